@@ -12,7 +12,7 @@ from nedbus.events import KINDS
 from nedbus.log_event import EVENTS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus_msgs import MESSAGES, TOPICS, Address, encode
+from nedbus_msgs import MESSAGES, TOPICS, Address, encode, encoding_of
 
 from .api import constants_of
 from .markdown import cell, code, page, section, table
@@ -92,7 +92,10 @@ def keys_page() -> str:
                 "script has taken it; the key is that of the subscription"
             ),
         ],
-        [code("nedbus/@schema/VehicleLocalPosition"), "queryable: JSON Schema and layouts of a message"],
+        [
+            code("nedbus/@schema/VehicleLocalPosition"),
+            "queryable: JSON Schema and layouts of a message, of each definition of its name, or of that of `?hash=`",
+        ],
         [code("nedbus/@service/*/status"), "queryable: status of each service, in JSON"],
         [code(one.rejected_key()), "rejected messages, with the reason, in JSON"],
     ]
@@ -101,7 +104,7 @@ def keys_page() -> str:
             code(name),
             str(len(each.types)),
             str(len(encode(each.model(timestamp=1)))),
-            code(f"application/msgpack;px4_msgs/{name}"),
+            code(encoding_of(each, None)),
         ]
         for name, each in MESSAGES.items()
     ]
@@ -121,7 +124,12 @@ def keys_page() -> str:
             "\nEvery field is written at its full width, so a payload of a message always has the same size, with "
             "every field at a fixed offset; any other valid msgpack of the array is read too."
             "\nThe encoding begins with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
-            "number with a bit for each field that was not provided, the lowest for `timestamp`.",
+            "number with a bit for each field that was not provided, the lowest for `timestamp`."
+            "\nThe name of any message that is not in this table is followed by `;hash=...`: the first 32 hexadecimal "
+            "digits of the RIHS01 hash of its fields as ROS 2 computes it (`nedbus_msgs.short_hash`), as builds of "
+            "PX4 may differ in a message of the same name."
+            "\nA reader queries `nedbus/@schema/<Message>?hash=...`, computes the hash of the fields in each answer, "
+            "and decodes a payload only with the fields of its own hash; without it, the message is invalid.",
             table(["message", "fields", "bytes", "encoding"], messages),
         ),
         section("Topics", table(["topic", "Hz", "messages kept", "priority"], topics)),

@@ -49,7 +49,7 @@ from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgra
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, field_type
 from .model.rules import UnitQuaternion
-from .provenance import Provenance, encoding_of, message_name_of, provenance_of
+from .provenance import Provenance, encoding_of, identity_of, provenance_of, short_hash
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2.msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
 from .ros2.types import dds_type, definition_text, hash_of, message_of_type_hash, ros2_type, ros2_types
@@ -84,10 +84,10 @@ __all__ = [
     "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of", "dds_type",
     "decode", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
     "describe_flags", "encode", "encode_with", "encoding_of", "enu_to_ned", "euler_to_quaternion", "field_type",
-    "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "is_unix_time", "is_vehicle_input",
-    "json_schema_of", "layout_table_of", "message_doubts", "message_name_of", "message_of_type_hash",
+    "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "identity_of", "is_unix_time",
+    "is_vehicle_input", "json_schema_of", "layout_table_of", "message_doubts", "message_of_type_hash",
     "ned_to_enu", "provenance_of", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "quaternion_to_euler",
     "read_msg", "rejected_key_expr", "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "schema_of",
-    "split_ros2_topic", "status_key", "to_global", "to_local", "upgrade_fields", "upgrade_with",
+    "short_hash", "split_ros2_topic", "status_key", "to_global", "to_local", "upgrade_fields", "upgrade_with",
     "variances_enu_to_ned", "variances_ned_to_enu", "vehicle_name", "wrap", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip

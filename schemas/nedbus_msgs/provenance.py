@@ -1,7 +1,9 @@
-"""Provenance of messages, carried in their Zenoh encoding: the source, and the fields that it does not provide.
+"""Type and provenance of messages in their Zenoh encoding: the source, and the fields that it does not provide.
 
     application/msgpack;px4_msgs/VehicleLocalPosition;source=mavlink;missing=fffff00000000
+    application/msgpack;px4_msgs/WheelEncoders;hash=0123456789abcdef0123456789abcdef;source=ulog
 
+`hash`: identifies the definition of any message but the first twelve, as builds of PX4 may differ; see `short_hash`.
 `missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; it is left out if no
 field is missing.
 Both directions are cached, as almost all messages of a publisher have the same encoding.
@@ -11,17 +13,26 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
 from .errors import AddressError
-from .model.definition import Definition
+from .model.declaration import Layout
+from .model.definition import MESSAGES, Definition
+from .model.px4_types import FieldType
+from .ros2.types import PACKAGE, hash_of
 
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
 _MISSING = re.compile(r"[0-9a-f]+")
-_ENCODING = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63})(?:;.*)?")
+_IDENTITY = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?")
 _CACHE_SIZE: Final = 1024
+# The messages with a file in the first version, which every reader has; other versions may lack a file.
+_WITHOUT_HASH: Final = re.compile(
+    "BatteryStatus|EstimatorStatusFlags|FailsafeFlags|HomePosition|SensorGps|TimesyncStatus|VehicleAttitude"
+    "|VehicleGlobalPosition|VehicleLandDetected|VehicleLocalPosition|VehicleOdometry|VehicleStatus"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +59,8 @@ def encoding_of(definition: Definition[Any], source: str | None, provided: froze
     names = definition.names
     mask = 0 if provided is None else sum(1 << index for index, name in enumerate(names) if name not in provided)
     parts = [f"application/msgpack;px4_msgs/{definition.name}"]
+    if not _WITHOUT_HASH.fullmatch(definition.name) or MESSAGES[definition.name] is not definition:
+        parts.append(f"hash={short_hash(definition.name, definition.types)}")
     if source is not None:
         parts.append(f"source={source}")
     if mask:
@@ -55,11 +68,16 @@ def encoding_of(definition: Definition[Any], source: str | None, provided: froze
     return ";".join(parts)
 
 
+def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
+    """Return the first 32 hex digits of the RIHS01 hash of a message with these fields: 128 bits in each encoding."""
+    return hash_of(Layout("", "", types=types), f"{PACKAGE}/{name}").removeprefix("RIHS01_")[:32]
+
+
 @lru_cache(_CACHE_SIZE)
-def message_name_of(encoding: str) -> str | None:
-    """Return the message name in an encoding, None if there is none; known topics are decoded without it."""
-    found = _ENCODING.fullmatch(encoding)
-    return found[1] if found else None
+def identity_of(encoding: str) -> tuple[str, str] | None:
+    """Return name and hash of a message without a file from its encoding; None if it lacks one of them."""
+    found = _IDENTITY.fullmatch(encoding)
+    return (found[1], found[2]) if found else None
 
 
 @lru_cache(_CACHE_SIZE)

@@ -24,6 +24,7 @@ from nedbus.errors import ListenError, NoDataError
 from nedbus_msgs import (
     DEFAULT_TOPIC,
     Address,
+    Definition,
     Message,
     Selection,
     VehicleLocalPosition,
@@ -51,7 +52,7 @@ class FoxgloveServer:
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
         self._bus = bus
         self._context = foxglove.Context()
-        self._fields: dict[Address, foxglove.Channel] = {}
+        self._fields: dict[tuple[Address, Definition[Any]], foxglove.Channel] = {}
         # The last message of each stream without a rate, until a client subscribes.
         self._unseen: dict[Address, tuple[Message, int]] = {}
         self._vehicles: dict[str, _Vehicle] = {}
@@ -104,13 +105,12 @@ class FoxgloveServer:
 
     def _show_fields(self, address: Address, message: Message, time_ns: int) -> None:
         definition = message.DEFINITION
-        channel = self._fields.get(address)
+        channel = self._fields.get((address, definition))
         if channel is None:
             text = definition_text(definition, definition.current).encode()
             schema = foxglove.Schema(name=ros2_type(definition), encoding="ros2msg", data=text)
-            channel = self._fields[address] = foxglove.Channel(
-                f"/{address}", schema=schema, message_encoding="cdr", context=self._context
-            )
+            channel = foxglove.Channel(f"/{address}", schema=schema, message_encoding="cdr", context=self._context)
+            self._fields[address, definition] = channel
         if channel.has_sinks():
             self._unseen.pop(address, None)
             channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
@@ -139,8 +139,8 @@ class FoxgloveServer:
         published = {address for addresses in self._bus.vehicles().values() for address in addresses}
         if not self._bus.connected:
             return  # without a link the reply is incomplete
-        for address in self._fields.keys() - published:
-            self._fields.pop(address).close()
+        for address, definition in [stream for stream in self._fields if stream[0] not in published]:
+            self._fields.pop((address, definition)).close()
             self._unseen.pop(address, None)
             if address.topic == _ATTITUDE:
                 self._attitudes.pop(address.vehicle, None)

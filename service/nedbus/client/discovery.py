@@ -19,19 +19,22 @@ from pydantic_core import PydanticUseDefault
 from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health.stream_health import Health
-from nedbus.client.receiving.layout_lookup import Schemas
+from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json
 from nedbus.log_event import about
 from nedbus.transport import AliveTokens, RawSample, Session, query, while_open
 from nedbus_msgs import (
     ANY,
+    MESSAGES,
     Address,
     AddressError,
     Selection,
     address_of_alive_key,
     address_of_rejected_key,
+    field_type,
     rejected_key_expr,
     schema_key,
+    short_hash,
     status_key,
 )
 
@@ -255,18 +258,24 @@ def find_accounts(session: Session, *, prefix: str, within: float, timeout: floa
     return [report for report in found if report is not None]
 
 
-def find_schemas(messages: Collection[str], *, session: Session, prefix: str) -> Schemas:
-    """Query publishers for the fields of all layouts of these messages; the first reply for a layout wins."""
-    found: dict[str, dict[int, dict[str, str]]] = {}
-    keys = [schema_key(name, prefix=prefix) for name in messages]
+def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
+    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins."""
+    found: dict[Wanted, dict[str, str]] = {}
+    keys = {
+        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
+    }
     for key, content in _parse(query(session, *keys, timeout=_SCHEMA_TIMEOUT, newest=False)):
+        name = key.rpartition("/")[2]
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
-            with suppress(ValidationError):
+            with suppress(ValueError):
                 parsed = _LAYOUT.validate_python(layout)
                 fields = {field.name: field.type for field in parsed.fields}
-                if len(fields) == len(parsed.fields):
-                    found.setdefault(key.rpartition("/")[2], {}).setdefault(parsed.wire, fields)
+                # The hash of what the peer describes, not what it claims.
+                types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
+                which = short_hash(name, types) if types else parsed.wire
+                if len(fields) == len(parsed.fields) and (name, which) in wanted:
+                    found.setdefault((name, which), fields)
     return found
 
 

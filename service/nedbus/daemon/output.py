@@ -102,12 +102,18 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher for an address if it has none; raise AddressInUseError if another source has one."""
+        """Open a publisher for an address if it has none of this definition.
+
+        Raises AddressInUseError if another source has one.
+        """
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
-            return
+            if definition in (None, stream.publisher.definition):
+                return
+            stream.publisher.close()  # another firmware, after a reboot
+            stream.publisher = None
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:
@@ -156,10 +162,7 @@ class SourceOutput:
         address = message.address
         stream = self._streams.get(address)
         publisher = stream.publisher if stream is not None else None
-        if stream is not None and publisher is not None and message.definition not in (None, publisher.definition):
-            publisher.close()  # another firmware, after a reboot
-            stream.publisher = None
-        if stream is None or stream.publisher is None:
+        if stream is None or publisher is None or message.definition not in (None, publisher.definition):
             back = stream is not None and stream.heard is not None
             if not back and self._live >= _MAX_ADDRESSES:
                 self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"))

@@ -36,8 +36,8 @@ _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, 
 class RecordingWriter:
     """Write messages to a new MCAP file; a context manager that finishes the file on exit.
 
-    Each address and provenance has its own channel, in the message's current layout. If no PX4 layout has all fields
-    of the message, a PX4 layout with exactly the fields provided by the source is preferred.
+    Each address, definition and provenance has its own channel, in the message's current layout. If no PX4 layout has
+    all fields of the message, a PX4 layout with exactly the fields provided by the source is preferred.
     A flipped bit costs one chunk, of up to `chunk_size` bytes before compression.
 
     Raises OutputError if the file exists, is deleted while open, or cannot be written; flushed messages stay readable.
@@ -57,8 +57,8 @@ class RecordingWriter:
             self._file.close()
             self.path.unlink(missing_ok=True)
             raise
-        self._schemas: dict[tuple[str, str], int] = {}  # by message and layout
-        self._channels: dict[tuple[Address, Provenance], tuple[int, Layout]] = {}
+        self._schemas: dict[tuple[Definition[Any], str], int] = {}  # by definition and layout
+        self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
 
     def write(
         self,
@@ -97,8 +97,9 @@ class RecordingWriter:
         times: Iterable[tuple[int, int, int]],
     ) -> Iterator[_Encoded]:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
+        channels = self._channels.setdefault(definition, {})
         for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
-            channel, layout = self._channels.get(stream) or self._open_channel(definition, *stream)
+            channel, layout = channels.get(stream) or self._open_channel(definition, *stream)
             if layout not in encoded:
                 payloads = arrays_of(definition).encode_cdr(messages, layout)
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
@@ -138,11 +139,11 @@ class RecordingWriter:
         self, definition: Definition[Any], address: Address, provenance: Provenance
     ) -> tuple[int, Layout]:
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
-        schema = self._schemas.get((definition.name, layout.name))
+        schema = self._schemas.get((definition, layout.name))
         if schema is None:
             text = definition_text(definition, layout).encode()
             schema = self._writer.register_schema(ros2_type(definition), "ros2msg", text)
-            self._schemas[definition.name, layout.name] = schema
+            self._schemas[definition, layout.name] = schema
         # ROS 2 tools recognize their bags by the first key.
         metadata = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:
@@ -152,7 +153,7 @@ class RecordingWriter:
         if provenance.missing:
             metadata["missing"] = " ".join(sorted(provenance.missing))
         channel = self._writer.register_channel(f"/{address}", "cdr", schema, metadata)
-        self._channels[address, provenance] = channel, layout
+        self._channels[definition][address, provenance] = channel, layout
         return channel, layout
 
 

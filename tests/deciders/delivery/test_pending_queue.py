@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import tracemalloc
 import weakref
 from collections.abc import Collection, Sequence
@@ -18,15 +19,15 @@ from nedbus import Batch, Counts, Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, layout_lookup
 from nedbus.client.receiving import decoder as decoder_module
 from nedbus.client.receiving import pending_queue as module
-from nedbus.client.receiving.layout_lookup import Schemas
+from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.transport import RawSample
 from nedbus_msgs import DEFAULT, codec_of, encode
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.first_message import encoding_of
-from tests.waits import DEADLINE
+from tests.waits import DEADLINE, wait_for
 
-from .raw_samples import INVALID, OTHER_KEY, VALID, Payload, drain, junk, make_queue, put, raw, timestamps
+from .raw_samples import INVALID, OTHER_KEY, SOURCE, VALID, Payload, drain, junk, make_queue, put, raw, timestamps
 
 STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 
@@ -113,36 +114,24 @@ def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
 
 def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
     """One lookup serves all messages, and is repeated at growing intervals, as publishers may start later."""
-    now, asked, payloads = 0.0, list[float](), [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
+    now, asked, payloads = 0.0, list[tuple[float, Wanted]](), [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
 
-    def find(_: Collection[str]) -> Schemas:
-        asked.append(now)
+    def find(wanted: Collection[Wanted]) -> Schemas:
+        asked.extend((now, each) for each in wanted)
         return {}
 
     lookup = LayoutLookup(find, now=lambda: now)
     while now < 250.0:
         learn(lookup, payloads)
         now += 0.5
-    assert asked == [0.0, 2.0, 7.0, 17.0, 47.0, 107.0, 167.0, 227.0]
-
-
-def test_reader_may_wait_while_a_lookup_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader waits for lookups at any moment, also just before the thread of one runs."""
-    lookup, start = LayoutLookup(lambda _: {}), threading.Thread.start
-
-    def wait_and_start(thread: threading.Thread) -> None:
-        lookup.wait()
-        start(thread)
-
-    monkeypatch.setattr(threading.Thread, "start", wait_and_start)
-    with pytest.raises(nedbus.DecodeError):
-        lookup.definition("VehicleCommand")
-    lookup.wait()
+    assert sorted({when for when, _ in asked}) == [0.0, 0.5, 2.5, 7.5, 17.5, 47.5, 107.5, 167.5, 227.5]
+    assert len(asked) == len(set(asked)) == 9 * len(payloads)
 
 
 def test_only_layouts_that_are_needed_are_remembered() -> None:
     """A reply may describe thousands of layouts: those not in use do not displace one that is."""
-    known = {"VehicleLocalPosition": {number: {"timestamp": "uint64", "x": "float32"} for number in range(9, 2000)}}
+    fields = {"timestamp": "uint64", "x": "float32"}
+    known: Schemas = {("VehicleLocalPosition", number): fields for number in range(9, 2000)}
     lookup = LayoutLookup(lambda _: known)
     for layout in range(1500, 1520):
         learn(lookup, [msgpack.packb([layout, 1, 2.0])])
@@ -151,7 +140,7 @@ def test_only_layouts_that_are_needed_are_remembered() -> None:
 
 def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
     """A layout with a name of 100,000 characters is logged as one short line."""
-    known = {"VehicleLocalPosition": {1500: {"timestamp": "uint64", 100_000 * "x": "float32"}}}
+    known: Schemas = {("VehicleLocalPosition", 1500): {"timestamp": "uint64", 100_000 * "x": "float32"}}
     learn(LayoutLookup(lambda _: known), [msgpack.packb([1500, 1, 2])])
     [line] = caplog.messages
     assert line.startswith("layout 1500 of VehicleLocalPosition is newer than this reader; not read: xxx")
@@ -160,15 +149,17 @@ def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCap
 
 def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
     """The receiving thread does not wait for a peer that never replies, and neither does closing the lookup."""
-    answering = threading.Event()
+    asked, answering = threading.Event(), threading.Event()
 
-    def find(_: Collection[str]) -> Schemas:
+    def find(_: Collection[Wanted]) -> Schemas:
+        asked.set()
         answering.wait(DEADLINE)
-        return {"VehicleLocalPosition": {9: {"timestamp": "uint64", "x": "float32"}}}
+        return {("VehicleLocalPosition", 9): {"timestamp": "uint64", "x": "float32"}}
 
     lookup = LayoutLookup(find)
     with pytest.raises(nedbus.UnknownLayoutError):
         lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
+    assert asked.wait(DEADLINE)
     assert not lookup.newer(DEFAULT)
     answering.set()
     lookup.close()
@@ -180,22 +171,54 @@ def test_what_arrives_while_a_question_is_open_is_asked_for_next() -> None:
 
     Layouts described by the first reply are not looked up again, although more of their messages arrived.
     """
-    known: Schemas = {name: {1: {"timestamp": "uint64", "x": "float32"}} for name in ("First", "Second")}
-    answering, asked = threading.Event(), list[set[str]]()
+    answering, asked = threading.Event(), list[set[Wanted]]()
 
-    def find(names: Collection[str]) -> Schemas:
-        asked.append(set(names))
+    def find(wanted: Collection[Wanted]) -> Schemas:
+        asked.append(set(wanted))
         answering.wait(DEADLINE)
-        return {name: known[name] for name in names}
+        return {each: {"timestamp": "uint64", "x": "float32"} for each in wanted}
 
     lookup = LayoutLookup(find)
     for name in ("First", "First", "Second"):
-        with pytest.raises(nedbus.DecodeError):
-            lookup.definition(name)
+        assert lookup.codec(name, "hash") is None
+        wait_for(lambda: asked, what="the first lookup")
     answering.set()
-    lookup.wait()
-    assert [lookup.definition(name).name for name in known] == ["First", "Second"]
-    assert asked == [{"First"}, {"Second"}]
+    found = [lookup.codec(name, "hash", wait=True) for name in ("First", "Second")]
+    assert [codec.definition.name for codec in found if codec] == ["First", "Second"]
+    assert asked == [{("First", "hash")}, {("Second", "hash")}]
+
+
+def test_unanswered_lookups_delay_readers_little() -> None:
+    """A peer that names ever new definitions and describes none makes readers wait for 3 s, then a tenth of the time.
+
+    What others describe is found all the same, and what is remembered of the failed ones is bounded.
+    """
+
+    def find(wanted: Collection[Wanted]) -> Schemas:
+        return {each: {"timestamp": "uint64"} for each in wanted if each[0] == "Honest"}
+
+    lookup = LayoutLookup(find)
+    lookup._patience, lookup._waited = 0.0, time.monotonic()  # as after 3 s in vain
+    start = time.monotonic()
+    for number in range(5000):
+        assert lookup.codec("Evil", str(number), wait=True) is None
+    assert len(lookup._open) <= 2 * layout_lookup._MAX_UNKNOWN
+    assert len(lookup._failed) <= layout_lookup._MAX_FAILED
+    assert start <= lookup._waited <= time.monotonic()
+    wait_for(lambda: lookup.codec("Honest", "hash"), what="the definition")
+    lookup.close()
+
+
+def test_definitions_that_peers_make_up_fill_no_memory(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The fields of all definitions are bounded; those in use stay, and further ones are refused with a reason."""
+    monkeypatch.setattr(layout_lookup, "_MAX_FIELDS", 10 * (1 + layout_lookup._BASE))
+    lookup = LayoutLookup(lambda wanted: {each: {"timestamp": "uint64"} for each in wanted})
+    known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
+    assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
+    assert lookup.codec("Honest", "0") is known[0]
+    assert "too many messages without a file" in caplog.text
 
 
 def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout() -> None:
@@ -283,6 +306,15 @@ def test_samples_that_wait_are_kept_compact(small: PendingQueue, in_batches: boo
     assert [(each.source, len(each.missing)) for each in provenances] == [(f"source{each}", 52) for each in range(9)]
 
 
+def test_long_encodings_fill_no_memory(small: PendingQueue) -> None:
+    """An encoding may be of any length: what is kept of one that waits is as long as nedbus's own."""
+    for number in range(9):
+        put(small, [raw(number, encoding=SOURCE + number * 10_000 * "x")])
+    kept = [arrival[2].encoding for arrival in small._every]
+    assert all(len(str(encoding)) <= 512 for encoding in kept[5:])
+    assert len(drain(small)) == 9
+
+
 def test_ring_that_was_full_dropped_what_is_absent(caplog: pytest.LogCaptureFixture) -> None:
     """Samples pushed out of Zenoh's ring count as dropped, not as lost in transit; this is logged once.
 
@@ -310,9 +342,12 @@ def take_batch(pending_queue: PendingQueue) -> Batch:
 ATTITUDE = Payload(encode(VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))))
 
 
+UNDESCRIBED = f"application/msgpack;px4_msgs/FooBar;hash={'0' * 32}"
+
+
 def undescribed(payload: bytes = VALID) -> RawSample:
     """Return a sample of an undeclared message that no publisher describes."""
-    return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding="application/msgpack;px4_msgs/FooBar")
+    return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding=UNDESCRIBED)
 
 
 def test_stream_that_two_threads_meet_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -352,10 +387,10 @@ def test_batch_goes_past_what_is_invalid() -> None:
 
 def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     """While a batch waits for the description of a message, arriving samples are queued at once."""
-    monkeypatch.setattr(layout_lookup, "_JOIN_TIMEOUT", DEADLINE)
+    monkeypatch.setattr(layout_lookup, "_PATIENCE", DEADLINE)
     asked, answered = threading.Event(), threading.Event()
 
-    def find(_: Collection[str]) -> Schemas:
+    def find(_: Collection[Wanted]) -> Schemas:
         asked.set()
         answered.wait(DEADLINE)
         return {}

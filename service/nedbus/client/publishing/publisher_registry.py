@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from typing import Any, Final, cast
 
 import zenoh
@@ -19,7 +21,7 @@ from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
-from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, schema_of
+from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, schema_of, short_hash
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
@@ -30,6 +32,7 @@ from .writer import Heartbeats
 _log = logging.getLogger(__name__)
 
 _TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to reply with its tokens; usually milliseconds
+_MAX_DEFINITIONS: Final = 64  # per message name; beyond, the first one without a publisher is forgotten
 _FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
 
 
@@ -46,6 +49,7 @@ class PublisherRegistry:
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries, self._housekeeping = session, queries, housekeeping
         self._publishers: dict[Address, Publisher] = {}
+        self._definitions: dict[str, dict[str, Definition[Any]]] = {}  # of all publishers so far, by name and hash
         self._answered: set[str] = set()  # key expressions of schemas and of vehicles with a queryable
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
@@ -92,8 +96,13 @@ class PublisherRegistry:
             if not self._answered:
                 self._housekeeping.add(self.heartbeats.send_due)
             schema, messages = schema_key(definition.name, prefix=self.prefix), f"{self.prefix}/{vehicle}/**"
+            definitions = self._definitions.setdefault(definition.name, {})
+            definitions[short_hash(definition.name, definition.types)] = definition
+            if len(definitions) > _MAX_DEFINITIONS:
+                used = {each.definition for each in self._publishers.values()}
+                del definitions[next(short for short, each in definitions.items() if each not in used)]
             if schema not in self._answered:
-                self._queries.answer_json(schema, lambda _: schema_of(definition))
+                self._queries.answer(schema, partial(_reply_schemas, schema, definitions))
             if messages not in self._answered:
                 self._queries.answer(messages, _weakly(self._reply, vehicle))
             self._answered |= {schema, messages}
@@ -164,6 +173,14 @@ class PublisherRegistry:
             if matches and publisher.last is not None:
                 payload, stamp, encoding = publisher.last
                 query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
+
+
+def _reply_schemas(key: str, definitions: Mapping[str, Definition[Any]], query: zenoh.Query) -> None:
+    """Reply with the schema of each definition of a message, or of the one with the hash in the query."""
+    wanted = query.parameters.get("hash")
+    for short, definition in tuple(definitions.items()):
+        if wanted in (None, short):
+            query.reply(key, json.dumps({**schema_of(definition), "hash": short}), encoding=JSON)
 
 
 def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus import clock
-from nedbus_msgs import DEFAULT, Address, Message, Provenance, codec_of
+from nedbus_msgs import DEFAULT, Address, Message, Provenance, codec_of, provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
-from .decoder import Arrival, Decoder
+from .decoder import Arrival, Decoder, encoding_of
 
 
 @dataclass(eq=False)
@@ -34,7 +34,6 @@ class Batch:
     received: int
     lost: int
     _arrivals: Sequence[Arrival] = field(repr=False)
-    _decoder: Decoder = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -60,16 +59,17 @@ class Batch:
     @cached_property
     def provenances(self) -> list[Provenance]:
         """Provenance of each message: its source and the fields that the source did not provide."""
-        return list(map(self._decoder.provenance, self._arrivals))
+        definition = self.message.DEFINITION
+        return [provenance_of(definition, encoding_of(stream, raw)) for stream, _, raw, _ in self._arrivals]
 
 
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
     received = clock.utc_ns()
-    codec = decoder.resolve(arrivals[0][0])  # may wait for a layout lookup
+    codec = decoder.codec(*arrivals[0][:3:2])  # may wait for a layout lookup
     definition = codec.definition if codec else DEFAULT
     blank = bytes(codec_of(definition).size)  # invalid stand-in for payloads of other layouts, decoded separately below
-    own = arrivals[0][0].size  # -1 while their type is unknown
+    own = codec.size if codec else -1
     payloads = [payload if len(payload) == own else blank for _, payload, _, _ in arrivals]
     messages, valid = arrays_of(definition).decode(b"".join(payloads))
     if not valid.all():
@@ -84,6 +84,4 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     addresses = {stream.key: stream.address for stream, _, _, _ in arrivals}
     indices = {key: index for index, key in enumerate(addresses)}
     address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
-    return Batch(
-        messages, definition.model, tuple(addresses.values()), address_index, received, lost, arrivals, decoder
-    )
+    return Batch(messages, definition.model, tuple(addresses.values()), address_index, received, lost, arrivals)

@@ -22,10 +22,9 @@ from nedbus_msgs import (
     AddressError,
     Codec,
     DecodeError,
-    Provenance,
     UnknownLayoutError,
     codec_of,
-    message_name_of,
+    identity_of,
     provenance_of,
 )
 
@@ -39,6 +38,7 @@ _log = logging.getLogger(__name__)
 MAX_KEYS: Final = 10_000  # tracked per reader, a bound on memory that no peer can exceed
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
 _MAX_WARNED: Final = 100  # keys with a logged warning about invalid messages
+_MAX_ENCODING: Final = 512  # characters kept of an encoding; those of nedbus have 250 at most
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 
@@ -47,7 +47,8 @@ class KeyState:
     """State of a key: address, codec, writer proxies and losses not yet reported.
 
     `key`: key of the full-rate stream. `wire_key`: key on which messages arrive, perhaps downsampled.
-    `codec`: None while the definition of `message` is unknown. `size`: payload size in bytes of the known layout.
+    `codec`: None for messages without a file, whose definition each encoding identifies. `size`: bytes of its payload
+    with all fields, or -1. `message`: its name, or "". `encoding`: the last one, as Zenoh's object and as text.
     `writers`: writer proxies by name. `writer`: the one of the last message.
     `gap`: messages lost before the next delivery. `unreported`: messages lost before one that was dropped or invalid;
     the next sample read reports them.
@@ -59,15 +60,11 @@ class KeyState:
     codec: Codec[Any] | None = None
     size: int = -1
     message: str = ""
-    last: tuple[zenoh.Encoding | None, Provenance] = None, Provenance()  # one tuple, as two threads access it
+    encoding: tuple[object, str] = None, ""  # one tuple, as two threads access it
     writers: dict[str, WriterProxy] = field(default_factory=dict)
     writer: WriterProxy | None = None
     gap: int = 0
     unreported: int = 0
-
-    def set_codec(self, codec: Codec[Any]) -> None:
-        """Set the codec and the values derived from it."""
-        self.codec, self.size, self.message = codec, codec.size, codec.definition.name
 
 
 class DetachedSample(NamedTuple):
@@ -75,7 +72,7 @@ class DetachedSample(NamedTuple):
 
     timestamp: zenoh.Timestamp | None
     source_info: zenoh.SourceInfo | None
-    provenance: Provenance
+    encoding: str
 
 
 Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int]  # the last item: messages lost before this one
@@ -100,7 +97,8 @@ class Decoder:
             address = from_key(key, prefix=self._prefix)
             stream = KeyState(address.key(prefix=self._prefix), key, address)
             if address.topic in BY_TOPIC:
-                stream.set_codec(codec_of(BY_TOPIC[address.topic]))
+                stream.codec = codec_of(BY_TOPIC[address.topic])
+                stream.size, stream.message = stream.codec.size, stream.codec.definition.name
             if len(self._streams) < MAX_KEYS:
                 stream = self._streams.setdefault(key, stream)  # another thread may have added it
         return stream
@@ -145,29 +143,31 @@ class Decoder:
         stream, payload, raw, lost = arrival
         if isinstance(raw, DetachedSample):
             return arrival
-        return stream, payload, DetachedSample(raw.timestamp, raw.source_info, cls.provenance(arrival)), lost
+        return stream, payload, DetachedSample(raw.timestamp, raw.source_info, encoding_of(stream, raw)), lost
 
-    @staticmethod
-    def provenance(arrival: Arrival) -> Provenance:
-        """Return the provenance of an arrival."""
-        stream, _, raw, _ = arrival
-        if isinstance(raw, DetachedSample):
-            return raw.provenance
-        encoding = raw.encoding
-        known, provenance = stream.last
-        if encoding != known and stream.codec:  # rarely changes, so the last one is cached
-            provenance = provenance_of(stream.codec.definition, str(encoding))
-            stream.last = encoding, provenance
-        return provenance
+    def codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
+        """Return the codec of a sample; None if no publisher describes its message.
+
+        `wait`: wait for a lookup in progress; never do so on a receiving thread.
+        Raises DecodeError if the encoding identifies no message.
+        """
+        if stream.codec:
+            return stream.codec
+        encoding, info = encoding_of(stream, raw), raw.source_info
+        identity = identity_of(encoding)
+        if identity is None:
+            raise DecodeError(f"the encoding {encoding!r:.100} has no name and hash of a message")
+        return self._layouts.codec(*identity, publisher=info and info.source_id.zid, wait=wait)
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
         """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
         stream, payload, raw, _ = arrival
         if not payload:
             return None
-        codec = stream.codec or self.resolve(stream)
+        codec = stream.codec or self.codec(stream, raw)
+        encoding = encoding_of(stream, raw)
         if codec is None:
-            self.reject(stream.key, DecodeError("no publisher has described its layout", stream.message))
+            self.reject(stream.key, DecodeError(f"no publisher describes {encoding[:_MAX_TEXT]!r}"))
             return None
         decode = codec.decode_row if rows else codec.decode
         try:
@@ -178,20 +178,8 @@ class Decoder:
         except DecodeError as exc:
             self.reject(stream.key, exc)
             return None
-        return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, self.provenance(arrival))
-
-    def resolve(self, stream: KeyState) -> Codec[Any] | None:
-        """Return the codec of a key, looked up if its message is unknown; None if no publisher describes the message.
-
-        Waits once for a lookup in progress, so never call it on a receiving thread.
-        """
-        if stream.codec is None and stream.message:
-            for _ in range(2):
-                with suppress(DecodeError):
-                    stream.set_codec(codec_of(self._layouts.definition(stream.message)))
-                    break
-                self._layouts.wait()
-        return stream.codec
+        provenance = provenance_of(codec.definition, encoding)
+        return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, provenance)
 
     def count_invalid(self, count: int) -> None:
         """Add to the count of invalid samples."""
@@ -216,11 +204,18 @@ class Decoder:
             raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
         if raw.kind == zenoh.SampleKind.DELETE:
             raise DecodeError("a delete sample, which nedbus publishers never send")
-        if stream.codec is None:
-            stream.message = message_name_of(str(raw.encoding)) or ""
-            if not stream.message:
-                raise DecodeError(f"unknown message type: the encoding {str(raw.encoding)!r:.100} names none")
-            with suppress(DecodeError):  # decoded on read; the lookup may be done by then
-                stream.set_codec(codec_of(self._layouts.definition(stream.message)))
-        if len(payload) != stream.size and stream.codec:
-            self._layouts.check(stream.codec, payload)
+        codec = self.codec(stream, raw, wait=False)  # None: decoded on read; the lookup may be done by then
+        if codec and len(payload) != codec.size:
+            self._layouts.check(codec, payload)
+
+
+def encoding_of(stream: KeyState, raw: RawSample | DetachedSample) -> str:
+    """Return the encoding of a sample as text; it rarely changes, so the last one is cached and shared."""
+    if isinstance(raw, DetachedSample):
+        return raw.encoding
+    encoding = raw.encoding
+    known, text = stream.encoding
+    if encoding != known:
+        text = str(encoding)[:_MAX_ENCODING]
+        stream.encoding = encoding, text
+    return text

@@ -7,23 +7,39 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
+from itertools import islice
 from typing import Any, Final
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus_msgs import MESSAGES, Codec, DecodeError, Definition, UnknownLayoutError, define, field_type
+from nedbus_msgs import MESSAGES, Codec, Definition, UnknownLayoutError, codec_of, define, field_type
 
 _log = logging.getLogger(__name__)
 
 _MAX_LAYOUTS: Final = 16  # newer layouts per message
-_MAX_MESSAGES: Final = 256  # messages defined by publishers
-_MAX_UNKNOWN: Final = 64  # messages and layouts per query
-_PAUSES: Final = (0.0, 2.0, 5.0, 10.0, 30.0, 60.0)  # s until the next query, by the number of failed ones in a row
+_MAX_FIELDS: Final = 65_536  # of all messages defined by publishers; PX4's have 15 on average
+_BASE: Final = 48  # fields that take as much memory as a message without any
+_MAX_UNKNOWN: Final = 64  # messages and layouts per query, and those that wait for the next one
+_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the first one may be asked for again
+_PAUSES: Final = (
+    0.5,
+    2.0,
+    5.0,
+    10.0,
+    30.0,
+    60.0,
+)  # s until the same is asked for again, by the number of failed queries
+_PACE: Final = 0.2  # s between a query without a result and the next one
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_JOIN_TIMEOUT: Final = 3.0  # s
+_PATIENCE: Final = 3.0  # s that readers wait for definitions in vain
+_RECOVERY: Final = 0.1  # of the time since then becomes patience again, so that no peer can keep readers waiting
 
-Schemas = Mapping[str, Mapping[int, Mapping[str, str]]]
-"""Descriptions by publishers: message name to layout number to field name to type."""
+Wanted = tuple[str, int | str]
+"""A message, and the number of a newer layout or, for a message without a file, the hash of its definition."""
+
+Schemas = Mapping[Wanted, Mapping[str, str]]
+"""Descriptions by publishers: field name to type."""
 
 
 class LayoutLookup:
@@ -34,30 +50,38 @@ class LayoutLookup:
     """
 
     def __init__(
-        self, find: Callable[[Collection[str]], Schemas], *, now: Callable[[], float] = time.monotonic
+        self, find: Callable[[Collection[Wanted]], Schemas], *, now: Callable[[], float] = time.monotonic
     ) -> None:
         self._find = find
         self._now = now
         self._newer: dict[str, dict[int, Sequence[str]]] = {}
-        self._defined: dict[str, Definition[Any]] = {}
-        self._lock = threading.Lock()
+        self._codecs: dict[Wanted, Codec[Any]] = {}
+        self._room = _MAX_FIELDS
+        self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
-        self._unknown: set[tuple[str, int | None]] = set()  # since the last query
-        self._failures = 0
-        self._next_request = float("-inf")
+        self._open: dict[Wanted, object] = {}  # with the publisher; those of the current query first
+        self._failed: dict[Wanted, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
+        self._patience, self._waited = _PATIENCE, float("-inf")  # of readers, and the time of the last wait in vain
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
         """Return the newer layouts of a message found so far, in the form that `decode` expects."""
         return self._newer.get(definition.name, {})
 
-    def definition(self, name: str) -> Definition[Any]:
-        """Return the definition of a message; raise DecodeError and start a lookup if it is unknown."""
-        found = MESSAGES.get(name) or self._defined.get(name)
-        if found is None:
-            self._request(name, None)
-            raise DecodeError(f"no publisher has described {name} yet", name)
-        return found
+    def codec(self, name: str, identity: str, *, publisher: object = None, wait: bool = False) -> Codec[Any] | None:
+        """Return the codec of a message without a file; None while its definition is unknown, and start a lookup.
+
+        `publisher`: after a failed lookup, that of another publisher starts at once.
+        `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
+        """
+        wanted = name, identity
+        codec = self._codecs.get(wanted)
+        if codec is None:
+            self._request(wanted, publisher)
+            if wait:
+                self.wait(wanted)
+                codec = self._codecs.get(wanted)
+        return codec
 
     def check(self, codec: Codec[Any], payload: bytes) -> None:
         """Validate a payload; raise DecodeError if it is invalid or of an unknown layout, which starts a lookup."""
@@ -65,73 +89,101 @@ class LayoutLookup:
         try:
             codec.decode(payload, newer=self._newer.get(name))
         except UnknownLayoutError as exc:
-            self._request(name, exc.layout)
+            if MESSAGES.get(name) is codec.definition:  # others have a single layout
+                self._request((name, exc.layout))
             raise
 
-    def wait(self) -> None:
-        """Wait for lookups in progress, up to 3 s; never call it on a receiving thread."""
-        end, last = time.monotonic() + _JOIN_TIMEOUT, None
-        while (thread := self._thread) is not last and thread is not None:
-            thread.join(max(0.0, end - time.monotonic()))
-            last = thread
+    def wait(self, wanted: Wanted | None = None) -> None:
+        """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
+        with self._changed:
+            start = time.monotonic()
+            patience = min(_PATIENCE, self._patience + _RECOVERY * (start - self._waited))
+            is_pending = self._open.__len__ if wanted is None else partial(self._open.__contains__, wanted)
+            self._changed.wait_for(lambda: self._closed or not is_pending(), _PATIENCE if wanted is None else patience)
+            if wanted is not None and wanted not in self._codecs:
+                self._waited = time.monotonic()
+                self._patience = max(0.0, patience - (self._waited - start))
 
     def close(self) -> None:
         """Start no more lookups and wait for the one in progress."""
-        with self._lock:
+        with self._changed:
             self._closed = True
-        self.wait()
+            self._changed.notify_all()
+            thread = self._thread
+        if thread is not None:
+            thread.join(_PATIENCE)
 
-    def _request(self, name: str, layout: int | None) -> None:
-        with self._lock:
-            if len(self._unknown) < _MAX_UNKNOWN:
-                self._unknown.add((name, layout))
-            self._request_if_due()
+    def _request(self, wanted: Wanted, publisher: object = None) -> None:
+        with self._changed:
+            _, due, failed = self._failed.get(wanted, (0, float("-inf"), None))
+            is_due = self._now() >= due or publisher != failed
+            is_known = wanted in self._codecs or wanted[1] in self._newer.get(wanted[0], ())
+            if self._closed or is_known or not is_due or len(self._open) >= 2 * _MAX_UNKNOWN:
+                return
+            self._open[wanted] = publisher
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="nedbus-layouts", daemon=True)
+                self._thread.start()
 
-    def _request_if_due(self) -> None:
-        self._unknown = {each for each in self._unknown if not self._is_known(*each)}  # an answer may have arrived
-        if self._unknown and self._now() >= self._next_request and not self._closed:
-            self._next_request = float("inf")  # until this query ends
-            unknown, self._unknown = self._unknown, set()
-            thread = threading.Thread(target=self._run, args=(unknown,), name="nedbus-layouts", daemon=True)
-            thread.start()
-            self._thread = thread  # started, since `wait` joins it without the lock
+    def _run(self) -> None:
+        while asked := self._next():
+            added: list[Wanted] = []
+            try:
+                with suppress(NedbusError):  # the session is closed
+                    found = self._find(asked)
+                    added = [wanted for wanted in asked if wanted in found and self._add(wanted, found[wanted])]
+            finally:
+                self._end(asked, added)
 
-    def _is_known(self, name: str, layout: int | None) -> bool:
-        return name in self._defined if layout is None else layout in self._newer.get(name, ())
+    def _next(self) -> dict[Wanted, object]:
+        with self._changed:
+            if self._closed or not self._open:
+                self._thread = None
+                return {}
+            return dict(islice(self._open.items(), _MAX_UNKNOWN))
 
-    def _run(self, unknown: Collection[tuple[str, int | None]]) -> None:
-        found: Schemas = {}
-        added = 0
-        try:
-            with suppress(NedbusError):  # the session is closed
-                found = self._find({name for name, _ in unknown})
-            for name, layout in unknown:
-                added += self._define(name, found) if layout is None else self._add_layout(name, layout, found)
-        finally:
-            with self._lock:
-                self._failures = 0 if added else min(self._failures + 1, len(_PAUSES) - 1)
-                self._next_request = self._now() + _PAUSES[self._failures]
-                self._request_if_due()
+    def _end(self, asked: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
+        """End the lookups of a query, and pause if it had no result."""
+        with self._changed:
+            for wanted, asked_for in asked.items():
+                publisher = self._open.pop(wanted)
+                failures = self._failed.pop(wanted, (0,))[0]
+                if wanted not in added and publisher != asked_for:
+                    self._open[wanted] = publisher  # perhaps later than the query
+                elif wanted not in added:
+                    pause = _PAUSES[min(failures, len(_PAUSES) - 1)]
+                    self._failed[wanted] = failures + 1, self._now() + pause, publisher
+            while len(self._failed) > _MAX_FAILED:
+                del self._failed[next(iter(self._failed))]
+            self._changed.notify_all()
+            if not added:
+                self._changed.wait_for(lambda: self._closed, _PACE)
 
-    def _define(self, name: str, found: Schemas) -> bool:
-        """Define a message by the newest layout that a publisher describes."""
-        layouts = found.get(name)
-        if not layouts or len(self._defined) >= _MAX_MESSAGES:
+    def _add(self, wanted: Wanted, fields: Mapping[str, str]) -> bool:
+        name, which = wanted
+        return self._add_layout(name, which, fields) if isinstance(which, int) else self._define(name, which, fields)
+
+    def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
+        """Define a message without a file."""
+        size = len(fields) + _BASE
+        if size > self._room:
+            _log.warning("%s: too many messages without a file: not read", name, extra=about("invalid"))
             return False
         try:
-            fields = ((field, field_type(kind)) for field, kind in layouts[max(layouts)].items())
-            self._defined[name] = define(name, fields)
+            definition = define(name, ((field, field_type(kind)) for field, kind in fields.items()))
         except ValueError as exc:
             _log.warning("%s: invalid description by a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
-        _log.info("%s is not installed here: using the publisher's description", name, extra=about("described"))
+        self._room -= size
+        self._codecs[name, identity] = codec_of(definition)
+        text = "%s is not installed here: using the publisher's description"
+        _log.info(text, name, extra=about("described", reason=f"hash {identity}"))
         return True
 
-    def _add_layout(self, name: str, number: int, found: Schemas) -> bool:
+    def _add_layout(self, name: str, number: int, fields: Mapping[str, str]) -> bool:
         """Add a newer layout of a message."""
-        definition, newer = MESSAGES.get(name) or self._defined.get(name), self._newer.get(name, {})
-        fields = found.get(name, {}).get(number)
-        if definition is None or fields is None or number in newer or len(newer) >= _MAX_LAYOUTS:
+        definition, newer = MESSAGES[name], self._newer.get(name, {})
+        if len(newer) >= _MAX_LAYOUTS:
             return False
         self._newer[name] = {**newer, number: tuple(fields)}
         ignored = ", ".join(field for field in fields if field not in definition.types)[:_MAX_TEXT] or "nothing"

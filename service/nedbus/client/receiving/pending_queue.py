@@ -19,9 +19,9 @@ from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.errors import ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
 from nedbus.transport import RawSample
-from nedbus_msgs import AddressError
+from nedbus_msgs import AddressError, identity_of
 
-from .decoder import MAX_KEYS, Arrival, Decoder
+from .decoder import MAX_KEYS, Arrival, Decoder, encoding_of
 from .stateful_reader import StatefulReader
 from .writer_proxy import WriterProxy
 
@@ -249,8 +249,9 @@ class PendingQueue:
         """Remove the messages of the same type as the first one; the rest stay queued in order."""
         every, newest = self._every, self._newest
         waiting = list(newest.values()) or [every.popleft() for _ in range(min(len(every), _MAX_BATCH))]
-        taken = [arrival for arrival in waiting if arrival[0].message == waiting[0][0].message]
-        rest = [arrival for arrival in waiting if arrival[0].message != waiting[0][0].message]
+        kinds = [stream.message or identity_of(encoding_of(stream, raw)) for stream, _, raw, _ in waiting]
+        taken = [arrival for arrival, kind in zip(waiting, kinds, strict=True) if kind == kinds[0]]
+        rest = [arrival for arrival, kind in zip(waiting, kinds, strict=True) if kind != kinds[0]]
         if self.newest_only:
             self._newest = {arrival[0].key: arrival for arrival in rest}
         else:
