@@ -110,7 +110,7 @@ class SourceOutput:
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
-            if definition in (None, stream.publisher.definition):
+            if not _differs(definition, stream.publisher.definition):
                 return
             stream.publisher.close()  # another firmware, after a reboot
             stream.publisher = None
@@ -162,7 +162,7 @@ class SourceOutput:
         address = message.address
         stream = self._streams.get(address)
         publisher = stream.publisher if stream is not None else None
-        if stream is None or publisher is None or message.definition not in (None, publisher.definition):
+        if stream is None or publisher is None or _differs(message.definition, publisher.definition):
             back = stream is not None and stream.heard is not None
             if not back and self._live >= _MAX_ADDRESSES:
                 self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"))
@@ -264,6 +264,11 @@ class SourceOutput:
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
         self._account.reject(message.address, reason, clock.steady())
         self._registry.reject(message.address, report)
+
+
+def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
+    """Return True if a definition has other fields, or the same in another order."""
+    return new is not None and new is not known and [*new.types.items()] != [*known.types.items()]
 
 
 def _time_of(message: SourceMessage) -> int:
