@@ -16,4 +16,4 @@ def open_replay(text: str) -> ReplayRun:
 
 def convert_replay(text: str, path: Path) -> str:
     """Write one run of a source to a recording, as `nedbus convert` does; return its summary."""
-    return convert(open_replay(text).messages, path, source=text.partition(":")[0], on_progress=lambda _: None)
+    return convert(open_replay(text), path, source=text.partition(":")[0], on_progress=lambda _: None)

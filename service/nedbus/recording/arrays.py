@@ -57,7 +57,6 @@ class Flight:
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
     `start`: when recording began, on the clock of the messages' timestamps [us]; of a recording, once it is read.
-    `boot_utc`: Unix time of the boot according to the log's information [us], 0 if unknown.
 
     Raises SourceError if the file cannot be read.
     """
@@ -68,18 +67,17 @@ class Flight:
         self._topics: dict[Address, UlogTopic] = {}
         self._invalid: list[str] = []
         self._decode: Callable[[Definition[Any], Sequence[Any]], _Decoded] = _decode_cdr
-        self.start = self.boot_utc = 0
+        self.start = 0
         if (form := find_format(path)) == "mcap":
             reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
         elif form == "tlog":  # converted by the source, which is above this package
             reader = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
             self._file, self._decode, self.definitions = reader, _decode_fields, reader.find_definitions()
-            self.boot_utc = reader.boot_utc
         else:
             log = read_ulog(path, topics=topics)
             self._file, self._topics = log.reader, log.topics
-            self.start, self.boot_utc = log.reader.start, log.reader.boot_utc
+            self.start = log.reader.start
             self.definitions = {each: topic.definition for each, topic in log.topics.items()}
         self.addresses = sorted(self.definitions)
 
@@ -89,6 +87,11 @@ class Flight:
     def __exit__(self, *exc: object) -> None:
         if not isinstance(self._file, UlogReader):
             self._file.close()
+
+    @property
+    def boot_utc(self) -> int:
+        """Unix time of the boot, as the file has it besides its messages [us]; 0 if unknown."""
+        return int(self._file.boot_utc)
 
     @property
     def warnings(self) -> list[str]:

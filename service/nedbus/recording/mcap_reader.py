@@ -96,6 +96,12 @@ class RecordingReader:
         return [*self._lacking, *(f"{where[file]}{text}" for file in self._files for text in file.chunks.warnings)]
 
     @property
+    def boot_utc(self) -> int:
+        """Unix time of the boot, as the log had it that this was converted from [us]; 0 if unknown."""
+        known = {boot for file in self._files for boot in file.boots}
+        return int(known.pop()) if len(known) == 1 else 0
+
+    @property
     def damaged(self) -> bool:
         """True if damage cost messages."""
         return bool(self._lacking) or any(file.chunks.damaged for file in self._files)
@@ -128,6 +134,7 @@ class _RecordedFile:
     def __init__(self, path: Path, vehicle: str) -> None:
         self.name = path.name
         self._vehicle = vehicle
+        self.boots: set[str] = set()
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
@@ -207,6 +214,8 @@ class _RecordedFile:
         except (AddressError, ValueError) as exc:
             self.chunks.warn(f"skipped {channel.topic}: {exc}")
             return None
+        if (boot := channel.metadata.get("boot_time_utc_us", "")).isdecimal():
+            self.boots.add(boot)
         missing = frozenset(channel.metadata.get("missing", "").split())
         return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
 

@@ -38,13 +38,14 @@ class RecordingWriter:
 
     Each address, definition and provenance has its own channel, in the message's current layout. If no PX4 layout has
     all fields of the message, a PX4 layout with exactly the fields provided by the source is preferred.
-    A flipped bit costs one chunk, of up to `chunk_size` bytes before compression.
+    A flipped bit costs one chunk, of up to `chunk_size` bytes before compression. `boot_utc`: Unix time of the
+    vehicle's boot [us], for `utc_of` of a recording whose messages do not give it.
 
     Raises OutputError if the file exists, is deleted while open, or cannot be written; flushed messages stay readable.
     """
 
-    def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK, boot_utc: int = 0) -> None:
+        self.path, self._boot_utc = Path(path), boot_utc
         self.messages = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
@@ -150,6 +151,8 @@ class RecordingWriter:
             metadata["instance"] = str(address.instance)
         if provenance.source is not None:
             metadata["source"] = provenance.source
+        if self._boot_utc:
+            metadata["boot_time_utc_us"] = str(self._boot_utc)
         if provenance.missing:
             metadata["missing"] = " ".join(sorted(provenance.missing))
         channel = self._writer.register_channel(f"/{address}", "cdr", schema, metadata)

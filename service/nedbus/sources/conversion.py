@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +15,7 @@ from nedbus.log_event import about
 from nedbus.whole_file import whole_file
 from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
 
-from .source import SourceMessage
+from .source import ReplayRun
 
 _log = logging.getLogger(__name__)
 
@@ -26,13 +26,13 @@ _MAX_LOGGED: Final = 5  # rejected messages logged per file
 
 
 def convert(
-    messages: Iterable[SourceMessage],
+    run: ReplayRun,
     path: Path,
     *,
     source: str,
     on_progress: Callable[[int], object],
 ) -> str:
-    """Write messages to a new MCAP file and return a summary; leave no file behind on failure.
+    """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
     The publish time of a message is its PX4 timestamp, its log time that of the first message plus `due`.
     `source`: the kind of source, such as `ulog`. `on_progress`: called with the number of messages handled so far.
@@ -42,17 +42,17 @@ def convert(
     recording.check_recording(path)
     try:
         with whole_file(path) as part:
-            return _write(messages, part, source=source, on_progress=on_progress)
+            return _write(run, part, source=source, on_progress=on_progress)
     except OSError as exc:
         cause = exc.__cause__ if isinstance(exc, OutputError) else exc
         raise OutputError(path, cause if isinstance(cause, OSError) else exc) from exc
 
 
-def _write(messages: Iterable[SourceMessage], path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
+def _write(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
     pending: list[tuple[Message, Address, Provenance, int]] = []
     rejected, start = 0, None
-    with recording.RecordingWriter(path, chunk_size=_CHUNK_BYTES) as writer:
-        for done, each in enumerate(messages, 1):
+    with recording.RecordingWriter(path, chunk_size=_CHUNK_BYTES, boot_utc=run.boot_utc) as writer:
+        for done, each in enumerate(run.messages, 1):
             definition = each.definition or BY_TOPIC[each.address.topic]
             try:
                 message = upgrade_with(definition, each.fields)

@@ -72,6 +72,7 @@ class ReplayRun:
     `summary`: a description for the log; `warnings`: damage, and skipped parts.
     `damage`: a description of messages lost to damage; with it, the run ends as failed.
     `position`: bytes of the file that were read; None if progress is counted in messages.
+    `boot_utc`: Unix time of the vehicle's boot, as the file has it besides its messages [us]; 0 if it has none.
     """
 
     messages: Iterator[SourceMessage]
@@ -81,6 +82,7 @@ class ReplayRun:
     warnings: tuple[str, ...] = ()
     damage: str | None = None
     position: int | None = None
+    boot_utc: int = 0
 
     def done(self, messages: int) -> int:
         """Return the progress towards `total`, given the number of messages so far."""

@@ -39,7 +39,7 @@ class UlogSource:
         messages = self._read(reader, run)
         ahead = list(islice(messages, _AHEAD))
         run.messages = (message for part in (ahead, messages) for message in part)
-        run.total = self._path.stat().st_size
+        run.total, run.boot_utc = self._path.stat().st_size, reader.boot_utc
         streams = list(reader.streams.values())
         layouts = " and ".join(sorted({_layout_name(each) for each in streams if each.definition is DEFAULT}))
         layout = f", layout {layouts}" if layouts else ""

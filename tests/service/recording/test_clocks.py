@@ -12,7 +12,7 @@ import pytest
 import nedbus
 from nedbus.sources import read_account
 from nedbus_msgs import DEFAULT_TOPIC, is_unix_time
-from tests.flights.replays import open_replay
+from tests.flights.replays import convert_replay, open_replay
 
 DATA: Final = Path(__file__).parents[2] / "data"
 UNIX: Final = DATA / "uxrce_unix_time.mcap"
@@ -33,6 +33,12 @@ def test_every_caller_has_the_same_utc(path: Path, utc: str, source: str) -> Non
     assert nedbus.align(path, utc=True)["utc"][0] == np.datetime64(utc.replace(" ", "T"))
     event: Any = SimpleNamespace(vehicle="1", boot=first / 1e6)
     assert read_account(path).times.utc(event) == pytest.approx(found.unix_us(int(first)) / 1e6)
+
+
+def test_conversion_keeps_the_time_of_the_boot(tmp_path: Path) -> None:
+    """A recording of a log without a clock in its messages has the UTC that the log's information gives."""
+    convert_replay(f"ulog:{BOOT}", tmp_path / "a.mcap")
+    assert nedbus.utc_of(tmp_path / "a.mcap") == nedbus.utc_of(BOOT)
 
 
 def test_clocks_may_be_mixed() -> None:

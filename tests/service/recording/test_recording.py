@@ -24,7 +24,7 @@ from nedbus.cli.follow import write_notice
 from nedbus.client import Subscription
 from nedbus.errors import OutputError, SourceError
 from nedbus.recording import Recorder, RecordingReader, RecordingWriter
-from nedbus.sources import SourceMessage, convert
+from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import to_array
@@ -447,7 +447,8 @@ def test_strange_messages_are_converted_or_counted(tmp_path: Path) -> None:
     done: list[int] = []
     strange = [{"timestamp": 2**64 - 1}, {"timestamp": 2, "xy_valid": True}]
     messages = [SourceMessage(0.0, ADDRESS, each) for each in [{"timestamp": 1}] * 2998 + strange]
-    assert convert(messages, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
+    run = ReplayRun(iter(messages), {}, None, "")
+    assert convert(run, path, source="ulog", on_progress=done.append) == "2999 messages, 1 rejected"
     assert [each.timestamp for *_, each in read_independently(path)] == [1] * 2998 + [2**64 - 1]
     assert done == [1024, 2048]
 

@@ -30,7 +30,7 @@ for module in ("nedbus.sources.mcap", "nedbus.recording.mcap_writer"):
 def convert():
     replay = nedbus.sources.parse_source(nedbus.sources.source_text_of_file(path, topics="*")).open_source(vehicle="1")
     target = path.with_name("converted.mcap")
-    nedbus.sources.convert(replay.open().messages, target, source="ulog", on_progress=lambda _: None)
+    nedbus.sources.convert(replay.open(), target, source="ulog", on_progress=lambda _: None)
 
 def play():
     recording = nedbus.web.playback.Recording(path)

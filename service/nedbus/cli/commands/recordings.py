@@ -79,7 +79,7 @@ def convert(
     run = replay.open()
     with show_progress() as show:
         report = convert_messages(
-            run.messages,
+            run,
             output,
             source=spec.kind,
             on_progress=lambda done: show(f"{output}", run.done(done), run.total),
