@@ -22,14 +22,7 @@ _MAX_FIELDS: Final = 65_536  # of all messages defined by publishers; PX4's have
 _BASE: Final = 48  # fields that take as much memory as a message without any
 _MAX_UNKNOWN: Final = 64  # messages and layouts per query, and those that wait for the next one
 _MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the first one may be asked for again
-_PAUSES: Final = (
-    0.5,
-    2.0,
-    5.0,
-    10.0,
-    30.0,
-    60.0,
-)  # s until the same is asked for again, by the number of failed queries
+_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s until the same is asked for again, by failed queries
 _PACE: Final = 0.2  # s between a query without a result and the next one
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
 _PATIENCE: Final = 3.0  # s that readers wait for definitions in vain

@@ -1,0 +1,114 @@
+"""Small files made after the reports of users, each with its right value by an independent tool."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+import nedbus
+from nedbus.errors import SourceError
+from nedbus.sources import FileAccount, parse_source, read_account
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
+from tests.peers.command_line import run_command
+
+CASES: Final = Path(__file__).parents[4] / "shared/cases"
+
+pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+
+
+def utc(name: str) -> str:
+    """Return the UTC of the first position."""
+    found = nedbus.utc_of(CASES / name)
+    assert found is not None
+    return str(found.at(nedbus.read(CASES / name)["timestamp"][0]))[:19]
+
+
+def count(name: str) -> dict[str, int]:
+    """Return the number of messages of each stream."""
+    return {stream: len(each) for stream, each in nedbus.read(CASES / name, ["*"]).items()}
+
+
+def dues(name: str) -> tuple[float, float]:
+    """Return when a replay is due with its first position, and with its last one [s]."""
+    found = [each.due for each in open_replay(f"ulog:{CASES / name}").messages if each.address.topic == VLP]
+    return round(found[0], 2), round(found[-1], 2)
+
+
+def events(name: str) -> set[tuple[str, str]]:
+    """Return the kind and the severity of all events."""
+    return {(each.kind, each.severity) for each in account(name).account.events}
+
+
+def account(name: str) -> FileAccount:
+    return read_account(CASES / name)
+
+
+def exit_code(name: str, tmp_path: Path) -> int:
+    """Return how its conversion ends."""
+    return run_command("convert", str(CASES / name), str(tmp_path / "a.mcap")).exit_code
+
+
+RIGHT: Final[list[tuple[Callable[[str], object], str, object]]] = [
+    (utc, "08_boot_time_utc_us.ulg", "2025-09-08 13:31:04"),
+    (utc, "28_uxrce_timesync_unix.mcap", "2025-10-09 08:53:19"),  # .997
+    (count, "15_logging_dropout_5s.ulg", {VLP: 500}),
+    (count, "16_home_position_50s_old.ulg", {VLP: 500, "home_position": 1}),
+    (count, "31_fmu_in_topics.mcap", {
+        VLP: 50, "offboard_control_mode": 50, "trajectory_setpoint": 50, "vehicle_visual_odometry": 50,
+    }),
+    (count, "04_replayed_zero_attitude.ulg", {"vehicle_attitude": 250, VLP: 250}),
+    (dues, "16_home_position_50s_old.ulg", (0.0, 9.98)),
+    (dues, "16b_home_position_108s_old.ulg", (0.0, 9.98)),
+    (events, "15_logging_dropout_5s.ulg", {("dropout", "info")}),
+    (events, "16_home_position_50s_old.ulg", set()),
+    (events, "17_old_log_without_release.ulg", {("mode", "info")}),
+    (events, "18_primary_ekf_is_1.ulg", set()),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("value", "name", "right"), RIGHT)
+def test_value_is_right(value: Callable[[str], object], name: str, right: object) -> None:
+    """By pyulog, rosbags, and the times of the files' own records."""
+    assert value(name) == right
+
+
+def test_old_log_is_not_damaged(tmp_path: Path) -> None:
+    """A log without ver_sw_release is converted whole, with nothing to warn of."""
+    assert exit_code("17_old_log_without_release.ulg", tmp_path) == 0
+    assert account("17_old_log_without_release.ulg").warnings == ()
+
+
+def test_cause_is_the_end_of_the_fake_position() -> None:
+    """The position is invalid from 154.3 on: the fake position ended at 154.1, and nothing was fused before 160.4."""
+    told = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
+    (invalid,) = (line for line in told if "BAD    xy not valid" in line)
+    assert invalid.startswith("   154.300")
+    assert "no horizontal aiding: fake position ended, nothing else is fused (200 ms before)" in invalid
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("07_encrypted.ulg", "an encrypted log"),
+        ("24_ros2idl.mcap", "cdr with ros2idl"),
+        ("24b_no_definition.mcap", "no definition of px4_msgs/msg/VehicleLocalPosition"),
+    ],
+)
+def test_refusal_names_the_reason(name: str, reason: str) -> None:
+    """Whatever cannot be read is named, with what to do."""
+    with pytest.raises(SourceError, match=reason):
+        nedbus.read(CASES / name)
+
+
+@pytest.mark.parametrize(
+    "name", ["Bom", "BomCrlf", "DefaultValue", "FormFeed", "Latin1", "LineSep", "Nel", "StringConst"]
+)
+def test_definitions_are_read(name: str) -> None:
+    """The .msg files that rosbags reads, and those with a BOM, which it refuses."""
+    source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(vehicle="1")
+    ((definition,),) = (each.values() for each in source._given.values())
+    assert [*definition.types][:3] == ["timestamp", "angle", "mode"]
