@@ -54,7 +54,7 @@ def test_example_runs(start: Start, flying: str, tmp_path: Path, name: str) -> N
     assert PRINTS[name] in process.out, process.err
     if name != "fleet.py":  # which ends by itself
         process.signal(signal.SIGINT)
-    assert process.wait() == 0
+    assert process.wait() == 0, process.err
     assert process.err == ""
 
 

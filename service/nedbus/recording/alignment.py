@@ -107,7 +107,7 @@ def align(
         columns["utc"] = np.full(len(times), np.datetime64("NaT", "us"))
         if offset:
             unix = offset.unix_us(times)
-            columns["utc"] = np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT"))
+            columns["utc"] = np.where(is_unix_time(unix), unix.astype("M8[us]"), columns["utc"])
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
