@@ -8,6 +8,7 @@ import logging
 import os
 import queue
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from typing import Final
@@ -17,10 +18,23 @@ from nedbus.transport import is_forked
 _log = logging.getLogger(__name__)
 
 _DRAIN: Final = 2.0  # s that the exit of the process waits for pending closes
+_START_PAUSE: Final = 0.005  # s between looks at a thread that is about to run
 _pending: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # a SimpleQueue, as `put` has to be reentrant
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 _start = threading.Lock()
 _closer: list[threading.Thread] = []  # empty until started: a fork marks threads as stopped
+
+
+def join_thread(thread: threading.Thread, timeout: float) -> None:
+    """Wait up to `timeout` seconds for a thread to end, also if Ctrl-C interrupted its start and it is yet to run."""
+    end = time.monotonic() + timeout
+    while (left := end - time.monotonic()) > 0:
+        try:
+            thread.join(left)
+        except RuntimeError:  # not started
+            time.sleep(_START_PAUSE)
+        else:
+            return
 
 
 class Finalizer:

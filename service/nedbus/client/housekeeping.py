@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
+from nedbus.client.closing import join_thread
 from nedbus.log_event import about
 
 _log = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ class Housekeeping:
         self.closed = True
         self.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_JOIN_TIMEOUT)
+            join_thread(self._thread, _JOIN_TIMEOUT)
 
     def _remove(self, job: Job) -> None:
         with self._round, suppress(ValueError):

@@ -11,6 +11,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, Final
 
+from nedbus.client.closing import join_thread
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus_msgs import MESSAGES, Codec, Definition, UnknownLayoutError, codec_of, define, field_type
@@ -104,7 +105,7 @@ class LayoutLookup:
             self._changed.notify_all()
             thread = self._thread
         if thread is not None:
-            thread.join(_PATIENCE)
+            join_thread(thread, _PATIENCE)
 
     def _request(self, wanted: Wanted, publisher: object = None) -> None:
         with self._changed:

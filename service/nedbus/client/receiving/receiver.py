@@ -17,6 +17,7 @@ from typing import Final, TypeVar
 
 import zenoh
 
+from nedbus.client.closing import join_thread
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import CLOSED, read_parameters
 from nedbus.log_event import about
@@ -130,7 +131,7 @@ class Receiver:
             with suppress(zenoh.ZError):  # the session is already closed
                 undeclare()
         if self._pump is not None:  # a thread still in Zenoh at interpreter exit aborts the process
-            self._pump.join(_JOIN_TIMEOUT)
+            join_thread(self._pump, _JOIN_TIMEOUT)
         if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
             self._receiving.release()
 
