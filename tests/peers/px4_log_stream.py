@@ -204,7 +204,8 @@ class Px4LogStream:
     `events`: at times of the recording [s]. `on_send`: called with each frame.
     `waits`: the recording is held before its own START until one comes.
 
-    `commands`: MAV_CMD of those received. `dropped`, `late`: LOGGING_DATA that never arrive, and those that come late.
+    `commands`: MAV_CMD of those received. `dropped`: LOGGING_DATA that never arrive, before one that does.
+    `late`: those that come late.
     `streams`: number of streams that began. `finished`: set when the recording has been sent.
     """
 
@@ -244,6 +245,7 @@ class Px4LogStream:
         self._crc_extra: dict[int, int] = {}
         self._held: list[tuple[int, bytes, int]] = []  # late frames: the number of the frame that they follow
         self._frames = self._drops_left = self._data_sent = self._newest = 0
+        self._unnoticed: list[int] = []  # LOGGING_DATA that were dropped since the last one that arrived
         self._is_gone = False
         self._busy_until = self._next_heartbeat = 0.0
         self._is_full, self._next_look = False, 0
@@ -490,11 +492,11 @@ class Px4LogStream:
             self._drops_left = self._burst
         if self._is_gone or self._drops_left:
             self._drops_left = max(0, self._drops_left - 1)
-            self.dropped += number > 0
+            self._unnoticed += [number] if number else []
         elif self._random.random() < self._reorder:
             self._held.append((self._frames + self._random.randint(1, _MAX_LATE), frame, number))
         else:
-            self._newest = max(self._newest, number)
+            self._arrive(number)
             self._on_send(frame)
             self._socket.sendto(frame, ("127.0.0.1", self._port))
 
@@ -505,8 +507,14 @@ class Px4LogStream:
             if everything or due <= self._frames:
                 self._held.remove(each)
                 self.late += 0 < number < self._newest
-                self._newest = max(self._newest, number)
+                self._arrive(number)
                 self._socket.sendto(frame, ("127.0.0.1", self._port))
+
+    def _arrive(self, number: int) -> None:
+        """Count what was dropped before a LOGGING_DATA that arrives."""
+        dropped = sum(each < number for each in self._unnoticed)
+        self.dropped, self._unnoticed = self.dropped + dropped, self._unnoticed[dropped:]
+        self._newest = max(self._newest, number)
 
     def _renumber(self, frame: bytes) -> bytes:
         """Return a frame with the next sequence of this link, as PX4 counts what it sends."""
