@@ -204,7 +204,7 @@ class Px4LogStream:
     `events`: at times of the recording [s]. `on_send`: called with each frame.
     `waits`: the recording is held before its own START until one comes.
 
-    `commands`: MAV_CMD of those received. `dropped`: LOGGING_DATA that never arrive, before one that does.
+    `commands`: MAV_CMD of those received. `dropped`: LOGGING_DATA that never arrive, before a message that does.
     `late`: those that come late.
     `streams`: number of streams that began. `finished`: set when the recording has been sent.
     """
@@ -358,6 +358,7 @@ class Px4LogStream:
         if stream.acknowledged is not None and now >= stream.acknowledged:
             stream.pending.popleft()
             stream.sends, stream.acknowledged = 0, None
+            self.dropped, self._unnoticed = self.dropped + len(self._unnoticed), []
             if not stream.pending:
                 self._clock = max(self._clock, self.recording.header_end)
                 return
@@ -394,6 +395,7 @@ class Px4LogStream:
     def _begin(self, ids: tuple[int, int]) -> _Stream:
         """Return a stream with the whole header, and with the definitions of topics that appeared since."""
         recording, stream = self.recording, _Stream(ids)
+        self._unnoticed = []
         for each in recording.header:
             stream.append(each)
         for index, record in recording.definitions:
