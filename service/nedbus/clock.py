@@ -16,7 +16,7 @@ utc_ns = time.time_ns
 
 
 def steady() -> float:
-    """Return a time that nobody can set [s]: Unix time by the host's clock as it was when this process started."""
+    """Return a monotonic time [s] that equals the host's Unix time when this process starts."""
     return _START + time.monotonic()
 
 

@@ -52,8 +52,8 @@ class UlogReader:
     """Read the messages of a log in the log's order; the memory does not grow with the log.
 
     `topics`: those to read, None for all. `vehicle`: by default the log's MAV_SYS_ID, else `default_vehicle`.
-    `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if
-    the log has none so far. `position`: bytes read so far.
+    `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if the log has none so far.
+    `position`: bytes read so far.
     `dropout`: seconds that the logger lost, until the caller resets it. `streams`: those with a message so far.
     `damaged`: True if damage may have cost messages so far.
     """
@@ -133,10 +133,9 @@ class UlogReader:
         """Take what is not a message."""
         if isinstance(record, ulog.Header):
             self.start = record.timestamp
-        elif (
-            isinstance(record, ulog.Information) and record.key == "boot_time_utc_us" and isinstance(record.value, int)
-        ):
-            self.boot_utc = record.value
+        elif isinstance(record, ulog.Information):
+            if record.key == "boot_time_utc_us" and isinstance(record.value, int):
+                self.boot_utc = record.value
         elif isinstance(record, ulog.Dropout):
             self.dropout += record.duration / 1e3
         elif isinstance(record, ulog.Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):

@@ -264,12 +264,12 @@ def test_hostile_datagrams_are_counted(listener: Listener, port: int) -> None:
 def test_messages_of_others_are_ignored(listener: Listener, port: int) -> None:
     """A late datagram is rejected, as are messages of a system or component 0; a camera's position is ignored."""
     with (
-        Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as nobody,
+        Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as unnamed,
         Autopilot(port, component=0) as unset,
     ):  # fmt: skip
         vehicle.send(estimator_status(127), local_position(2000, math.nan, *range(5)), local_position(1500))
         camera.send(local_position(3000))
-        nobody.send(local_position(3000))
+        unnamed.send(local_position(3000))
         unset.send(local_position(3000))
         vehicle.send(local_position(4000))
         first, second = listener.receive(2)

@@ -287,7 +287,7 @@ def test_old_log_without_its_release_is_not_damaged(tmp_path: Path) -> None:
 
 
 def test_dropout_in_a_log_is_an_event_of_the_logger(tmp_path: Path) -> None:
-    """A dropout of 5 s is told with its duration; a gap without a record of it is silence of the vehicle."""
+    """A dropout of 5 s becomes an event with its duration; a gap without such a record is silence of the vehicle."""
     for is_recorded in (True, False):
         writer = UlogWriter()
         writer.define([VLP])
