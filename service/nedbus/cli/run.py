@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import queue
 import signal
 import sys
 import threading
@@ -20,6 +21,7 @@ from nedbus.log_event import about
 _log = logging.getLogger("nedbus")
 
 _END_TIMEOUT: Final = 1.6  # s between a signal and a forced exit
+_TICK: Final = 0.5  # s between two calls of `on_tick`
 _HANGUP_PAUSE: Final = 0.2  # s; some shells pass the signal on before their terminal is gone
 
 
@@ -32,7 +34,7 @@ def run_until_stopped(
 ) -> None:
     """Run `body` in a thread until it returns; Ctrl-C, SIGTERM or SIGHUP set its stop event.
 
-    `on_stop` is called from the signal handler, `on_tick` ten times a second from the main thread, and `on_hangup`
+    `on_stop` is called from the signal handler, `on_tick` twice a second from the main thread, and `on_hangup`
     after a SIGHUP that does not come from a closed terminal, in place of the end. `nohup` keeps SIGHUP ignored.
     The main thread does nothing else, and so handles signals at once, even while Zenoh blocks.
 
@@ -42,24 +44,29 @@ def run_until_stopped(
     outcome: Future[object] = Future()
     signals: list[int] = []
     hangups: list[int] = []
+    changed: queue.SimpleQueue[None] = queue.SimpleQueue()  # `put` is reentrant
 
     def run() -> None:
         try:
             outcome.set_result(body(stop))
         except BaseException as exc:  # noqa: BLE001 - raised again below, in the main thread
             outcome.set_exception(exc)
+        changed.put(None)
 
-    def on_signal(number: int, _: FrameType | None) -> None:
+    def end(number: int) -> None:
         if signals:
             os._exit(130 if number == signal.SIGINT else 1)  # the second signal exits at once
         signals.append(number)
         stop.set()
         on_stop()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        signal.signal(signal.SIGHUP, lambda number, _: hangups.append(number))
+    def on_signal(number: int, _: FrameType | None) -> None:
+        (hangups.append if number == signal.SIGHUP else end)(number)
+        changed.put(None)
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, on_signal)
     on_terminal = _has_terminal()
     thread = threading.Thread(target=run, name="nedbus-run", daemon=True)
     thread.start()
@@ -72,24 +79,27 @@ def run_until_stopped(
             if on_hangup is not None and _has_terminal() == on_terminal:
                 on_hangup()
             else:
-                on_signal(signal.SIGHUP, None)
+                end(signal.SIGHUP)
         on_tick()
-        thread.join(0.1)
+        with suppress(queue.Empty):
+            changed.get(timeout=_TICK)
     if signals:
         _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("ending"))
     thread.join(_END_TIMEOUT)
     if thread.is_alive():
-        text = (
-            f"shutdown took more than {_END_TIMEOUT:g} s, maybe because of a blocked reader: unsent messages are lost"
-        )
-        _log.error(text, extra=about("ending"))
-        sys.stderr.flush()
-        os._exit(1)
+        _force_exit()
     succeeded = outcome.result() is not False
     if signals[:1] == [signal.SIGINT]:
         raise typer.Exit(130)
     if not succeeded:
         raise typer.Exit(1)
+
+
+def _force_exit() -> None:
+    text = "shutdown took more than %g s, maybe because of a blocked reader: unsent messages are lost"
+    _log.error(text, _END_TIMEOUT, extra=about("ending"))
+    sys.stderr.flush()
+    os._exit(1)
 
 
 def _has_terminal() -> bool:

@@ -83,7 +83,7 @@ class Notifier:
             self._thread.join(1.0)  # the interpreter aborts at exit if a thread is inside Zenoh
 
     def tick(self) -> None:
-        """Record that the main thread is alive; call it ten times a second."""
+        """Record that the main thread is alive; call it twice a second."""
         self._ticked = True
 
     def stopping(self) -> None:

@@ -19,7 +19,6 @@ from .discovery import (
 )
 from .health.stream_health import Health, Histogram, Monitor, StreamHealth
 from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
-from .housekeeping import Housekeeping
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
@@ -36,7 +35,7 @@ else:
 
 __all__ = [
     "HEARTBEAT", "AsyncBus", "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "Counts", "Health", "Histogram",
-    "Housekeeping", "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "QueryServer",
+    "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "QueryServer",
     "RejectionReport", "Rejections", "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState",
     "StreamStatus", "Subscription", "check_max_rate", "connect", "connect_async", "connect_with", "describe_stream",
     "find_accounts", "find_services", "health_of_last", "stream_state", "to_age",

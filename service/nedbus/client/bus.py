@@ -22,7 +22,6 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Definition, Selection, vehi
 from .by_topic import by_topic, last
 from .closing import Finalizer
 from .discovery import Rejections, ServiceStatus, VehicleDirectory, find_accounts, find_schemas, find_services
-from .housekeeping import Housekeeping
 from .protocol import LIVE
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
@@ -46,14 +45,14 @@ class Bus:
         self.routers = tuple(routers)
         self._tls = tls
         self._zenoh = session
-        self._housekeeping = Housekeeping()
         self._queries = QueryServer(session)
-        self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
+        self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(Selection(), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         closing = ExitStack()  # in reverse order; closing the session ends an open query for layouts
-        for close in (self._layouts.close, session.close, self._housekeeping.close, self._queries.close):
+        heartbeats = self._publishers.heartbeats  # the registry references publishers, and they the bus
+        for close in (self._layouts.close, session.close, heartbeats.close, self._queries.close):
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
         self._finalizer = Finalizer(self, closing.close)
@@ -217,12 +216,12 @@ class Bus:
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
-        session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
+        session, prefix = self._session, self.prefix
         receiver: Receiver
         if isinstance(pending_queue, MaxRateQueue):
-            receiver = MaxRateReceiver(session, selection, pending_queue, prefix=prefix, housekeeping=housekeeping)
+            receiver = MaxRateReceiver(session, selection, pending_queue, prefix=prefix)
         else:
-            receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue, housekeeping=housekeeping)
+            receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue)
         self._receivers.add(receiver)
         if not self._finalizer.alive:  # closed by another thread
             receiver.close()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
-import logging
 import os
-import queue
 import threading
 import time
 import weakref
@@ -15,14 +13,12 @@ from typing import Final
 
 from nedbus.transport import is_forked
 
-_log = logging.getLogger(__name__)
+from .io_thread import CallThread
 
 _DRAIN: Final = 2.0  # s that the exit of the process waits for pending closes
 _START_PAUSE: Final = 0.005  # s between looks at a thread that is about to run
-_pending: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # a SimpleQueue, as `put` has to be reentrant
+_closer = CallThread("nedbus-closer")
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
-_start = threading.Lock()
-_closer: list[threading.Thread] = []  # empty until started: a fork marks threads as stopped
 
 
 def join_thread(thread: threading.Thread, timeout: float) -> None:
@@ -49,10 +45,7 @@ class Finalizer:
         self._close = close
         _owners.add(owner)
         self._finalize = weakref.finalize(owner, _close_later, close)
-        with _start:
-            if not _closer:
-                _closer.append(threading.Thread(target=_run, name="nedbus-closer", daemon=True))
-                _closer[0].start()
+        _closer.start()
 
     @property
     def alive(self) -> bool:
@@ -69,27 +62,15 @@ def _close_later(close: Callable[[], object]) -> None:
     if is_forked():
         return  # the session belongs to the parent process
     if threading.main_thread().is_alive():
-        _pending.put(close)
+        _closer.put(close)
     else:  # the process is exiting and no longer waits for threads
         close()
-
-
-def _run() -> None:
-    while True:
-        close = _pending.get()
-        try:
-            close()
-        except Exception:  # noqa: BLE001 - one failed close must not stop the others
-            _log.debug("cannot close an unreferenced object", exc_info=True)
 
 
 @atexit.register
 def _drain() -> None:
     """Wait for pending closes: a thread still in Zenoh at interpreter exit aborts the process."""
-    if _closer and _closer[0].is_alive():
-        drained = threading.Event()
-        _pending.put(drained.set)
-        drained.wait(_DRAIN)
+    _closer.drain(_DRAIN)
 
 
 def _after_fork() -> None:

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final, Literal
 
 from nedbus import clock
-from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
+from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
 from nedbus.errors import ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
@@ -169,10 +169,9 @@ class Daemon:
         session = self._session = self._open()
         if session is None:
             return True
-        settings, queries, housekeeping = self._settings, QueryServer(session), Housekeeping()
-        is_client = self.role == "client"
+        settings, queries, is_client = self._settings, QueryServer(session), self.role == "client"
+        registry = PublisherRegistry(session, queries, prefix=settings.prefix, is_client=is_client)
         try:
-            registry = PublisherRegistry(session, queries, housekeeping, prefix=settings.prefix, is_client=is_client)
             queries.answer_json(status_key(self.id, prefix=settings.prefix), self._answer)
             with self._planning:
                 self._registry = registry
@@ -184,7 +183,7 @@ class Daemon:
             self._stop.set()
             stop_workers(self._workers, _GRACE)
             queries.close()
-            housekeeping.close()
+            registry.heartbeats.close()
             session.close()
             if self._permission is not None:
                 self._permission.close()

@@ -17,7 +17,7 @@ import zenoh
 
 import nedbus
 from nedbus import ClosedError, Counts, Mode
-from nedbus.client import Housekeeping, PublisherRegistry, QueryServer, RejectionReport
+from nedbus.client import PublisherRegistry, QueryServer, RejectionReport
 from nedbus.client.receiving.decoder import Decoder
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
@@ -279,9 +279,7 @@ def test_reports_arrive_with_their_reason(bus: nedbus.Bus, raw: Session) -> None
     ):
         raw.put(key, payload)
     queries = QueryServer(raw)
-    PublisherRegistry(raw, queries, Housekeeping(), prefix="nedbus", is_client=True).reject(
-        ADDRESS, {"reason": "x is NaN"}
-    )
+    PublisherRegistry(raw, queries, prefix="nedbus", is_client=True).reject(ADDRESS, {"reason": "x is NaN"})
     reports: list[RejectionReport] = []
 
     def has_come() -> bool:

@@ -16,7 +16,6 @@ import pytest
 import nedbus
 from nedbus import Counts
 from nedbus.cli.output.samples import to_line
-from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.receiving import Receiver
 from nedbus.transport import open_client
 from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, define, encode, field_type
@@ -161,8 +160,8 @@ def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: A
     """A reader of mode `every` gets missing messages from the publisher's history cache, in order."""
     publisher, queue = publisher_of(bus, address), LossyQueue()
     queue.missing = {1, 2, 3, 6}
-    with closing(Housekeeping()) as housekeeping, closing(open_client([endpoint], timeout=DEADLINE)) as session:
-        receiver = Receiver(session, address.key(), queue, housekeeping=housekeeping)
+    with closing(open_client([endpoint], timeout=DEADLINE)) as session:
+        receiver = Receiver(session, address.key(), queue)
         with nedbus.Subscription[Any](receiver, queue, owner=None) as subscription:
             wait_for_reader(bus._session, address.key())
             for number in range(10):

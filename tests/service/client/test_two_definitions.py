@@ -236,6 +236,7 @@ def test_payload_of_another_size_is_invalid(bus: nedbus.Bus, raw: Session) -> No
     publisher_of(bus, "A")
     with bus.subscribe(TOPIC, mode="every") as subscription:
         key, encoding = f"nedbus/1/{TOPIC}", encoding_of(definition_of("A"), None)
+        wait_for_reader(raw, key)
         for payload in (msgpack.packb([0, 1, 2.0]), msgpack.packb([7, 1, 2.0, 3.0]), msgpack.packb([0, 1, 2.0, 3.0])):
             raw.put(key, payload, encoding=encoding)
         assert as_dict(subscription.receive(DEADLINE).message) == {"timestamp": 1, "north": 2.0, "east": 3.0}

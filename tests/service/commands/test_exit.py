@@ -186,7 +186,7 @@ def test_threads_of_ten_subscriptions(endpoint: str) -> None:
     with nedbus.connect(endpoint) as bus:
         subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(10)]
         assert {thread.name for thread in set(threading.enumerate()) - before} <= {
-            "nedbus-housekeeping",
+            "nedbus-io",
             "nedbus-closer",
         }
         for subscription in subscriptions:

@@ -15,7 +15,7 @@ import zenoh
 
 import nedbus
 from nedbus import Counts
-from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.io_thread import Job
 from nedbus.client.receiving import Receiver, retransmission, stateful_reader, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
@@ -34,20 +34,11 @@ KEY = f"nedbus/7/{VLP}"
 
 
 @pytest.fixture
-def housekeeping() -> Iterator[Housekeeping]:
-    """Run the thread shared by the receivers of a session."""
-    with closing(Housekeeping()) as thread:
-        yield thread
-
-
-@pytest.fixture
-def lossy(
-    endpoint: str, bus: nedbus.Bus, housekeeping: Housekeeping, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Lossy]:
+def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lossy]:
     """Subscribe to all vehicles, and wait until the publisher is matched."""
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue()
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
-        lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue, housekeeping=housekeeping), publisher)
+        lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue), publisher)
         monkeypatch.setattr(retransmission, "request_samples", lossy.ask)
         with lossy.subscription:
             wait_for_subscriber(publisher)
@@ -121,9 +112,7 @@ def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypa
 
 
 @pytest.mark.parametrize("waits", ["without", "with a timeout"])
-def test_newest_message_is_recovered_by_heartbeat(
-    lossy: Lossy, raw: Session, housekeeping: Housekeeping, waits: str
-) -> None:
+def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, waits: str) -> None:
     """The newest message is recovered by a heartbeat, also if its reader waits in Zenoh's channel without timeout.
 
     The sample that wakes it up is invisible to other readers of its session, and does not leave the process.
@@ -133,7 +122,7 @@ def test_newest_message_is_recovered_by_heartbeat(
     foreign = raw.declare_subscriber(KEY, seen)
     wait_for_router(raw)
     lossless = LossyQueue()
-    other = Receiver(lossy.session, KEY, lossless, housekeeping=housekeeping)
+    other = Receiver(lossy.session, KEY, lossless)
 
     def read() -> None:
         if waits == "without":
@@ -172,7 +161,7 @@ def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
 
 
 @pytest.mark.parametrize("when", ["open", "closed"])
-def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, housekeeping: Housekeeping, when: str) -> None:
+def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str) -> None:
     """A flood of replies to a request does not stop the session, not even after its reader has closed."""
     asked = threading.Event()
 
@@ -191,7 +180,7 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, housekeepi
         else:
             assert lossy.receive(3) == [0, 1, 2]
         queue = LossyQueue()
-        other = Receiver(lossy.session, KEY, queue, housekeeping=housekeeping)
+        other = Receiver(lossy.session, KEY, queue)
 
         def goes_on() -> bool:
             lossy.publish(7)
@@ -232,7 +221,7 @@ def test_requests_without_replies_delay_no_others(lossy: Lossy, raw: Session) ->
         taken.clear()
 
 
-def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pytest.LogCaptureFixture) -> None:
+def test_job_that_fails_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
     """An exception in the job of one subscription is logged once, and delays neither it nor others."""
     calls: list[float] = []
 
@@ -245,10 +234,10 @@ def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pyte
         return 0.01
 
     others: list[float] = []
-    ends = [housekeeping.add(fail_at_first), housekeeping.add(go_on)]
+    jobs = [Job(fail_at_first), Job(go_on)]
     wait_for(lambda: len(calls) > 5 and len(others) > 5, what="both")
-    for end in ends:
-        end()
+    for job in jobs:
+        job.end()
     assert sum("unexpected error" in text for text in caplog.messages) == 1
 
 

@@ -16,7 +16,6 @@ import zenoh
 from pydantic_core import to_json
 
 from nedbus.client.discovery import VehicleDirectory
-from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
@@ -32,25 +31,22 @@ from .writer import Heartbeats
 _log = logging.getLogger(__name__)
 
 _TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to reply with its tokens; usually milliseconds
-_MAX_DEFINITIONS: Final = 64  # per message name; beyond, the first one without a publisher is forgotten
+_MAX_UNUSED: Final = 64  # definitions without a publisher, for readers that still have messages of one
 _FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
 
 
 class PublisherRegistry:
     """Creates the publishers of a session, one per address, and replies to queries for their last messages.
 
-    `housekeeping` sends their heartbeats. `is_client`: the session is a client, and reaches readers through a router.
+    `is_client`: the session is a client, and reaches readers through a router.
     """
 
-    def __init__(
-        self, session: Session, queries: QueryServer, housekeeping: Housekeeping, *, prefix: str, is_client: bool
-    ) -> None:
+    def __init__(self, session: Session, queries: QueryServer, *, prefix: str, is_client: bool) -> None:
         self.prefix, self.is_client = prefix, is_client
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
-        self._session, self._queries, self._housekeeping = session, queries, housekeeping
+        self._session, self._queries = session, queries
         self._publishers: dict[Address, Publisher] = {}
-        self._definitions: dict[str, dict[str, Definition[Any]]] = {}  # of all publishers so far, by name and hash
-        self._answered: set[str] = set()  # key expressions of schemas and of vehicles with a queryable
+        self._definitions: dict[str, dict[str, Definition[Any]]] = {}  # by name and hash, oldest first
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
         self._shared: set[str] = set()
@@ -93,19 +89,8 @@ class PublisherRegistry:
             publisher = self._publishers[address] = Publisher(
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
-            if not self._answered:
-                self._housekeeping.add(self.heartbeats.send_due)
-            schema, messages = schema_key(definition.name, prefix=self.prefix), f"{self.prefix}/{vehicle}/**"
-            definitions = self._definitions.setdefault(definition.name, {})
-            definitions[short_hash(definition.name, definition.types)] = definition
-            if len(definitions) > _MAX_DEFINITIONS:
-                used = {each.definition for each in self._publishers.values()}
-                del definitions[next(short for short, each in definitions.items() if each not in used)]
-            if schema not in self._answered:
-                self._queries.answer(schema, partial(_reply_schemas, schema, definitions))
-            if messages not in self._answered:
-                self._queries.answer(messages, _weakly(self._reply, vehicle))
-            self._answered |= {schema, messages}
+            self._queries.answer(self._messages_of(vehicle), _weakly(self._reply, vehicle))
+            self._add_definition(definition)
         return publisher
 
     def is_published(self, address: Address) -> bool:
@@ -163,8 +148,27 @@ class PublisherRegistry:
         with self._lock:
             self._publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self._publishers):
+                self._queries.end(self._messages_of(address.vehicle))
                 self._matched.pop(address.vehicle).close()
                 del self._directories[address.vehicle]
+
+    def _messages_of(self, vehicle: str) -> str:
+        return f"{self.prefix}/{vehicle}/**"
+
+    def _add_definition(self, definition: Definition[Any]) -> None:
+        """Reply to queries for a definition, and no more to those for the oldest one without a publisher."""
+        name = definition.name
+        known, key = self._definitions.setdefault(name, {}), schema_key(name, prefix=self.prefix)
+        known[short_hash(name, definition.types)] = definition
+        self._queries.answer(key, partial(_reply_schemas, key, known))
+        if sum(map(len, self._definitions.values())) > len(self._publishers) + _MAX_UNUSED:
+            used = {each.definition for each in self._publishers.values()}
+            items = self._definitions.items()
+            name, short = next((name, short) for name, known in items for short in known if known[short] not in used)
+            del self._definitions[name][short]
+            if not self._definitions[name]:
+                del self._definitions[name]
+                self._queries.end(schema_key(name, prefix=self.prefix))
 
     def _reply(self, vehicle: str, query: zenoh.Query) -> None:
         """Reply with the last messages of a vehicle."""

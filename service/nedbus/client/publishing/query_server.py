@@ -1,28 +1,30 @@
-"""A server for Zenoh queries, with its own thread."""
+"""Replies to Zenoh queries: the I/O thread polls for them, and a thread of their own computes the replies."""
 
 from __future__ import annotations
 
 import json
 import logging
+import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Final
 
 import zenoh
 
-from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.io_thread import TICK, CallThread, Job
 from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 1000  # queued queries per key expression; beyond that the oldest are dropped
-_MAX_TURN: Final = 64  # queries per key expression in one poll, so that others get their turn
-_POLL: Final = 0.01  # s between polls
-_IDLE_POLL: Final = 0.05  # s between polls without a query for _BUSY seconds
+_TURN: Final = 0.02  # s of replies on one key expression, then others get their turn
+_POLL: Final = 0.01  # s between polls; a tick without a query for _BUSY seconds
 _BUSY: Final = 1.0
 JSON: Final = "application/json"
 
+_replies = CallThread("nedbus-replies")  # a report of many vehicles takes longer than the I/O thread may be held up
 
 Reply = Callable[[zenoh.Query], object]
 """Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close."""
@@ -33,39 +35,65 @@ class QueryServer:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._queryables: list[zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
-        self._thread = Housekeeping(name="nedbus-queries")
+        self._queryables: dict[str, _Queryable] = {}
 
     def answer(self, key_expr: str, reply: Reply) -> None:
-        """Call `reply` for each query on a key expression; raise ClosedError if the session is closed."""
-        channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
-        with while_open():
-            queryable = self._session.declare_queryable(key_expr, channel)
-        self._queryables.append(queryable)
-        busy_until, handler = 0.0, queryable.handler
+        """Call `reply` for each query on a key expression from now on, unless it is answered already.
 
-        def poll(now: float) -> float:
-            nonlocal busy_until
-            with suppress(zenoh.ZError):  # the session is closed
-                for _ in range(_MAX_TURN):
-                    if self._thread.closed or (query := handler.try_recv()) is None:
-                        break
-                    _answer(query, reply)
-                    busy_until = now + _BUSY
-            return _POLL if now < busy_until else _IDLE_POLL
-
-        self._thread.add(poll)
+        Raises ClosedError if the session is closed.
+        """
+        if key_expr not in self._queryables:
+            self._queryables[key_expr] = _Queryable(self._session, key_expr, reply)
 
     def answer_json(self, key: str, content: Callable[[Callable[[str], str | None]], Mapping[str, object]]) -> None:
         """Reply to queries on a key with JSON; `content` is called with a getter of the query's parameters."""
         self.answer(key, lambda query: query.reply(key, json.dumps(content(query.parameters.get)), encoding=JSON))
 
+    def end(self, key_expr: str) -> None:
+        """Reply no more to queries on a key expression. Idempotent."""
+        if (queryable := self._queryables.pop(key_expr, None)) is not None:
+            queryable.close()
+
     def close(self) -> None:
-        """Stop the thread and undeclare all queryables."""
-        self._thread.close()
-        for queryable in self._queryables:
-            with suppress(zenoh.ZError):
-                queryable.undeclare()
+        """Reply to no more queries."""
+        while self._queryables:
+            self._queryables.popitem()[1].close()
+
+
+class _Queryable:
+    def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
+        channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
+        with while_open():
+            self._queryable = session.declare_queryable(key_expr, channel)
+        self._take, self._reply = self._queryable.handler.try_recv, reply
+        self._query: zenoh.Query | None = None  # to be replied to
+        self._busy_until = 0.0
+        self._replying = threading.Lock()
+        self._closed = False
+        _replies.start()
+        self._job = Job(self._poll)
+
+    def close(self) -> None:
+        self._closed = True
+        self._job.end()
+        with self._replying, suppress(zenoh.ZError):  # a thread still in Zenoh at interpreter exit aborts the process
+            self._queryable.undeclare()
+
+    def _poll(self, now: float) -> float:
+        if self._query is None:
+            with suppress(zenoh.ZError):  # the session is closed
+                self._query = self._take()
+            if self._query is not None:
+                self._busy_until = now + _BUSY
+                _replies.put(self._take_turn)
+        return _POLL if now < self._busy_until else TICK
+
+    def _take_turn(self) -> None:
+        end = time.monotonic() + _TURN
+        with self._replying, suppress(zenoh.ZError):
+            while self._query is not None and not self._closed:
+                _answer(self._query, self._reply)
+                self._query = self._take() if time.monotonic() < end else None
 
 
 def _answer(query: zenoh.Query, reply: Reply) -> None:

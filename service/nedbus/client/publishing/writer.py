@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -10,14 +11,14 @@ from typing import Final
 import zenoh
 from zenoh import Priority
 
+from nedbus.client.io_thread import TICK, Job
 from nedbus.errors import ClosedError
 from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payload, while_open
 from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
-_POLL, _IDLE = 0.1, 0.5  # s between polls: while messages are published, and otherwise
-_TURN: Final = 256  # heartbeats per call, so that other housekeeping jobs are not delayed
-HEARTBEAT: Final = _PAUSES[0] + _POLL
+_TURN: Final = 256  # heartbeats per call, so that other jobs are not delayed
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK
 """Maximum delay of the first heartbeat after the last message [s]; readers then detect that they missed it."""
 
 
@@ -28,6 +29,8 @@ class Writer:
         self, heartbeats: Heartbeats, key: str, *, priority: Priority, cache: int, encoding: str | None = None
     ) -> None:
         self.session, self.key, self.priority, self.published = heartbeats.session, key, priority, 0
+        self.last_put = 0.0  # monotonic time of the last message [s]
+        self.is_silent = True  # since then a heartbeat has been sent, or there is no message yet
         self._heartbeats = heartbeats
         with while_open():
             # Interconnected routers cache the route of a message only if something is declared on its exact key.
@@ -50,6 +53,9 @@ class Writer:
             raise ClosedError
         self._publisher.put(payload, timestamp=stamp, encoding=encoding)
         self.published += 1
+        self.last_put = time.monotonic()
+        if self.is_silent:
+            self._heartbeats.resume(self)
 
     @property
     def closed(self) -> bool:
@@ -67,20 +73,21 @@ class Writer:
 
 @dataclass(slots=True)
 class _Silence:
-    """The silence of a writer since message number `published`, the last one; none before the first message."""
+    """The silence of a writer since its message at monotonic time `since` [s]; the first one follows."""
 
     publisher: zenoh.Publisher
-    published: int = 0
-    sent: int = 1  # heartbeats during this silence
-    due: float = math.inf  # monotonic time of the next heartbeat [s]
+    since: float = 0.0
+    sent: int = 0  # heartbeats during this silence
+    due: float = math.inf  # monotonic time of the next heartbeat, or of a look at the writer [s]
 
 
 class Heartbeats:
-    """Sends the heartbeats of all writers of a session; `send_due` is a housekeeping job."""
+    """Sends the heartbeats of all writers of a session."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self._silences: dict[Writer, _Silence] = {}
+        self._job: Job | None = None
 
     def add(self, writer: Writer) -> None:
         """Send heartbeats of a writer, from its first message on; without readers they cost no traffic."""
@@ -88,24 +95,44 @@ class Heartbeats:
         publisher = self.session.declare_publisher(key, congestion_control=drop, priority=writer.priority)
         self._silences[writer] = _Silence(publisher)
 
+    def resume(self, writer: Writer) -> None:
+        """End the silence of a writer, which has put a message."""
+        silence = self._silences.get(writer)
+        if silence is not None:
+            writer.is_silent, silence.due = False, writer.last_put + _PAUSES[0]
+            if self._job is None:
+                self._job = Job(self.send_due)
+            self._job.wake(silence.due)
+
     def remove(self, writer: Writer) -> None:
         """Stop the heartbeats of a writer. Idempotent."""
         self._silences.pop(writer, None)
 
+    def close(self) -> None:
+        """Stop all heartbeats. Idempotent."""
+        self._silences.clear()
+        if self._job is not None:
+            self._job.end()
+
     def send_due(self, now: float) -> float:
         """Send all heartbeats due at monotonic time `now` [s]; return the seconds until the next call."""
-        pause, left = _IDLE, _TURN
+        left = _TURN
         for writer, silence in tuple(self._silences.items()):
-            if silence.published != writer.published:
-                silence.published, silence.sent, silence.due = writer.published, 0, now + _PAUSES[0]
-            elif silence.due <= now and left:
-                left -= 1
-                with suppress(zenoh.ZError):  # the session is closed
-                    silence.publisher.put(heartbeat_payload(silence.published))
-                silence.sent += 1
-                silence.due = now + _PAUSES[min(silence.sent, len(_PAUSES) - 1)]
-            pause = min(pause, silence.due - now, _IDLE if silence.sent else _POLL)
-        return pause
+            if silence.due > now or not left:
+                continue
+            writer.is_silent = True  # before the look at its last message, so that the next one calls `resume`
+            if silence.since != writer.last_put:
+                silence.since, silence.sent = writer.last_put, 0
+                silence.due = silence.since + _PAUSES[0]
+            if silence.due > now:
+                writer.is_silent = False
+                continue
+            left -= 1
+            with suppress(zenoh.ZError):  # the session is closed
+                silence.publisher.put(heartbeat_payload(writer.published))
+            silence.sent += 1
+            silence.due = now + _PAUSES[min(silence.sent, len(_PAUSES) - 1)]
+        return min((silence.due for silence in tuple(self._silences.values())), default=math.inf) - now
 
 
 def priority_of(topic: Topic) -> Priority:

@@ -14,7 +14,6 @@ from typing import Final
 
 import zenoh
 
-from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import LIVE
 from nedbus.client.rate_gate import RateGate, rate_step
 from nedbus.client.sample import Mode
@@ -84,15 +83,13 @@ class MaxRateQueue(PendingQueue):
 class MaxRateReceiver(Receiver):
     """Put downsampled and last messages into a MaxRateQueue until closed."""
 
-    def __init__(
-        self, session: Session, selection: Selection, queue: MaxRateQueue, *, prefix: str, housekeeping: Housekeeping
-    ) -> None:
+    def __init__(self, session: Session, selection: Selection, queue: MaxRateQueue, *, prefix: str) -> None:
         self._prefix, self._rate_queue = prefix, queue
         self._awaiting: dict[str, float] = {}  # appearance of tokens without a downsampled message yet [s], by key
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
         self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
-        super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, history=False)
+        super().__init__(session, rate_key_expr, queue, history=False)
         self._undeclares.append(self._tokens.undeclare)
         self.pump()  # last messages bypass the ring, so no reader may block on it
 

@@ -2,7 +2,7 @@
 
 The ring lives in Rust and never blocks Zenoh, so a slow reader delays neither its session nor other readers.
 A reader that waits without a timeout drains the ring on its own thread. The first wait with a timeout, or from asyncio,
-starts a pump thread that takes over. While no reader waits, the housekeeping thread drains the ring.
+starts a pump thread that takes over. While no reader waits, the I/O thread drains the ring.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Final, TypeVar
 import zenoh
 
 from nedbus.client.closing import join_thread
-from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.io_thread import Job
 from nedbus.client.protocol import CLOSED, read_parameters
 from nedbus.log_event import about
 from nedbus.transport import Session, while_open
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 RING_CAPACITY: Final = 16_384
 """Samples that fit between two polls; more than 0.2 s of traffic of the largest fleet."""
 
-_POLL: Final = 0.1  # s between polls by housekeeping
+_POLL: Final = 0.1  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
@@ -49,15 +49,7 @@ class Receiver:
     With `history` the first samples are the last message of each publisher.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        key_expr: str,
-        pending_queue: PendingQueue,
-        *,
-        housekeeping: Housekeeping,
-        history: bool = True,
-    ) -> None:
+    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue, *, history: bool = True) -> None:
         self._session = session
         self._queue = pending_queue
         self._name = key_expr
@@ -80,8 +72,9 @@ class Receiver:
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
         if not pending_queue.newest_only:
-            self._declare_every(housekeeping)
-        self._end_job = housekeeping.add(self._poll)
+            self._declare_every()
+        self._job = Job(self._poll)
+        self._queue.on_gap = self._job.wake
 
     def receive(self) -> bool:
         """Drain the ring into the queue; return False at once if another thread is receiving."""
@@ -101,7 +94,7 @@ class Receiver:
             return self._queue.wait(timeout)
         if self._busy:
             time.sleep(_BUSY_PAUSE)
-        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # housekeeping holds it for less
+        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds it for less
             return self._queue.wait(None)
         try:
             self._receive(if_empty=True)
@@ -123,7 +116,7 @@ class Receiver:
                 return
             self._closed = True
         self._queue.end()
-        self._end_job()
+        self._job.end()
         if self._retransmission is not None:
             self._retransmission.close()
         self._queue.give_up()
@@ -135,7 +128,7 @@ class Receiver:
         if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
             self._receiving.release()
 
-    def _declare_every(self, housekeeping: Housekeeping) -> None:
+    def _declare_every(self) -> None:
         requests: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
         events: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
         with while_open():
@@ -144,7 +137,6 @@ class Receiver:
         self._undeclares += [queryable.undeclare, links.undeclare]
         self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
         self._retransmission = Retransmission(self._session, self._name, self._queue)
-        self._queue.on_gap = housekeeping.wake
 
     def _run(self) -> None:
         try:
@@ -192,7 +184,7 @@ class Receiver:
             self._queue.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:
-        """Housekeeping job: drain the ring, acknowledge and recover; return the seconds until the next call."""
+        """Job of the I/O thread: drain the ring, acknowledge and recover; return the seconds until the next call."""
         self._take_events()
         drained = self.receive() or self._idle
         if self._retransmission is None:

@@ -33,7 +33,7 @@ _ANSWER_POLL: Final = 0.005  # s between polls for answers
 
 
 class Retransmission:
-    """Send a queue's retransmission requests and collect the answers; a job of the housekeeping thread."""
+    """Send a queue's retransmission requests and collect the answers; a job of the I/O thread."""
 
     def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue) -> None:
         self._session = session

@@ -1,0 +1,139 @@
+"""The I/O thread of the process, which polls the channels of all its sessions, and threads that call functions in turn.
+
+Its cost grows with what happens: jobs that wait for something to happen are due at common ticks, so that a hundred idle
+sessions wake the process as often as one.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+from nedbus.log_event import about
+
+_log = logging.getLogger(__name__)
+
+TICK: Final = 0.06
+"""Pauses of this length and longer [s] end at common multiples of it, up to one tick later."""
+
+_MIN_PAUSE: Final = 0.002  # s between two calls of a job
+_RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
+
+_jobs: dict[Job, None] = {}
+_start = threading.Lock()
+# At most one item. Not an Event, which is written in Python: Ctrl-C inside one leaves its lock held forever.
+_woken: queue.SimpleQueue[None] = queue.SimpleQueue()
+_sleeps_until = math.inf
+
+
+class Job:
+    """A function that the I/O thread calls until `end`, from now on.
+
+    It takes the monotonic time [s], and returns the seconds until its next call. It must not block, as it delays all
+    sessions of the process.
+    """
+
+    def __init__(self, call: Callable[[float], float]) -> None:
+        self._call = call
+        self._running = threading.RLock()  # a job may end itself
+        self._due, self._requested = 0.0, math.inf
+        self._ended = self._failed = False
+        _jobs[self] = None
+        _thread.start()
+        self.wake()
+
+    @property
+    def due(self) -> float:
+        """The monotonic time of the next call [s]."""
+        return min(self._due, self._requested)
+
+    def wake(self, at: float = 0.0) -> None:
+        """Call the job soon, or at a monotonic time [s], if it is not due before; any thread may call this."""
+        at = _tick(at)
+        self._requested = min(self._requested, at)
+        if at < _sleeps_until and _woken.empty():
+            _woken.put(None)
+
+    def end(self) -> None:
+        """Call the job no more, and wait until it no longer runs. Idempotent."""
+        self._ended = True
+        _jobs.pop(self, None)
+        with self._running:
+            pass
+
+    def run(self, now: float) -> None:
+        """Call the job; the I/O thread alone calls this."""
+        self._requested = math.inf
+        try:
+            with self._running:
+                pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
+        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; other jobs must go on
+            pause = _RETRY_PAUSE
+            if not self._failed:
+                _log.exception("unexpected error in a background job (logged once)", extra=about("bug"))
+            self._failed = True
+        self._due = now + pause if pause < TICK or pause == math.inf else _tick(now + pause)
+
+
+class CallThread:
+    """A daemon thread that calls functions one after another; the first call starts it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._calls: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # `put` has to be reentrant
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Start the thread, unless it runs."""
+        if self._thread is None or not self._thread.is_alive():
+            with _start:
+                if self._thread is None or not self._thread.is_alive():
+                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                    self._thread.start()
+
+    def put(self, call: Callable[[], object]) -> None:
+        """Call a function on the thread, which has been started."""
+        self._calls.put(call)
+
+    def drain(self, timeout: float) -> None:
+        """Wait up to `timeout` seconds until all calls so far have ended."""
+        if self._thread is not None and self._thread.is_alive():
+            drained = threading.Event()
+            self.put(drained.set)
+            drained.wait(timeout)
+
+    def _run(self) -> None:
+        while True:
+            call = self._calls.get()
+            try:
+                call()
+            except Exception:  # noqa: BLE001 - one failed call must not stop the others
+                _log.debug("unexpected error in thread %s", self._name, exc_info=True)
+            del call  # what it references may be collected now
+
+
+def _tick(time: float) -> float:
+    return math.ceil(time / TICK) * TICK
+
+
+def _run_jobs() -> None:
+    global _sleeps_until  # noqa: PLW0603 - a process has one I/O thread
+    while True:
+        now, _sleeps_until = time.monotonic(), 0.0
+        for job in tuple(_jobs):
+            if job.due <= now:
+                job.run(now)
+        _sleeps_until = math.inf  # `wake` puts an item from here on, and from the next line on only if it is earlier
+        _sleeps_until = due = min((job.due for job in tuple(_jobs)), default=math.inf)
+        with suppress(queue.Empty):
+            _woken.get(timeout=None if due == math.inf else max(0.0, due - time.monotonic()))
+
+
+_thread = CallThread("nedbus-io")
+_thread.put(_run_jobs)

@@ -1,0 +1,118 @@
+"""The I/O thread of the process: due times, common ticks, and what is left after a session or a vehicle has gone."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import pytest
+
+import nedbus
+from nedbus.client import io_thread
+from nedbus.client.io_thread import TICK, CallThread, Job
+from tests.flights.messages import VLP, message
+from tests.waits import DEADLINE, wait_for
+
+
+class Calls:
+    """A job that counts its calls and keeps their times."""
+
+    def __init__(self, pause: float) -> None:
+        self.pause, self.times = pause, list[float]()
+
+    def __call__(self, now: float) -> float:
+        self.times.append(now)
+        return self.pause
+
+
+def test_pauses_end_at_common_ticks() -> None:
+    """Jobs with different pauses of a tick or more are called in the same rounds, one for each tick."""
+    calls = [Calls(TICK * (1 + number / 50)) for number in range(50)]
+    jobs = [Job(call) for call in calls]
+    wait_for(lambda: all(len(call.times) > 5 for call in calls), what="a few rounds")
+    for job in jobs:
+        job.end()
+    rounds = sorted({moment for call in calls for moment in call.times[1:]})
+    assert len(rounds) <= (rounds[-1] - rounds[0]) / TICK + 2
+
+
+def test_job_is_called_when_woken() -> None:
+    """A job that waits for an hour is called at once after `wake`, and after a moment that `wake` names."""
+    calls = Calls(3600.0)
+    job = Job(calls)
+    wait_for(lambda: len(calls.times) == 1, what="the first call")
+    job.wake()
+    wait_for(lambda: len(calls.times) == 2, what="the second call")
+    due = time.monotonic() + 0.2
+    job.wake(due)
+    wait_for(lambda: len(calls.times) == 3, what="the third call")
+    assert calls.times[2] >= due
+    job.end()
+
+
+def test_ended_job_is_not_running() -> None:
+    """`end` waits for a call in progress; a job may end itself, and delays no other by that."""
+    inside, go_on = threading.Event(), threading.Event()
+
+    def block(_: float) -> float:
+        inside.set()
+        assert go_on.wait(DEADLINE)
+        return 0.0
+
+    job = Job(block)
+    assert inside.wait(DEADLINE)
+    ending = threading.Thread(target=job.end)
+    ending.start()
+    go_on.set()
+    ending.join(DEADLINE)
+    assert not ending.is_alive()
+    ends: list[Callable[[], None]] = []
+
+    def end_itself(_: float) -> float:
+        if ends:
+            ends.pop()()
+        return 0.0
+
+    itself = Job(end_itself)
+    ends.append(itself.end)
+    wait_for(lambda: itself not in io_thread._jobs, what="the job to end itself")
+
+
+def test_failing_call_ends_no_others() -> None:
+    """A call that raises is followed by the next one."""
+    thread, done = CallThread("nedbus-test"), threading.Event()
+    thread.start()
+    thread.put(lambda: 1 // 0)
+    thread.put(done.set)
+    assert done.wait(DEADLINE)
+
+
+def test_sessions_share_their_threads(endpoint: str) -> None:
+    """Twenty buses that publish, and are queried, have as many Python threads as one."""
+    before = set(threading.enumerate())
+    with ExitStack() as opened:
+        buses = [opened.enter_context(nedbus.connect(endpoint)) for _ in range(20)]
+        for number, bus in enumerate(buses):
+            bus.publisher(VLP, vehicle=str(number)).publish(message(number))
+        wait_for(lambda: len(buses[0].latest(timeout=DEADLINE)) == 20, what="all last messages")
+        names = {thread.name for thread in set(threading.enumerate()) - before}
+        assert names <= {"nedbus-io", "nedbus-replies", "nedbus-closer"}
+        assert len(set(threading.enumerate()) - before) <= 3
+
+
+@pytest.mark.parametrize("closed", ["publishers", "bus"])
+def test_nothing_is_polled_after_a_close(endpoint: str, closed: str) -> None:
+    """Vehicles that have left, and closed sessions, leave no job behind; the schema stays for messages under way."""
+    before = len(io_thread._jobs)
+    with nedbus.connect(endpoint) as bus:
+        for number in range(30):
+            with bus.publisher(VLP, vehicle=str(number)) as publisher:
+                publisher.publish(message(number))
+        if closed == "publishers":
+            assert len(io_thread._jobs) <= before + 2  # the schema's queryable, and heartbeats
+            assert bus.latest(timeout=DEADLINE) == []
+        else:
+            bus.publisher(VLP, vehicle="30")
+    assert len(io_thread._jobs) == before
