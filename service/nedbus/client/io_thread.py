@@ -20,7 +20,7 @@ from nedbus.log_event import about
 _log = logging.getLogger(__name__)
 
 TICK: Final = 0.06
-"""Pauses of this length and longer [s] end at common multiples of it, up to one tick later."""
+"""Pauses of this length and longer [s] end at common multiples of it, less than one tick earlier."""
 
 _MIN_PAUSE: Final = 0.002  # s between two calls of a job
 _RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
@@ -54,8 +54,8 @@ class Job:
         return min(self._due, self._requested)
 
     def wake(self, at: float = 0.0) -> None:
-        """Call the job soon, or at a monotonic time [s], if it is not due before; any thread may call this."""
-        at = _tick(at)
+        """Call the job now, or at the first tick after a monotonic time [s]; any thread may call this."""
+        at = math.ceil(at / TICK) * TICK
         self._requested = min(self._requested, at)
         if at < _sleeps_until and _woken.empty():
             _woken.put(None)
@@ -78,7 +78,7 @@ class Job:
             if not self._failed:
                 _log.exception("unexpected error in a background job (logged once)", extra=about("bug"))
             self._failed = True
-        self._due = now + pause if pause < TICK or pause == math.inf else _tick(now + pause)
+        self._due = now + pause if pause < TICK or pause == math.inf else math.floor((now + pause) / TICK) * TICK
 
 
 class CallThread:
@@ -116,10 +116,6 @@ class CallThread:
             except Exception:  # noqa: BLE001 - one failed call must not stop the others
                 _log.debug("unexpected error in thread %s", self._name, exc_info=True)
             del call  # what it references may be collected now
-
-
-def _tick(time: float) -> float:
-    return math.ceil(time / TICK) * TICK
 
 
 def _run_jobs() -> None:

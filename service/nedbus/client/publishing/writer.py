@@ -101,7 +101,7 @@ class Heartbeats:
         if silence is not None:
             writer.is_silent, silence.due = False, writer.last_put + _PAUSES[0]
             if self._job is None:
-                self._job = Job(self.send_due)
+                self._job = Job(self._run)
             self._job.wake(silence.due)
 
     def remove(self, writer: Writer) -> None:
@@ -113,6 +113,12 @@ class Heartbeats:
         self._silences.clear()
         if self._job is not None:
             self._job.end()
+
+    def _run(self, now: float) -> float:
+        due = now + self.send_due(now)
+        if self._job is not None and due < math.inf:  # without a job yet, `resume` wakes it
+            self._job.wake(due)  # not before, unlike the returned pause
+        return math.inf
 
     def send_due(self, now: float) -> float:
         """Send all heartbeats due at monotonic time `now` [s]; return the seconds until the next call."""

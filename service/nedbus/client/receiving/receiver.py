@@ -18,7 +18,7 @@ from typing import Final, TypeVar
 import zenoh
 
 from nedbus.client.closing import join_thread
-from nedbus.client.io_thread import Job
+from nedbus.client.io_thread import TICK, Job
 from nedbus.client.protocol import CLOSED, read_parameters
 from nedbus.log_event import about
 from nedbus.transport import Session, while_open
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 RING_CAPACITY: Final = 16_384
 """Samples that fit between two polls; more than 0.2 s of traffic of the largest fleet."""
 
-_POLL: Final = 0.1  # s between polls by the I/O thread
+_POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper

@@ -13,6 +13,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus.client.io_thread import TICK
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats, request_samples
@@ -28,7 +29,7 @@ _MAX_OPEN_HISTORY: Final = 16  # of these, requests to publishers that have deli
 _MAX_OPEN_OF_KEY: Final = 4  # of these, requests on one key, whose publishers may never answer
 _MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, answers would push out others, and requests pause
 _REQUEST_TIMEOUT: Final = 3.0  # s
-_POLL: Final = 0.1  # s between polls of heartbeats and due requests
+_POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
 
 
