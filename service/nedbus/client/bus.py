@@ -108,13 +108,9 @@ class Bus:
         decoder = Decoder(self._layouts, prefix=self.prefix)
         samples: list[Sample[Any]] = []
         answers = query(self._session, key_expr, timeout=timeout, newest=False)
-        decoder.learn(answers)
-        for raw in answers:
-            for arrival in decoder.admit([raw]):
-                sample = decoder.decode(arrival, rows=False)
-                if sample is not None:
-                    sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
-                    samples.append(sample)
+        for raw, sample in decoder.read(answers):
+            sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
+            samples.append(sample)
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
         newest = {sample.address: sample for sample in samples}  # the last one of each address wins
         return [newest[address] for address in sorted(newest)]

@@ -102,6 +102,8 @@ class Counts:
     `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
+    `forgotten`: keys forgotten, those silent longest, because there were more than 10,000; their next gap is not in
+    `lost`.
     """
 
     received: int = 0
@@ -109,3 +111,4 @@ class Counts:
     dropped: int = 0
     invalid: int = 0
     discarded: int = 0
+    forgotten: int = 0

@@ -51,6 +51,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_connected": (_GAUGE, (), "1 while connected to a router"),
     "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
     "nedbus_messages_invalid": (_COUNTER, (), "Payloads discarded because they are not valid messages"),
+    "nedbus_keys_forgotten": (_COUNTER, (), "Keys beyond 10,000 whose next gap is not counted as lost"),
     "nedbus_queue_messages": (_GAUGE, (), "Messages queued in the exporter"),
     "nedbus_router_sessions": (_GAUGE, ("router",), "Zenoh sessions open at a router, by router id"),
     "nedbus_router_sessions_max": (_GAUGE, ("router",), "Session limit of a router, by router id"),

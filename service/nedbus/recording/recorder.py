@@ -38,7 +38,7 @@ class Recorder:
     def status(self) -> str:
         """The counts so far, as one line of text."""
         counts = self._subscription.counts
-        names = ("lost", "dropped", "invalid", "discarded")
+        names = ("lost", "dropped", "invalid", "discarded", "forgotten")
         trouble = ", ".join(f"{count} {name}" for name in names if (count := getattr(counts, name)))
         return f"{self._writer.messages} messages" + (f", {trouble}" if trouble else "")
 

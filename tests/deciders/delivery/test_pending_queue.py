@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 import tracemalloc
 import weakref
+from collections import Counter
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from typing import Any
 
 import msgpack
 import pytest
@@ -17,17 +18,31 @@ import zenoh
 import nedbus
 from nedbus import Batch, Counts, Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, layout_lookup
-from nedbus.client.receiving import decoder as decoder_module
 from nedbus.client.receiving import pending_queue as module
+from nedbus.client.receiving.decoder import KeyState
 from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.client.receiving.pending_queue import CAPACITY
+from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.transport import RawSample
 from nedbus_msgs import DEFAULT, codec_of, encode
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.first_message import encoding_of
 from tests.waits import DEADLINE, wait_for
 
-from .raw_samples import INVALID, OTHER_KEY, SOURCE, VALID, Payload, drain, junk, make_queue, put, raw, timestamps
+from .raw_samples import (
+    INVALID,
+    OTHER_KEY,
+    SOURCE,
+    VALID,
+    Payload,
+    drain,
+    junk,
+    make_queue,
+    name_of,
+    put,
+    raw,
+    timestamps,
+)
 
 STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 
@@ -93,7 +108,7 @@ def test_invalid_samples_are_counted_and_logged_once_for_each_key(caplog: pytest
 
 def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """The state of 10,000 keys is kept, here of 10; messages on other keys arrive all the same."""
-    monkeypatch.setattr("nedbus.client.receiving.decoder.MAX_KEYS", 10)
+    monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_KEYS", 10)
     pending_queue = make_queue("every")
     tracemalloc.start()
     for number in range(2000):
@@ -102,6 +117,80 @@ def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 100_000
+
+
+def key_of(vehicle: str) -> str:
+    return f"nedbus/{vehicle}/vehicle_local_position"
+
+
+def remembered() -> list[str]:
+    """Return the vehicle of each stream and of each publisher in memory, over all readers."""
+    gc.collect()
+    objects = gc.get_objects()
+    streams = [each for each in objects if isinstance(each, KeyState)]
+    streams += [each.stream for each in objects if isinstance(each, WriterProxy)]
+    return [stream.address.vehicle for stream in streams]
+
+
+@pytest.mark.parametrize("mode", ["latest", "every"])
+def test_key_that_is_silent_longest_is_forgotten(
+    mode: Mode, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Beyond the limit, losses of all keys but those silent longest are counted; this is logged once, and a count."""
+    monkeypatch.setattr(module, "MAX_KEYS", 3)
+    now = [0.0]
+    pending_queue = make_queue(mode, clock=lambda: now[0])
+
+    def receive(vehicle: str, number: int) -> int:
+        now[0] += 1.0
+        put(pending_queue, [raw(number, key=key_of(vehicle), publisher=vehicle)])
+        return sum(sample.lost for sample in drain(pending_queue))
+
+    for vehicle in "abcab":
+        receive(vehicle, 0)
+    assert not caplog.messages
+    receive("d", 0)  # c is forgotten
+    assert [receive(vehicle, 9) for vehicle in "abd"] == [8, 8, 8]
+    assert pending_queue.counts.forgotten == 1
+    assert receive("c", 9) == 0  # a is forgotten
+    assert [receive(vehicle, 12) for vehicle in "bdc"] == [2, 2, 2]
+    assert (pending_queue.counts.forgotten, pending_queue.counts.lost) == (2, 30)
+    assert len(caplog.messages) == 1
+    assert "more than 3 keys" in caplog.text
+
+
+def test_key_with_an_open_gap_is_forgotten_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gap is given up, and counted as lost, only if all keys have one."""
+    monkeypatch.setattr(module, "MAX_KEYS", 3)
+    now = [0.0]
+    pending_queue = make_queue("every", clock=lambda: now[0])
+    for vehicle, numbers in [("a", [0, 5]), ("b", [0]), ("c", [0, 3]), ("d", [0]), ("d", [2]), ("e", [0])]:
+        now[0] += 1.0
+        pending_queue.put([raw(number, key=key_of(vehicle), publisher=vehicle) for number in numbers])
+    assert pending_queue.counts == Counts(lost=4, forgotten=2)  # b, then a
+    assert [sample.vehicle for sample in drain(pending_queue)] == list("abcdae")
+    assert len(pending_queue.account.requesting) == 2
+
+
+@pytest.mark.parametrize("mode", ["latest", "every"])
+def test_state_of_departed_streams_is_freed(mode: Mode) -> None:
+    """Of 2,000 vehicles that come and go, eight at a time, those of the last ten minutes are remembered.
+
+    A vehicle of which messages or heartbeats still arrive is not forgotten.
+    """
+    now = [0.0]
+    pending_queue = make_queue(mode, clock=lambda: now[0])
+    for number in range(2000):
+        now[0] += 10.0
+        put(pending_queue, [raw(number, key=key_of("steady"), publisher="steady")])
+        pending_queue.on_heartbeat(key_of("silent"), name_of("silent"), 5)
+        vehicles = [str(each) for each in range(max(0, number - 8), number)]
+        put(pending_queue, [raw(number, key=key_of(each), publisher=each) for each in vehicles])
+        drain(pending_queue)
+    kept = Counter(remembered())
+    assert {"steady", "silent", *map(str, range(1935, 1999))} <= kept.keys()
+    assert len(kept) <= 72
+    assert set(kept.values()) == {2}
 
 
 def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
@@ -348,20 +437,6 @@ UNDESCRIBED = f"application/msgpack;px4_msgs/FooBar;hash={'0' * 32}"
 def undescribed(payload: bytes = VALID) -> RawSample:
     """Return a sample of an undeclared message that no publisher describes."""
     return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding=UNDESCRIBED)
-
-
-def test_stream_that_two_threads_meet_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stream found by two threads at once, receiving and acknowledging, is tracked as one."""
-    decoder, met = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), list[object]()
-
-    def meet_meanwhile(*arguments: Any) -> Any:
-        monkeypatch.setattr(decoder_module, "codec_of", codec_of)
-        met.append(decoder.stream(OTHER_KEY))
-        return codec_of(*arguments)
-
-    monkeypatch.setattr(decoder_module, "codec_of", meet_meanwhile)
-    met.append(decoder.stream(OTHER_KEY))
-    assert met[0] is met[1]
 
 
 def test_what_a_batch_left_is_read_next() -> None:

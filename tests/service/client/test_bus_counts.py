@@ -18,7 +18,7 @@ import zenoh
 import nedbus
 from nedbus import ClosedError, Counts, Mode
 from nedbus.client import PublisherRegistry, QueryServer, RejectionReport
-from nedbus.client.receiving.decoder import Decoder
+from nedbus.client.receiving import PendingQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
 from tests.flights.messages import VLP, message
@@ -259,7 +259,7 @@ def test_unexpected_error_in_the_pump_is_counted(
     subscription = bus.subscribe(mode="every")
     assert take(subscription, 1) == [1]
     with monkeypatch.context() as patched:
-        patched.setattr(Decoder, "admit", lambda *_: 1 / 0)
+        patched.setattr(PendingQueue, "_admit", lambda *_: 1 / 0)
         publish(publisher, 2)
         wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
     publish(publisher, 3)
@@ -306,7 +306,7 @@ def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
 
 
 def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample receives it with at most 22 Python calls, in five classes of the client."""
+    """A reader that waits for each sample receives it with at most 22 Python calls, in four classes of the client."""
     called: list[list[str]] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:
@@ -324,4 +324,4 @@ def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None
     usual = sorted(waited, key=len)[len(waited) // 2]
     assert len(usual) <= 22
     classes = {name.partition(".")[0] for name in usual if name[0].isupper()}
-    assert classes == {"Subscription", "Receiver", "PendingQueue", "StatefulReader", "Decoder"}
+    assert classes == {"Subscription", "Receiver", "PendingQueue", "Decoder"}

@@ -16,7 +16,7 @@ import zenoh
 import nedbus
 from nedbus import Counts
 from nedbus.client.io_thread import Job
-from nedbus.client.receiving import Receiver, retransmission, stateful_reader, writer_proxy
+from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
@@ -267,7 +267,7 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
 
 def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of held back samples is bounded; beyond it gaps are lost, and the samples arrive."""
-    monkeypatch.setattr(stateful_reader, "MAX_HELD", 50)
+    monkeypatch.setattr(pending_queue, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]

@@ -20,9 +20,9 @@ from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.transport import AliveTokens, RawSample, Session, ask
-from nedbus_msgs import AddressError, Selection, address_of_alive_key, get_topic
+from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
 
-from .decoder import MAX_KEYS, Arrival, Decoder
+from .decoder import Arrival, Decoder
 from .pending_queue import PendingQueue
 from .receiver import Receiver
 
@@ -45,36 +45,38 @@ class MaxRateQueue(PendingQueue):
     def __init__(self, mode: Mode, decoder: Decoder, *, max_rate: float, name: str = "") -> None:
         super().__init__(mode, decoder, name=name)
         self.rate = rate_step(max_rate)  # requested from publishers
-        self.downsampled: dict[str, RateGate] = {}
-        """Rate gates of the streams with a downsampled message so far, by key."""
         self._max_rate = max_rate
-        self._last_sent: dict[str, float] = {}  # time of sending of the last message [ns], by key
 
     def put_last(self, batch: Sequence[RawSample]) -> None:
         """Queue the last messages of streams that have delivered none yet."""
-        arrivals = self._decoder.admit(batch)
         with self._lock:
-            for arrival in arrivals:
-                key = arrival[0].key
-                if arrival[1] and not (key in self.downsampled or key in self._last_sent):
-                    if len(self._last_sent) < MAX_KEYS:
-                        self._last_sent[key] = _sent(arrival)
-                    super()._queue([arrival])
+            for arrival in self._admit(batch):
+                stream = self._stream(self._rate_key(arrival[0].address))
+                if arrival[1] and stream.gate is None and stream.last_sent == -math.inf:
+                    stream.last_sent = _sent(arrival)
+                    self.account.delivered.append(arrival)
+            super()._queue()
         self.wake()
 
-    def _queue(self, arrivals: Sequence[Arrival]) -> None:
-        super()._queue([arrival for arrival in arrivals if self._passes(arrival)])
+    def has_downsampled(self, address: Address) -> bool:
+        """Return True if a downsampled message of a stream has arrived."""
+        with self._lock:
+            stream = self._streams.get(self._rate_key(address))
+            return stream is not None and stream.gate is not None
+
+    def _rate_key(self, address: Address) -> str:
+        return address.rate_key(self.rate, prefix=self._decoder.prefix)
+
+    def _queue(self) -> int:
+        self.account.delivered = [arrival for arrival in self.account.delivered if self._passes(arrival)]
+        return super()._queue()
 
     def _passes(self, arrival: Arrival) -> bool:
         stream = arrival[0]
-        gate = self.downsampled.get(stream.key)
-        if gate is None:
-            gate = RateGate(self._max_rate)
-            if len(self.downsampled) < MAX_KEYS:
-                self.downsampled[stream.key] = gate
-        passes = not 0 <= self._last_sent.get(stream.key, -math.inf) - _sent(arrival) <= _OVERTAKEN
+        stream.gate = stream.gate or RateGate(self._max_rate)
+        passes = not 0 <= stream.last_sent - _sent(arrival) <= _OVERTAKEN
         if self.rate > self._max_rate:  # lower than publishers offer
-            passes = passes and gate.passes(time.monotonic_ns())
+            passes = passes and stream.gate.passes(time.monotonic_ns())
         if not passes:
             stream.unreported += arrival[3]
         return passes
@@ -85,7 +87,7 @@ class MaxRateReceiver(Receiver):
 
     def __init__(self, session: Session, selection: Selection, queue: MaxRateQueue, *, prefix: str) -> None:
         self._prefix, self._rate_queue = prefix, queue
-        self._awaiting: dict[str, float] = {}  # appearance of tokens without a downsampled message yet [s], by key
+        self._awaiting: dict[Address, float] = {}  # appearance of tokens without a downsampled message yet [s]
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
         self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
@@ -108,17 +110,18 @@ class MaxRateReceiver(Receiver):
         for token, alive in self._tokens.take(timeout=_TIMEOUT):
             with suppress(AddressError):  # not a nedbus key
                 address = address_of_alive_key(token, prefix=self._prefix)
-                topic, key = get_topic(address.topic), address.key(prefix=self._prefix)
+                topic = get_topic(address.topic)
                 if not alive:
-                    self._awaiting.pop(key, None)
+                    self._awaiting.pop(address, None)
                 elif topic.rate and not topic.on_change:  # others may pause for long
-                    self._awaiting.setdefault(key, now)
-        due = [key for key, since in self._awaiting.items() if now - since >= DOWNSAMPLED_TIMEOUT]
-        for key in due:
-            del self._awaiting[key]
-        if missing := [key for key in due if key not in self._rate_queue.downsampled]:
+                    self._awaiting.setdefault(address, now)
+        due = [address for address, since in self._awaiting.items() if now - since >= DOWNSAMPLED_TIMEOUT]
+        for address in due:
+            del self._awaiting[address]
+        if missing := [address for address in due if not self._rate_queue.has_downsampled(address)]:
+            key = missing[0].key(prefix=self._prefix)
             text = "%d streams are not received, as they are not downsampled (by publisher or access rules), such as %s"
-            _log.warning(text, len(missing), missing[0], extra=about("unsupported"))
+            _log.warning(text, len(missing), key, extra=about("unsupported"))
 
 
 def _sent(arrival: Arrival) -> float:

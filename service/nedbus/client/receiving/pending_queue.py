@@ -1,4 +1,4 @@
-"""Pending queue between receiving and reading: every sample in order, or the newest per key; no I/O.
+"""Pending queue between receiving and reading: the streams of a subscription and their unread messages; no I/O.
 
 If the reader is slow, mode `latest` replaces unread samples, and mode `every` queues 65,536 and then drops the oldest.
 Either way drops are counted, and no publisher or other reader is delayed.
@@ -12,18 +12,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from heapq import heappop, heappush, heapreplace
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.errors import ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
-from nedbus.transport import RawSample
-from nedbus_msgs import AddressError, identity_of
+from nedbus.transport import RawSample, SourceInfo, entity_name
+from nedbus_msgs import AddressError, DecodeError, identity_of
 
-from .decoder import MAX_KEYS, Arrival, Decoder, encoding_of
-from .stateful_reader import StatefulReader
-from .writer_proxy import WriterProxy
+from .decoder import WAKE_UP, Arrival, Decoder, KeyState, detach, encoding_of
+from .writer_proxy import NUMBERS, Account, WriterProxy
 
 if TYPE_CHECKING:
     from .batch import Batch
@@ -33,11 +35,24 @@ _log = logging.getLogger(__name__)
 CAPACITY: Final = 65_536
 """Samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped."""
 
+MAX_KEYS: Final = 10_000
+"""Keys that a reader follows, a bound on memory; beyond, those silent longest are forgotten, and counted."""
+
+MAX_SILENCE: Final = 600.0
+"""Seconds without a message or heartbeat after which the state of a key is freed once another key appears."""
+
+MAX_HELD: Final = 131_072
+"""Messages held back behind gaps, about 90 MB; beyond, gaps are given up."""
+
 MAX_ACK_REQUESTS: Final = 1000
 """Pending acknowledgement requests; a well-behaved publisher has one per key."""
 
 _MAX_BATCH: Final = 4096  # messages per batch
 _MAX_FRESH: Final = 1024  # samples queued along with Zenoh's receive buffer; later ones are detached from it
+_MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
+_MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
+_SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
+_PAYLOAD: Final = itemgetter(1)
 
 
 @dataclass(slots=True, eq=False)
@@ -57,8 +72,10 @@ class AckRequest:
 
 
 class PendingQueue:
-    """Queue delivered messages, decode them on read, and count losses and drops.
+    """Order the messages of each publisher, count losses and drops, and decode messages when they are read.
 
+    It owns the state of all streams: key states, writer proxies, counters and unread messages, guarded by one lock.
+    In mode `every`, messages behind a gap are held back until it is filled; in mode `latest` a gap is lost at once.
     `name` appears in the log. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
@@ -74,23 +91,26 @@ class PendingQueue:
         self.on_wake: Callable[[], object] | None = None
         """Called on any thread when a sample may be ready, to wake a reader on an event loop."""
         self.name = name
-        self._warned = False
+        self.account = Account()
+        self._warned: set[str] = set()
         self._decoder = decoder
-        self._lock = threading.Lock()
+        self._clock = clock
+        self._lock = threading.RLock()  # reentrant, as log handlers may read the counts
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
+        self._streams: dict[str, KeyState] = {}
+        self._by_silence: list[tuple[float, str]] = []  # heap: every key, with the time of some message of it
+        self._settling_until = float("-inf")
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
-        self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
-        self.account = self._reader.account
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest go unanswered
-        self._arrived = self._dropped = self._received = 0
+        self._arrived = self._received = 0
 
     @property
     def counts(self) -> Counts:
-        """Received, lost, dropped, invalid and discarded messages so far."""
+        """Received, lost, dropped, invalid and discarded messages so far, and forgotten keys."""
         with self._lock:
-            account, dropped = self.account, self._dropped + self.account.dropped
-            return Counts(self._received, account.lost, dropped, self._decoder.invalid, account.discarded)
+            of, invalid = self.account, self._decoder.invalid
+            return Counts(self._received, of.lost, of.dropped, invalid, of.discarded, of.forgotten)
 
     @property
     def waiting(self) -> int:
@@ -106,11 +126,10 @@ class PendingQueue:
 
         `overflowed`: the ring was full; gaps in this batch count as dropped and are not requested again.
         """
-        arrivals = self._decoder.admit(batch)
         with self._lock:
-            requesting = len(self.account.requesting)
-            self._queue(self._reader.on_samples(arrivals, overflowed=overflowed))
-            has_gap = len(self.account.requesting) > requesting
+            opened = self.account.opened
+            self._accept(self._admit(batch), overflowed=overflowed)
+            has_gap = self.account.opened > opened
         if has_gap and self.on_gap is not None:
             self.on_gap()
         if self._tokens.empty():  # as `wake` does
@@ -118,19 +137,27 @@ class PendingQueue:
         if self.on_wake is not None:
             self.on_wake()
         if overflowed:
-            self._warn_once()
+            self._warn_of_drops()
         if self._ack_requests:
             self.acknowledge(drained=True)
 
     def on_link(self) -> None:
         """Handle a link that broke or came back."""
         with self._lock:
-            self._reader.on_link()
+            self._settling_until = self._clock() + _SETTLING
+            for writer in self.account.requesting:
+                writer.unresponsive = False  # perhaps the link was down
 
     def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
-        """Handle a heartbeat: the publisher has sent `number`, which should have arrived by now."""
-        with self._lock:
-            self._reader.on_heartbeat(key, publisher, number)
+        """Handle a heartbeat: the publisher, known or not, has sent `number`, which should have arrived by now."""
+        with self._lock, suppress(AddressError):
+            stream = self._stream(key)
+            stream.heard = self._clock()
+            writer = stream.writers.get(publisher)
+            if writer is None and len(self.account.requesting) < MAX_KEYS:
+                writer = self._add_writer(stream, publisher, 0 if self._settling else number, history_end=number + 1)
+            if writer is not None:
+                writer.on_heartbeat(number)
 
     def next_request(self, writer: WriterProxy, now: float) -> range | None:
         """Return the numbers to request from a publisher now; None if no request is due."""
@@ -141,16 +168,16 @@ class PendingQueue:
         self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float
     ) -> bool:
         """Queue recovered messages and those held back behind them; return True if there are any."""
-        arrivals = {number: arrival for number, raw in found.items() for arrival in self._decoder.admit([raw])}
         with self._lock:
-            delivered = writer.on_retransmission(arrivals, ended=ended, now=now)
-            self._queue(delivered)
-        return bool(delivered)
+            arrivals = {number: arrival for number, raw in found.items() for arrival in self._admit([raw])}
+            writer.on_retransmission(arrivals, ended=ended, now=now)
+            return self._queue() > 0
 
     def give_up(self) -> None:
         """Count all gaps as lost and queue the messages held back."""
         with self._lock:
-            self._queue(self._reader.give_up(-1))
+            self._give_up(-1)
+            self._queue()
 
     def add(self, request: AckRequest, *, drained: bool) -> None:
         """Add an acknowledgement request, to be answered as soon as possible."""
@@ -258,41 +285,195 @@ class PendingQueue:
             every.extendleft(reversed(rest))
         return taken
 
+    @property
+    def _settling(self) -> bool:
+        """True shortly after a link change, while unknown publishers may have sent messages."""
+        return self._clock() < self._settling_until
+
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
         if request.read_target is None:
-            has = self._reader.has(request.key, request.publisher, request.number)
-            if has or (has is None and drained and not self._reader.settling):
+            stream = self._streams.get(request.key)
+            writer = stream and stream.writers.get(request.publisher)
+            if writer.has(request.number) if writer else drained and not self._settling:
                 request.read_target = self._arrived if request.read else 0
         return self.ended or (request.read_target is not None and self._arrived - self.waiting >= request.read_target)
 
-    def _queue(self, arrivals: Sequence[Arrival]) -> None:
-        """Queue arrivals, dropping superseded ones and the oldest beyond the capacity."""
+    # Streams
+
+    def _stream(self, key: str) -> KeyState:
+        """Return the state of a key, a new one if needed; raise AddressError if the key has no address."""
+        stream = self._streams.get(key)
+        if stream is None:
+            stream = self._decoder.open(key)
+            now = stream.heard = self._clock()
+            self._make_room(now)
+            self._streams[key] = stream
+            heappush(self._by_silence, (now, key))
+        return stream
+
+    def _make_room(self, now: float) -> None:
+        """Forget keys that have been silent for long and, at the limit, the one silent longest; open gaps go last."""
+        order = self._by_silence
+        while order and (len(order) >= MAX_KEYS or order[0][0] < now - MAX_SILENCE):
+            since, key = order[0]
+            stream = self._streams[key]
+            if any(writer.request for writer in stream.writers.values()):
+                stream.heard = now
+            if since < stream.heard:
+                heapreplace(order, (stream.heard, key))
+                continue
+            heappop(order)
+            del self._streams[key]
+            for writer in stream.writers.values():
+                writer.give_up()
+            stream.writers.clear()
+            stream.writer = None
+            if since >= now - MAX_SILENCE:
+                self.account.forgotten += 1
+                text = "more than %d keys: those silent longest are forgotten, and their next gap is not counted"
+                self._warn_once(text, MAX_KEYS, extra=about("incomplete"))
+
+    def _admit(self, batch: Sequence[RawSample]) -> list[Arrival]:
+        """Return the arrivals of a batch, with 0 losses each; rejected ones keep their number but lose the payload.
+
+        A payload of the expected size is decoded when it is read. Any other size is checked here, so that it can
+        neither displace a valid sample nor use much memory.
+        """
+        admitted: list[Arrival] = []
+        known = self._streams.get
+        for raw in batch:
+            key = str(raw.key_expr)
+            stream = known(key)
+            payload = raw.payload.to_bytes()
+            if stream is None or len(payload) != stream.size:
+                if raw.encoding == WAKE_UP:
+                    continue
+                try:
+                    stream = stream or self._stream(key)
+                    if len(payload) != stream.size:
+                        self._decoder.inspect(stream, payload, raw)
+                except (AddressError, DecodeError) as exc:
+                    self._decoder.reject(key, exc, stream)
+                    if stream is None:
+                        continue
+                    payload = b""
+            admitted.append((stream, payload, raw, 0))
+        return admitted
+
+    def _accept(self, arrivals: list[Arrival], *, overflowed: bool) -> None:
+        """Order arrivals, count gaps and queue what can be delivered; `overflowed`: the ring was full."""
+        if len(arrivals) >= _MIN_IN_ORDER and self._are_in_order(arrivals):
+            self.account.delivered += arrivals
+            self._queue()
+            return
+        now, recovers = self._clock(), not (self.newest_only or overflowed)
+        delivered = self.account.delivered
+        for arrival in arrivals:
+            stream, payload, raw, _ = arrival
+            stream.heard = now
+            info, writer = raw.source_info, stream.writer
+            if info is not None:
+                source = info.source_id
+                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than names
+                    writer = self._writer_of(stream, info, recovers=recovers)
+            if info is None or writer is None:
+                if payload:
+                    delivered.append(arrival)
+                continue
+            number = info.source_sn
+            if number == writer.expected and writer.request is None and payload and not stream.gap:
+                writer.expected = (number + 1) % NUMBERS
+                delivered.append(arrival)
+            else:
+                writer.on_sample(number, arrival, recovers=recovers, overflowed=overflowed)
+        if self.account.held > MAX_HELD:
+            self._give_up(MAX_HELD)
+        self._queue()
+
+    def _are_in_order(self, arrivals: list[Arrival]) -> bool:
+        """Return whether a batch continues the last publisher of one key without a gap; if so, expect the next one."""
+        stream, info = arrivals[0][0], arrivals[-1][2].source_info
+        writer = stream.writer
+        if writer is None or info is None or writer.request is not None or stream.gap:
+            return False
+        stop = writer.expected + len(arrivals)
+        if info.source_sn != stop - 1 or stop >= NUMBERS or entity_name(info.source_id) != writer.name:
+            return False
+        if len({id(arrival[0]) for arrival in arrivals}) > 1 or not all(map(_PAYLOAD, arrivals)):
+            return False
+        infos = [raw.source_info for _, _, raw, _ in arrivals]
+        if [info and info.source_sn for info in infos] != list(range(writer.expected, stop)):
+            return False
+        writer.expected = stop
+        stream.heard = self._clock()
+        return True
+
+    def _writer_of(self, stream: KeyState, info: SourceInfo, *, recovers: bool) -> WriterProxy | None:
+        """Return the writer proxy of a sample, a new one if needed; None if there is no room for it."""
+        name = entity_name(info.source_id)
+        writer = stream.writers.get(name)
+        if writer is None:
+            first = 0 if recovers and self._settling else info.source_sn
+            writer = self._add_writer(stream, name, first, history_end=info.source_sn)
+        stream.writer = writer
+        if writer is not None:
+            writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
+        return writer
+
+    def _add_writer(self, stream: KeyState, name: str, expected: int, *, history_end: int) -> WriterProxy | None:
+        """Add a writer proxy, evicting one without a gap if necessary; None if all of its key have gaps."""
+        if len(stream.writers) >= _MAX_WRITERS_OF_KEY:
+            writers = stream.writers.values()
+            first = next((each for each in writers if each is not stream.writer and each.request is None), None)
+            if first is None:
+                return None
+            del stream.writers[first.name]
+        writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, history_end=history_end)
+        return writer
+
+    def _give_up(self, max_held: int) -> None:
+        """Give up gaps until `max_held` messages are held back, largest reorder buffers first; -1 gives up all."""
+        for writer in sorted(self.account.requesting, key=lambda writer: -len(writer.held)):
+            if self.account.held > max_held:
+                writer.give_up()
+
+    # Unread messages
+
+    def _queue(self) -> int:
+        """Queue the delivered messages, dropping superseded and, beyond the capacity, old ones; return their number."""
+        arrivals, self.account.delivered = self.account.delivered, []
         self._arrived += len(arrivals)
         if self.newest_only:
             for arrival in arrivals:
                 self._supersede(arrival)
-            return
+            return len(arrivals)
         every = self._every
-        every.extend(map(self._decoder.detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
+        every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
-            stream, _, _, lost = every.popleft()
-            stream.unreported += lost
-            self._dropped += 1
-            self._warn_once()
+            self._drop(every.popleft())
+            self._warn_of_drops()
+        return len(arrivals)
 
     def _supersede(self, arrival: Arrival) -> None:
         stream, payload, raw, lost = arrival
         waiting = self._newest.get(stream.key)
         if waiting is not None:
-            self._dropped += 1
+            self.account.dropped += 1
             arrival = stream, payload, raw, lost + waiting[3]
         elif len(self._newest) >= MAX_KEYS:
-            self._dropped += 1
-            return
+            self._drop(self._newest.pop(next(iter(self._newest))))
         self._newest[stream.key] = arrival
 
-    def _warn_once(self) -> None:
-        if not self._warned and not self.newest_only:
-            self._warned = True
-            extra = about("dropped")
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self.name, extra=extra)
+    def _drop(self, arrival: Arrival) -> None:
+        stream, _, _, lost = arrival
+        stream.unreported += lost
+        self.account.dropped += 1
+
+    def _warn_of_drops(self) -> None:
+        if not self.newest_only:
+            self._warn_once("the reader is slower than the data: messages are dropped", extra=about("dropped"))
+
+    def _warn_once(self, text: str, *values: object, extra: Mapping[str, object]) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            _log.warning(f"%s: {text}", self.name, *values, extra=extra)

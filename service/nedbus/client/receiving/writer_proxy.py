@@ -11,7 +11,7 @@ from typing import Final
 
 from nedbus.transport import MAX_ANSWERS
 
-from .decoder import Arrival, Decoder, KeyState
+from .decoder import Arrival, KeyState, detach
 
 NUMBERS: Final = 2**32
 """Zenoh's sequence numbers wrap here."""
@@ -27,16 +27,20 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the las
 
 @dataclass(slots=True, eq=False)
 class Account:
-    """Loss counters and open gaps, shared by all writer proxies of a reader.
+    """Counters and open gaps of a subscription, which its queue owns and its writer proxies update.
 
-    `dropped`: by a ring overflow. `discarded`: duplicates and late messages. `held`: messages held back behind gaps.
-    `requesting`: writers with a gap, least recently requested first.
+    `dropped`: by a full ring or queue. `discarded`: duplicates and late messages. `forgotten`: keys beyond the limit.
+    `held`: messages held back behind gaps. `delivered`: messages to be queued, in order.
+    `requesting`: writers with a gap, least recently requested first. `opened`: gaps so far.
     """
 
     lost: int = 0
     dropped: int = 0
     discarded: int = 0
+    forgotten: int = 0
     held: int = 0
+    opened: int = 0
+    delivered: list[Arrival] = field(default_factory=list)
     requesting: dict[WriterProxy, None] = field(default_factory=dict)
 
 
@@ -81,8 +85,8 @@ class WriterProxy:
     request: Request | None = None
     held: dict[int, Arrival] = field(default_factory=dict)
 
-    def on_sample(self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False) -> list[Arrival]:
-        """Accept a message and return the messages to deliver, in order.
+    def on_sample(self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False) -> None:
+        """Accept a message and deliver what is in order.
 
         With `recovers`, messages behind a gap are held back until it is filled.
         With `overflowed`, the ring was full, and the gap counts as dropped.
@@ -91,18 +95,19 @@ class WriterProxy:
         if step > MAX_GAP:
             if NUMBERS - step <= _MAX_REORDERED:
                 self.account.discarded += 1
-                return []
-            delivered = self.give_up()
+                return
+            self.give_up()
             self.expected = number
         elif step and (self.request is not None or recovers) and self.expected + step < _LAST_NUMBER:
             self._hold(number, arrival)
             self._extend_request(number + 1)
-            return []
+            return
         else:
-            delivered = self.give_up() if step and self.request is not None else []
+            if step:
+                self.give_up()
             self._count_gap(number, overflowed=overflowed)
-        self._deliver(arrival, delivered)
-        return self._release(delivered)
+        self._deliver(arrival)
+        self._release()
 
     def on_heartbeat(self, number: int) -> None:
         """Open a gap up to a message that should have arrived by now."""
@@ -126,11 +131,11 @@ class WriterProxy:
         request.requested = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
         return request.requested
 
-    def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> list[Arrival]:
-        """Accept answers to the open request and return the messages to deliver; `ended`: these were the last."""
-        request, delivered = self.request, list[Arrival]()
+    def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> None:
+        """Accept answers to the open request and deliver what is in order; `ended`: these were the last."""
+        request = self.request
         if request is None:
-            return delivered
+            return
         for number, arrival in found.items():
             if self.expected <= number < request.stop and number not in self.held:
                 self._hold(number, arrival)
@@ -139,32 +144,32 @@ class WriterProxy:
             request.first_available = min(found) if lowest is None else min(lowest, *found)
             request.last_answered |= request.requested is not None and request.requested[-1] in found
         if self.history_end <= self.expected:  # else wait for the end, which tells the lowest number available
-            self._release(delivered)
+            self._release()
         if ended and request.requested is not None:
             last, request.requested = request.requested[-1], None
             over = request.deadline is not None and now >= request.deadline
             if request.last_answered:
                 self.unresponsive = False
-                self._confirm_lowest(request, delivered, over=over)
+                self._confirm_lowest(request, over=over)
             elif request.probe is not None:
                 request.probe = request.stop - 1  # the probe may have left the cache
-            self._release(delivered)
+            self._release()
             if over:
                 self.unresponsive = request.first_available is None
-                self._give_up(last, delivered)
+                self._give_up(last)
             request.last_answered = False
             request.due = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
-        return delivered
 
-    def give_up(self) -> list[Arrival]:
-        """Count all gaps as lost and return the messages that were held back."""
-        return [] if self.request is None else self._give_up(self.request.stop, [])
+    def give_up(self) -> None:
+        """Count all gaps as lost and deliver the messages that were held back."""
+        if self.request is not None:
+            self._give_up(self.request.stop)
 
     def has(self, number: int) -> bool:
         """Return True if this message has arrived or counts as lost."""
         return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 
-    def _confirm_lowest(self, request: Request, delivered: list[Arrival], *, over: bool) -> None:
+    def _confirm_lowest(self, request: Request, *, over: bool) -> None:
         """Give up numbers below the lowest one answered, after a probe: lower ones may have been answered but lost."""
         lowest = request.first_available
         if lowest is None or lowest <= self.expected:
@@ -173,19 +178,20 @@ class WriterProxy:
             request.probe = request.candidate = lowest
         else:
             request.probe = None
-            self._give_up(lowest - 1, delivered)
+            self._give_up(lowest - 1)
 
     def _hold(self, number: int, arrival: Arrival) -> None:
         if number in self.held:
             self.account.discarded += 1
         else:
-            self.held[number] = Decoder.detach(arrival)
+            self.held[number] = detach(arrival)
             self.account.held += 1
 
     def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
             self.account.requesting[self] = None
+            self.account.opened += 1
         self.request.stop = max(self.request.stop, stop)
 
     def _count_gap(self, number: int, *, overflowed: bool = False) -> None:
@@ -199,30 +205,28 @@ class WriterProxy:
             self.stream.gap += lost
         self.expected = number
 
-    def _give_up(self, last: int, delivered: list[Arrival]) -> list[Arrival]:
+    def _give_up(self, last: int) -> None:
         while self.request is not None and self.expected <= last:
             self._count_gap(min(self.held, default=self.request.stop))
-            self._release(delivered)
-        return delivered
+            self._release()
 
-    def _deliver(self, arrival: Arrival, delivered: list[Arrival]) -> None:
+    def _deliver(self, arrival: Arrival) -> None:
         self.expected = (self.expected + 1) % NUMBERS
         self.history_end = 0
         stream, payload, raw, _ = arrival
         if payload:
-            delivered.append((stream, payload, raw, stream.gap))
+            self.account.delivered.append((stream, payload, raw, stream.gap))
             stream.gap = 0
 
-    def _release(self, delivered: list[Arrival]) -> list[Arrival]:
+    def _release(self) -> None:
         """Deliver messages held back, up to the next gap."""
         request = self.request
         if request is None:
-            return delivered
+            return
         while (arrival := self.held.pop(self.expected, None)) is not None:
             self.account.held -= 1
-            self._deliver(arrival, delivered)
+            self._deliver(arrival)
             request.deadline, request.attempts = None, 0
         if self.expected >= request.stop:
             self.request = None
             del self.account.requesting[self]
-        return delivered
