@@ -9,8 +9,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Iterator, Sequence
-from functools import cache
-from typing import Any, Final, Generic, cast
+from typing import Any, Final, Generic
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,7 @@ from .codecs.cdr import HEAD, cdr_layout
 from .codecs.msgpack import codec_of
 from .errors import InvalidMessageError
 from .functions import DEFAULT, M, definition_of
-from .model.declaration import Layout
+from .model.declaration import Layout, kept
 from .model.definition import Definition
 from .model.message import Message
 from .model.px4_types import BASES, FieldType
@@ -203,7 +202,7 @@ class Arrays(Generic[M]):
         return np.ndarray(len(wire), self._wire, wire).astype(self._native).view(self.dtype)
 
 
-@cache
+@kept
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
     """Return the array conversion of a definition, cached."""
     return Arrays(definition)
@@ -238,4 +237,4 @@ def to_array(messages: Sequence[M]) -> MessageArray:
 
 def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # any, by default
     """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
-    return cast("M", arrays_of(definition_of(message)).to_message(element))
+    return arrays_of(definition_of(message)).to_message(element)

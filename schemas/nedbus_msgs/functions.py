@@ -44,7 +44,7 @@ def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = N
     Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
     not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
     """
-    return cast("M", codec_of(definition_of(message)).decode(payload, newer=newer))
+    return codec_of(definition_of(message)).decode(payload, newer=newer)
 
 
 def schema_of(definition: Definition[Any]) -> dict[str, object]:

@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 from .errors import AddressError
-from .model.declaration import Layout
+from .model.declaration import Layout, kept
 from .model.definition import MESSAGES, Definition
 from .model.px4_types import FieldType
 from .ros2.types import PACKAGE, hash_of
@@ -27,7 +27,6 @@ from .ros2.types import PACKAGE, hash_of
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
 _MISSING = re.compile(r"[0-9a-f]+")
 _IDENTITY = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?")
-_CACHE_SIZE: Final = 1024
 # The messages with a file in the first version, which every reader has; other versions may lack a file.
 _WITHOUT_HASH: Final = re.compile(
     "BatteryStatus|EstimatorStatusFlags|FailsafeFlags|HomePosition|SensorGps|TimesyncStatus|VehicleAttitude"
@@ -53,7 +52,7 @@ class Provenance:
             raise AddressError("source", self.source, "1 to 32 of a-z 0-9 _ -")
 
 
-@lru_cache(_CACHE_SIZE)
+@kept
 def encoding_of(definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None) -> str:
     """Return the Zenoh encoding for a source that provides these fields; None means all fields."""
     names = definition.names
@@ -73,14 +72,14 @@ def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
     return hash_of(Layout("", "", types=types), f"{PACKAGE}/{name}").removeprefix("RIHS01_")[:32]
 
 
-@lru_cache(_CACHE_SIZE)
+@lru_cache(1024)
 def identity_of(encoding: str) -> tuple[str, str] | None:
     """Return name and hash of a message without a file from its encoding; None if it lacks one of them."""
     found = _IDENTITY.fullmatch(encoding)
     return (found[1], found[2]) if found else None
 
 
-@lru_cache(_CACHE_SIZE)
+@kept
 def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
     """Parse the provenance in an encoding; unknown or invalid parts are ignored, as other programs also publish."""
     parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])

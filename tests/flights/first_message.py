@@ -88,7 +88,7 @@ def encode_row(values: Sequence[object] | Message, message: type[M] = _FIRST) ->
 
 def decode_row(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
     """Return the message of a payload as a named tuple, a Row, validated by the same types and rules as in `decode`."""
-    return cast("M", codec_of(definition_of(message)).decode_row(payload, newer=newer))
+    return codec_of(definition_of(message)).decode_row(payload, newer=newer)
 
 
 def describe(error: ValidationError, message: type[Message] | str = _FIRST) -> str:

@@ -8,13 +8,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Final
 
 from pydantic import ValidationError
 
 from nedbus_msgs.errors import DecodeError, EncodeError
-from nedbus_msgs.model.declaration import Layout
+from nedbus_msgs.model.declaration import Layout, kept
 from nedbus_msgs.model.definition import Definition, require_fields
 from nedbus_msgs.model.px4_types import BASES
 from nedbus_msgs.model.validation import Validation
@@ -87,7 +86,7 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
         raise EncodeError(reason, definition.name) from None
 
 
-@cache
+@kept
 def cdr_layout(layout: Layout) -> CdrLayout:
     """Compute the CDR form of a layout, with each field at the next multiple of its alignment."""
     body, size, unpadded, not_bools = "<", 0, 0, 0

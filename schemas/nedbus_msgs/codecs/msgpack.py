@@ -9,13 +9,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Final, Generic, cast
 
 import msgpack
 from pydantic import ValidationError
 
 from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
+from nedbus_msgs.model.declaration import kept
 from nedbus_msgs.model.definition import Definition, M, upgrade_with
 from nedbus_msgs.model.message import fill
 from nedbus_msgs.model.px4_types import BASES, FieldType
@@ -77,7 +77,7 @@ class Codec(Generic[M]):
     decode_row: Callable[..., M]
 
 
-@cache
+@kept
 def codec_of(definition: Definition[M]) -> Codec[M]:
     """Return the codec of a message; its functions are closures, as attribute access costs time on the hot path."""
     name, types, model = definition.name, definition.types, definition.model

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from functools import lru_cache, partial, wraps
+from typing import Any, Final, Literal, TypeVar, cast
 
 from .px4_types import FieldType
 
@@ -18,6 +19,7 @@ ALL: Final = "all"
 
 _CACHE_SECONDS: Final = 20.0  # s of messages in a publisher's cache, at the nominal rate
 _MIN_CACHE: Final = 400  # messages in a publisher's cache
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,7 @@ class Layout:
     `wire`: its number in payloads, if it has one.
     `aliases`: further ROS 2 types with this layout, besides that of the message.
     `types`: its fields and their types in order, which the definition of the message parses from `text`.
+    `caches`: see `kept`.
     """
 
     name: str
@@ -63,11 +66,28 @@ class Layout:
     wire: int | None = None
     aliases: tuple[str, ...] = ()
     types: Mapping[str, FieldType] = dataclasses.field(default_factory=dict, repr=False)
+    caches: dict[object, Callable[..., Any]] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The names of its fields, in order."""
         return tuple(self.types)
+
+
+def kept(make: _F) -> _F:
+    """Cache the last 1,024 results of a function in its first argument, a Definition or Layout, to be freed with it.
+
+    A cache of the function would keep the definitions that any peer may send.
+    """
+
+    @wraps(make)
+    def find(owner: Any, *arguments: object) -> Any:
+        cached = owner.caches.get(make)
+        if cached is None:  # another thread may set it meanwhile
+            cached = owner.caches.setdefault(make, lru_cache(1024)(partial(make, owner)))
+        return cached(*arguments)
+
+    return cast("_F", find)
 
 
 @dataclass(frozen=True, slots=True)

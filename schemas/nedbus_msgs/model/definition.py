@@ -8,14 +8,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
 from nedbus_msgs.errors import LayoutError
 
-from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
+from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, kept
 from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values
 
@@ -75,7 +75,7 @@ class Definition(Generic[M_co]):
     `name`: its name in PX4, such as VehicleAttitude. `model`: its Pydantic model.
     `types`: the PX4 type of every field of the model, in order.
     `topics`, `older`: topics and older fields by name. `rules`: the rules for its fields.
-    `always`: the fields that every log has, even the oldest.
+    `always`: the fields that every log has, even the oldest. `caches`: see `kept`.
     """
 
     def __init__(self, model: type[M_co]) -> None:
@@ -91,6 +91,7 @@ class Definition(Generic[M_co]):
         self.older = {old.name: old for old in model.OLDER}
         self.rules = model.RULES
         self.always = frozenset(model.ALWAYS.split())
+        self.caches: dict[object, Callable[..., Any]] = {}
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
@@ -220,7 +221,7 @@ class Definition(Generic[M_co]):
         return value if kind.length or kind.is_float or least <= value <= greatest else kind.absent
 
 
-@lru_cache(256)  # all messages of a stream have the same names
+@kept  # all messages of a stream have the same names
 def _plan(definition: Definition[Any], names: tuple[str, ...]) -> Plan:
     direct: dict[str, str] = {name: name for name in names if name in definition.types}
     converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}

@@ -141,7 +141,7 @@ class FieldType:
 @cache
 def field_type(text: str) -> FieldType:
     """Parse PX4's name of a type; raise ValueError, as FieldType does, if it is invalid."""
-    found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text)
+    found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
     if found is None:
         raise ValueError(f"{text!r} is not a type: expected one such as uint8 or float32[4]")
     return FieldType(ALIASES.get(found[1], found[1]), None if found[2] is None else int(found[2]))

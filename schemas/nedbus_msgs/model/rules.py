@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any, Final, NamedTuple, cast
 
 FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
@@ -178,7 +178,7 @@ def wrong_columns(rules: Sequence[Rule], **functions: Callable[..., Any]) -> lis
     return [evaluated(f"lambda values: {text}", **functions) for text in texts]
 
 
-@cache
+@lru_cache(1024)
 def evaluated(expression: str, **functions: Callable[..., Any]) -> Callable[[Any], Any]:
     """Compile a lambda that was generated from numbers and field positions, never from a peer's data."""
     names = {"isfinite": math.isfinite, "squared_norm": _squared_norm, "inf": math.inf, **functions}

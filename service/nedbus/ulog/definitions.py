@@ -22,7 +22,7 @@ def definition_of(subscription: Subscription) -> Definition[Any]:
     return _define(name, tuple((field.name, field.kind) for field in subscription.fields))
 
 
-_define = lru_cache(1024)(define)  # shared by all instances and logs, since codecs are cached per definition
+_define = lru_cache(256)(define)  # shared by all instances and logs, since codecs are cached per definition
 
 
 class Fitting:

@@ -301,13 +301,22 @@ def test_unanswered_lookups_delay_readers_little() -> None:
 def test_definitions_that_peers_make_up_fill_no_memory(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The fields of all definitions are bounded; those in use stay, and further ones are refused with a reason."""
+    """The fields of all definitions are bounded; those in use stay, and further ones are refused, which is logged once.
+
+    Once those that peers made up are out of use, the least recently used ones make room.
+    """
+    now = 0.0
     monkeypatch.setattr(layout_lookup, "_MAX_FIELDS", 10 * (1 + layout_lookup._BASE))
-    lookup = LayoutLookup(lambda wanted: {each: {"timestamp": "uint64"} for each in wanted})
+    lookup = LayoutLookup(lambda wanted: {each: {"timestamp": "uint64"} for each in wanted}, now=lambda: now)
     known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
     assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
     assert lookup.codec("Honest", "0") is known[0]
-    assert "too many messages without a file" in caplog.text
+    assert caplog.text.count("too many messages without a file") == 1
+    now += 3600.0
+    assert lookup.codec("Honest", "0") is known[0]
+    assert lookup.codec("Honest", "new", wait=True)
+    assert [lookup.codec("Honest", str(number)) is known[number] for number in (0, 2)] == [True, True]
+    assert len(lookup._codecs) == len(lookup._used) == 10
 
 
 def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout() -> None:

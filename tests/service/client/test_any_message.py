@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 from contextlib import suppress
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.transport import Session
-from nedbus_msgs import field_type, short_hash
+from nedbus_msgs import Definition, define_msg, field_type, short_hash
 from tests.contract.test_messages import write_wheels
 from tests.peers.processes import Start
 from tests.service.commands.answering import answering, reply_with
@@ -87,6 +88,32 @@ def test_hostile_description_harms_no_other_stream(
             return subscription.counts.invalid == 1
 
         wait_for(is_rejected, what="the other one, of another priority")
+
+
+def read_once(endpoint: str, topic: str, form: str) -> int:
+    """Connect, read the last message in a form, close, and return its timestamp."""
+    with nedbus.connect(endpoint) as reader:
+        if form == "latest":
+            return int(reader.latest(topic)[0].message.timestamp)
+        with reader.subscribe(topic, mode="every") as subscription:
+            if form == "models":
+                return int(subscription.receive(DEADLINE).message.timestamp)
+            return int(subscription.receive_batch(DEADLINE).messages["timestamp"][0])
+
+
+def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
+    """Of readers that connect, read a message without a file and close, no definition remains, in any form."""
+    definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
+    publisher = bus.publisher("comes_and_goes", vehicle="1", definition=definition)
+    publisher.publish({"timestamp": 1})
+    assert [read_once(endpoint, "comes_and_goes", form) for form in ("latest", "models", "batches")] == [1, 1, 1]
+
+    def is_freed() -> bool:
+        gc.collect()
+        found = [each for each in gc.get_objects() if isinstance(each, Definition) and each.name == definition.name]
+        return len(found) == 1
+
+    wait_for(is_freed, what="the definitions of closed readers")
 
 
 def test_message_of_unknown_encoding_says_so(

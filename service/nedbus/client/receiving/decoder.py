@@ -23,6 +23,7 @@ from nedbus_msgs import (
     AddressError,
     Codec,
     DecodeError,
+    Provenance,
     UnknownLayoutError,
     codec_of,
     identity_of,
@@ -51,6 +52,7 @@ class KeyState:
     `key`: key of the full-rate stream. `wire_key`: key on which messages arrive, perhaps downsampled.
     `codec`: None for messages without a file, whose definition each encoding identifies. `size`: bytes of its payload
     with all fields, or -1. `message`: its name, or "". `encoding`: the last one, as Zenoh's object and as text.
+    `provenance`: the last one, with its encoding.
     `writers`: writer proxies by name. `writer`: the one of the last message.
     `heard`: monotonic time of the last message or heartbeat [s].
     `gap`: messages lost before the next delivery. `unreported`: messages lost before one that was dropped or invalid;
@@ -65,7 +67,8 @@ class KeyState:
     codec: Codec[Any] | None = None
     size: int = -1
     message: str = ""
-    encoding: tuple[object, str] = None, ""  # one tuple, as two threads access it
+    encoding: tuple[object, str] = None, ""  # one tuple each, as two threads access it
+    provenance: tuple[str, Provenance] = "", Provenance()
     writers: dict[str, WriterProxy] = field(default_factory=dict)
     writer: WriterProxy | None = None
     heard: float = 0.0
@@ -160,7 +163,10 @@ class Decoder:
         except DecodeError as exc:
             self.reject(stream.key, exc, stream)
             return None
-        provenance = provenance_of(codec.definition, encoding)
+        known, provenance = stream.provenance
+        if known is not encoding:
+            provenance = provenance_of(codec.definition, encoding)
+            stream.provenance = encoding, provenance
         return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, provenance)
 
     def count_invalid(self, count: int) -> None:

@@ -20,6 +20,7 @@ _log = logging.getLogger(__name__)
 
 _MAX_LAYOUTS: Final = 16  # newer layouts per message
 _MAX_FIELDS: Final = 65_536  # of all messages defined by publishers; PX4's have 15 on average
+_IN_USE: Final = 60.0  # s since the last message for which a definition is kept, although there is no room for another
 _BASE: Final = 48  # fields that take as much memory as a message without any
 _MAX_UNKNOWN: Final = 64  # messages and layouts per query, and those that wait for the next one
 _MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the first one may be asked for again
@@ -50,7 +51,8 @@ class LayoutLookup:
         self._now = now
         self._newer: dict[str, dict[int, Sequence[str]]] = {}
         self._codecs: dict[Wanted, Codec[Any]] = {}
-        self._room = _MAX_FIELDS
+        self._used: dict[Wanted, float] = {}  # monotonic time of the last use of each codec [s]
+        self._full = False
         self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
@@ -75,6 +77,8 @@ class LayoutLookup:
             if wait:
                 self.wait(wanted)
                 codec = self._codecs.get(wanted)
+        if codec is not None:
+            self._used[wanted] = self._now()
         return codec
 
     def check(self, codec: Codec[Any], payload: bytes) -> None:
@@ -159,20 +163,31 @@ class LayoutLookup:
 
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
         """Define a message without a file."""
-        size = len(fields) + _BASE
-        if size > self._room:
-            _log.warning("%s: too many messages without a file: not read", name, extra=about("invalid"))
+        if not self._make_room(len(fields) + _BASE):
+            if not self._full:
+                _log.warning("%s: too many messages without a file: not read", name, extra=about("invalid"))
+            self._full = True
             return False
         try:
             definition = define(name, ((field, field_type(kind)) for field, kind in fields.items()))
         except ValueError as exc:
             _log.warning("%s: invalid description by a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
-        self._room -= size
-        self._codecs[name, identity] = codec_of(definition)
+        self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
         text = "%s is not installed here: using the publisher's description"
         _log.info(text, name, extra=about("described", reason=f"hash {identity}"))
         return True
+
+    def _make_room(self, size: int) -> bool:
+        """Forget definitions out of use, least recently used first; return False if that makes too little room."""
+        known = sorted(self._codecs, key=self._used.__getitem__)
+        room = _MAX_FIELDS - sum(len(self._codecs[wanted].definition.types) + _BASE for wanted in known)
+        for wanted in known:
+            if room >= size or self._now() - self._used[wanted] < _IN_USE:
+                break
+            room += len(self._codecs.pop(wanted).definition.types) + _BASE
+            del self._used[wanted]
+        return room >= size
 
     def _add_layout(self, name: str, number: int, fields: Mapping[str, str]) -> bool:
         """Add a newer layout of a message."""
