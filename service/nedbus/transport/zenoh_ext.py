@@ -57,7 +57,7 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
     return drain, subscriber.undeclare
 
 
-@lru_cache(_MAX_HEARTBEATS)
+@lru_cache(1024)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
     """Return the stream and publisher in the key of a heartbeat, None for any other key."""
     found = _KEY.fullmatch(heartbeat)

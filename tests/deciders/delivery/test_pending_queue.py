@@ -404,6 +404,21 @@ def test_samples_that_wait_are_kept_compact(small: PendingQueue, in_batches: boo
     assert [(each.source, len(each.missing)) for each in provenances] == [(f"source{each}", 52) for each in range(9)]
 
 
+class Encoding(str):
+    """An encoding that supports weak references."""
+
+
+@pytest.mark.parametrize("mode", ["latest", "every"])
+def test_stream_keeps_no_receive_buffer(mode: Mode) -> None:
+    """The encoding of a Zenoh sample keeps its receive buffer alive, so the state of a stream has a copy of it."""
+    pending_queue, encoding = make_queue(mode), Encoding(SOURCE)
+    kept = weakref.ref(encoding)
+    put(pending_queue, [raw(0, encoding=encoding)])
+    del encoding
+    assert [sample.source for sample in drain(pending_queue)] == ["sim"]
+    assert kept() is None
+
+
 def test_long_encodings_fill_no_memory(small: PendingQueue) -> None:
     """An encoding may be of any length: what is kept of one that waits is as long as nedbus's own."""
     for number in range(9):

@@ -213,5 +213,5 @@ def encoding_of(stream: KeyState, raw: RawSample | DetachedSample) -> str:
     known, text = stream.encoding
     if encoding != known:
         text = str(encoding)[:_MAX_ENCODING]
-        stream.encoding = encoding, text
+        stream.encoding = zenoh.Encoding(text), text  # a copy, as the original keeps its receive buffer in memory
     return text
