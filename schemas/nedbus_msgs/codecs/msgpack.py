@@ -45,7 +45,7 @@ def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
     return head + tags * kind.length, f"{len(head)}x" + form * kind.length, bytes(len(head)) + bits * kind.length
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Codec(Generic[M]):
     """The codec of one message.
 

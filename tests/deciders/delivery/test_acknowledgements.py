@@ -30,7 +30,7 @@ class Asked:
     def ask(self, number: int, *, read: bool = False, publisher: str = "a", name: str = "") -> list[str]:
         """Send a request; return the names of all acknowledged ones."""
         reply = partial(self.answered.append, name or str(number))
-        self.queue.add(AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained)
+        self.queue.acknowledge(AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained)
         return self.answered
 
     def take(self, count: int) -> list[str]:

@@ -51,7 +51,7 @@ class KeyState:
 
     `key`: key of the full-rate stream. `wire_key`: key on which messages arrive, perhaps downsampled.
     `codec`: None for messages without a file, whose definition each encoding identifies. `size`: bytes of its payload
-    with all fields, or -1. `message`: its name, or "". `encoding`: the last one, as Zenoh's object and as text.
+    with all fields, or -1. `encoding`: the last one, as Zenoh's object and as text.
     `provenance`: the last one, with its encoding.
     `writers`: writer proxies by name. `writer`: the one of the last message.
     `heard`: monotonic time of the last message or heartbeat [s].
@@ -66,7 +66,6 @@ class KeyState:
     address: Address
     codec: Codec[Any] | None = None
     size: int = -1
-    message: str = ""
     encoding: tuple[object, str] = None, ""  # one tuple each, as two threads access it
     provenance: tuple[str, Provenance] = "", Provenance()
     writers: dict[str, WriterProxy] = field(default_factory=dict)
@@ -109,7 +108,7 @@ class Decoder:
         stream = KeyState(address.key(prefix=self.prefix), key, address)
         if address.topic in BY_TOPIC:
             stream.codec = codec_of(BY_TOPIC[address.topic])
-            stream.size, stream.message = stream.codec.size, stream.codec.definition.name
+            stream.size = stream.codec.size
         return stream
 
     def read(self, answers: Sequence[RawSample]) -> Iterator[tuple[RawSample, Sample[Any]]]:

@@ -65,7 +65,7 @@ class MaxRateQueue(PendingQueue):
             return stream is not None and stream.gate is not None
 
     def _rate_key(self, address: Address) -> str:
-        return address.rate_key(self.rate, prefix=self._decoder.prefix)
+        return address.rate_key(self.rate, prefix=self.decoder.prefix)
 
     def _queue(self) -> int:
         self.account.delivered = [arrival for arrival in self.account.delivered if self._passes(arrival)]

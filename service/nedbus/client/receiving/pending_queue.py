@@ -53,6 +53,7 @@ _MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
 _PAYLOAD: Final = itemgetter(1)
+_SLOW: Final = "dropped", "the reader is slower than the data: messages are dropped"
 
 
 @dataclass(slots=True, eq=False)
@@ -93,7 +94,7 @@ class PendingQueue:
         self.name = name
         self.account = Account()
         self._warned: set[str] = set()
-        self._decoder = decoder
+        self.decoder = decoder
         self._clock = clock
         self._lock = threading.RLock()  # reentrant, as log handlers may read the counts
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
@@ -109,17 +110,13 @@ class PendingQueue:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far, and forgotten keys."""
         with self._lock:
-            of, invalid = self.account, self._decoder.invalid
+            of, invalid = self.account, self.decoder.invalid
             return Counts(self._received, of.lost, of.dropped, invalid, of.discarded, of.forgotten)
 
     @property
     def waiting(self) -> int:
         """Number of unread messages."""
         return len(self._every) or len(self._newest)
-
-    def count_invalid(self, count: int) -> None:
-        """Count samples that could not be queued as invalid."""
-        self._decoder.count_invalid(count)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue a batch in order of arrival, reject invalid samples and wake the reader.
@@ -136,8 +133,8 @@ class PendingQueue:
             self._tokens.put(None)
         if self.on_wake is not None:
             self.on_wake()
-        if overflowed:
-            self._warn_of_drops()
+        if overflowed and not self.newest_only:
+            self._warn_once(*_SLOW)
         if self._ack_requests:
             self.acknowledge(drained=True)
 
@@ -179,18 +176,13 @@ class PendingQueue:
             self._give_up(-1)
             self._queue()
 
-    def add(self, request: AckRequest, *, drained: bool) -> None:
-        """Add an acknowledgement request, to be answered as soon as possible."""
-        with self._lock:
-            self._ack_requests.append(request)
-        self.acknowledge(drained=drained)
-
-    def acknowledge(self, *, drained: bool) -> None:
-        """Answer the acknowledgement requests that are ready.
+    def acknowledge(self, *requests: AckRequest, drained: bool) -> None:
+        """Add acknowledgement requests, and answer all that are ready.
 
         `drained`: the ring is empty, so an unknown publisher has sent nothing to this reader.
         """
         with self._lock:
+            self._ack_requests += requests
             ready = [request for request in self._ack_requests if self._can_answer(request, drained=drained)]
             for request in ready:
                 self._ack_requests.remove(request)
@@ -246,7 +238,7 @@ class PendingQueue:
                     lost, stream.unreported = lost + stream.unreported, 0
             if self._ack_requests:
                 self.acknowledge(drained=False)
-            sample = self._decoder.decode(arrival, rows=rows, lost=lost)
+            sample = self.decoder.decode(arrival, rows=rows, lost=lost)
             if sample is not None:
                 self._received += 1
                 return sample
@@ -266,7 +258,7 @@ class PendingQueue:
                 self.acknowledge(drained=False)
             if not taken:
                 return None
-            batch = make_batch(taken, self._decoder, lost=lost)
+            batch = make_batch(taken, self.decoder, lost=lost)
             if len(batch):
                 self._received += len(batch)
                 return batch
@@ -276,7 +268,7 @@ class PendingQueue:
         """Remove the messages of the same type as the first one; the rest stay queued in order."""
         every, newest = self._every, self._newest
         waiting = list(newest.values()) or [every.popleft() for _ in range(min(len(every), _MAX_BATCH))]
-        kinds = [stream.message or identity_of(encoding_of(stream, raw)) for stream, _, raw, _ in waiting]
+        kinds = [stream.codec or identity_of(encoding_of(stream, raw)) for stream, _, raw, _ in waiting]
         taken = [arrival for arrival, kind in zip(waiting, kinds, strict=True) if kind == kinds[0]]
         rest = [arrival for arrival, kind in zip(waiting, kinds, strict=True) if kind != kinds[0]]
         if self.newest_only:
@@ -304,7 +296,7 @@ class PendingQueue:
         """Return the state of a key, a new one if needed; raise AddressError if the key has no address."""
         stream = self._streams.get(key)
         if stream is None:
-            stream = self._decoder.open(key)
+            stream = self.decoder.open(key)
             now = stream.heard = self._clock()
             self._make_room(now)
             self._streams[key] = stream
@@ -330,8 +322,8 @@ class PendingQueue:
             stream.writer = None
             if since >= now - MAX_SILENCE:
                 self.account.forgotten += 1
-                text = "more than %d keys: those silent longest are forgotten, and their next gap is not counted"
-                self._warn_once(text, MAX_KEYS, extra=about("incomplete"))
+                text = "those silent longest are forgotten, and their next gap is not counted"
+                self._warn_once("incomplete", f"more than {MAX_KEYS:,} keys: {text}")
 
     def _admit(self, batch: Sequence[RawSample]) -> list[Arrival]:
         """Return the arrivals of a batch, with 0 losses each; rejected ones keep their number but lose the payload.
@@ -351,9 +343,9 @@ class PendingQueue:
                 try:
                     stream = stream or self._stream(key)
                     if len(payload) != stream.size:
-                        self._decoder.inspect(stream, payload, raw)
+                        self.decoder.inspect(stream, payload, raw)
                 except (AddressError, DecodeError) as exc:
-                    self._decoder.reject(key, exc, stream)
+                    self.decoder.reject(key, exc, stream)
                     if stream is None:
                         continue
                     payload = b""
@@ -451,7 +443,7 @@ class PendingQueue:
         every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
             self._drop(every.popleft())
-            self._warn_of_drops()
+            self._warn_once(*_SLOW)
         return len(arrivals)
 
     def _supersede(self, arrival: Arrival) -> None:
@@ -469,11 +461,7 @@ class PendingQueue:
         stream.unreported += lost
         self.account.dropped += 1
 
-    def _warn_of_drops(self) -> None:
-        if not self.newest_only:
-            self._warn_once("the reader is slower than the data: messages are dropped", extra=about("dropped"))
-
-    def _warn_once(self, text: str, *values: object, extra: Mapping[str, object]) -> None:
-        if text not in self._warned:
-            self._warned.add(text)
-            _log.warning(f"%s: {text}", self.name, *values, extra=extra)
+    def _warn_once(self, event: str, text: str) -> None:
+        if event not in self._warned:
+            self._warned.add(event)
+            _log.warning("%s: %s", self.name, text, extra=about(event))

@@ -181,7 +181,7 @@ class Receiver:
         except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
             extra = about("bug")
             _log.exception("%s: unexpected error, %d samples discarded", self._name, len(batch), extra=extra)
-            self._queue.count_invalid(len(batch))
+            self._queue.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:
         """Job of the I/O thread: drain the ring, acknowledge and recover; return the seconds until the next call."""
@@ -225,7 +225,7 @@ class Receiver:
         if parameters is not None:  # otherwise malformed: dropping the query ends it
             key = str(query.key_expr)
             request = AckRequest(key.removesuffix(ack_key("")), *parameters, partial(_reply, query, key, self._queue))
-            self._queue.add(request, drained=self._idle)
+            self._queue.acknowledge(request, drained=self._idle)
 
 
 def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
