@@ -18,6 +18,7 @@ import zenoh
 import nedbus
 from nedbus import ClosedError, Counts, Mode
 from nedbus.client import PublisherRegistry, QueryServer, RejectionReport
+from nedbus.client.protocol import LIVE
 from nedbus.client.receiving import PendingQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
@@ -217,6 +218,15 @@ def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, ca
     assert len(asked) == 1
     unread = [text for text in caplog.messages if "not read" in text]
     assert unread == ["layout 9 of VehicleLocalPosition is newer than this reader; not read: brand_new"]
+
+
+def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) -> None:
+    """The query of last messages waits for the description of a layout that the reader does not know."""
+    fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
+    schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
+    last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)
+    with answering(raw, SCHEMA, schema), answering(raw, KEY, last):
+        assert [(each.message.timestamp, each.message.x) for each in client.latest(VLP)] == [(4, 2.5)]
 
 
 @pytest.mark.parametrize(
