@@ -84,7 +84,7 @@ def test_stream_that_goes_on_sends_none(stream: Stream, rate: int) -> None:
 
 
 def test_silent_stream_sends_ever_more_rarely(stream: Stream) -> None:
-    """Heartbeats follow after 0.4 s, then after 0.5, 1 and 2 s, then each 4 s: 900 per hour, with as many calls."""
+    """Heartbeats follow after 0.4 s, then after 0.5, 1 and 2 s, then each 4 s: 900 per hour, each with one call."""
     for _ in range(2):  # a message restarts the schedule
         stream.put()
         first, *others = stream.wait(60.0)
