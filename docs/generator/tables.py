@@ -93,7 +93,7 @@ def keys_page() -> str:
             ),
         ],
         [
-            code("nedbus/@schema/VehicleLocalPosition"),
+            code("nedbus/@schema/*/VehicleLocalPosition"),
             "queryable: JSON Schema and layouts of a message, of each definition of its name, or of that of `?hash=`",
         ],
         [code("nedbus/@service/*/status"), "queryable: status of each service, in JSON"],
@@ -128,7 +128,7 @@ def keys_page() -> str:
             "\nThe name of any message that is not in this table is followed by `;hash=...`: the first 32 hexadecimal "
             "digits of the RIHS01 hash of its fields as ROS 2 computes it (`nedbus_msgs.short_hash`), as builds of "
             "PX4 may differ in a message of the same name."
-            "\nA reader queries `nedbus/@schema/<Message>?hash=...`, computes the hash of the fields in each answer, "
+            "\nA reader queries `nedbus/@schema/*/<Message>?hash=...`, computes the hash of the fields in each answer, "
             "and decodes a payload only with the fields of its own hash; without it, the message is invalid.",
             table(["message", "fields", "bytes", "encoding"], messages),
         ),

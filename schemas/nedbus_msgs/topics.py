@@ -167,9 +167,9 @@ def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Addres
     return Address.from_key(f"{prefix}/{key.removeprefix(begin)}", prefix=prefix)
 
 
-def schema_key(message: str, *, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key to query publishers for the JSON Schema and the layouts of a message."""
-    return f"{prefix}/@schema/{message}"
+def schema_key(message: str, *, session: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key to query publishers, or one session, for the JSON Schema and the layouts of a message."""
+    return f"{prefix}/@schema/{session}/{message}"
 
 
 def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:

@@ -54,7 +54,7 @@ def test_keys_are_as_documented() -> None:
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
     assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
     assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
-    assert schema_key("VehicleLocalPosition") == "nedbus/@schema/VehicleLocalPosition"
+    assert schema_key("VehicleLocalPosition") == "nedbus/@schema/*/VehicleLocalPosition"
     assert status_key("a-1") == "nedbus/@service/a-1/status"
     assert ack_key(Selection("vehicle_local_position").key_expr()) == "nedbus/*/vehicle_local_position/@ack"
 

@@ -73,7 +73,7 @@ def test_hostile_description_harms_no_other_stream(
     with suppress(ValueError):  # most hashes are right, so that the description itself is rejected
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
-    schema = "nedbus/@schema/Evil"
+    schema = "nedbus/@schema/peer/Evil"
     with answering(raw, schema, reply_with({schema: payload})), client.subscribe("*", mode="every") as subscription:
         good = bus.publisher("vehicle_attitude", vehicle="1")
         wait_for_reader(raw, "nedbus/7/evil")

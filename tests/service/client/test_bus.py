@@ -33,7 +33,7 @@ from tests.service.delivery.publishing import publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
 
 BOTH: list[Mode] = ["latest", "every"]
-SCHEMA = "nedbus/@schema/VehicleLocalPosition"
+SCHEMA = "nedbus/@schema/peer/VehicleLocalPosition"
 
 
 @pytest.mark.parametrize("mode", BOTH)

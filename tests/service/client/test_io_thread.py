@@ -90,7 +90,7 @@ def test_failing_call_ends_no_others() -> None:
 
 
 def test_sessions_share_their_threads(endpoint: str) -> None:
-    """Twenty buses that publish, and are queried, have as many Python threads as one."""
+    """Twenty buses that publish, and are queried, have the Python threads of one."""
     before = set(threading.enumerate())
     with ExitStack() as opened:
         buses = [opened.enter_context(nedbus.connect(endpoint)) for _ in range(20)]

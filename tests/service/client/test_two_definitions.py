@@ -204,7 +204,7 @@ def test_encoding_names_the_definition(bus: nedbus.Bus, raw: Session) -> None:
     )
     assert len(set(short.values())) == 2
     for parameter, expected in ("", set("AB")), (f"?hash={short['B']}", {"B"}):
-        replies = query(raw, f"nedbus/@schema/{NAME}{parameter}", timeout=DEADLINE, newest=False)
+        replies = query(raw, f"nedbus/@schema/*/{NAME}{parameter}", timeout=DEADLINE, newest=False)
         found = [json.loads(reply.payload.to_bytes()) for reply in replies]
         assert {each["hash"] for each in found} == {short[firmware] for firmware in expected}
 
@@ -212,7 +212,7 @@ def test_encoding_names_the_definition(bus: nedbus.Bus, raw: Session) -> None:
 def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, raw: Session) -> None:
     """A peer that describes a message with other fields, whatever hash it claims, leaves it undecoded."""
     wrong, definition = definition_of("B"), definition_of("A")
-    schema = f"nedbus/@schema/{NAME}"
+    schema = f"nedbus/@schema/peer/{NAME}"
     layout = {"wire": 0, "fields": [{"name": name, "type": str(kind)} for name, kind in wrong.types.items()]}
     claim = {"layouts": [layout], "hash": short_hash(NAME, definition.types)}
     with (

@@ -212,7 +212,7 @@ from nedbus.transport import open_client
 session = open_client([os.environ["NEDBUS_CONNECT"]], timeout=30.0)
 while True:
     for _ in range(50):
-        session.get("nedbus/@schema/VehicleLocalPosition", zenoh.handlers.RingChannel(1), timeout=1.0)
+        session.get("nedbus/@schema/*/VehicleLocalPosition", zenoh.handlers.RingChannel(1), timeout=1.0)
     time.sleep(0.002)
 """
     for _ in range(2):

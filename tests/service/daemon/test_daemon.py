@@ -472,7 +472,7 @@ def test_status_schema_and_last_values_are_on_the_network(run_nedbus: Start, raw
         *(f"estimator_local_position/{n}" for n in (0, 1)),
     )
     assert source["addresses"] == [f"1/{topic}" for topic in topics]
-    layouts = ask(raw, "nedbus/@schema/VehicleLocalPosition")[0]["layouts"]
+    layouts = ask(raw, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
     [current] = [layout for layout in layouts if layout["wire"] == 1]
     assert [field["name"] for field in current["fields"]] == list(VehicleLocalPosition.model_fields)
 

@@ -46,7 +46,8 @@ class PublisherRegistry:
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
         self._publishers: dict[Address, Publisher] = {}
-        self._definitions: dict[str, dict[str, Definition[Any]]] = {}  # by name and hash, oldest first
+        self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
+        self._schema_key = partial(schema_key, session=str(session.zid()), prefix=prefix)
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
         self._shared: set[str] = set()
@@ -90,6 +91,8 @@ class PublisherRegistry:
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
             self._queries.answer(self._messages_of(vehicle), _weakly(self._reply, vehicle))
+            # A key of its own: routers take quadratic time for one that all sessions declare.
+            self._queries.answer(self._schema_key(ANY), partial(_reply_schemas, self._schema_key, self._definitions))
             self._add_definition(definition)
         return publisher
 
@@ -157,18 +160,10 @@ class PublisherRegistry:
 
     def _add_definition(self, definition: Definition[Any]) -> None:
         """Reply to queries for a definition, and no more to those for the oldest one without a publisher."""
-        name = definition.name
-        known, key = self._definitions.setdefault(name, {}), schema_key(name, prefix=self.prefix)
-        known[short_hash(name, definition.types)] = definition
-        self._queries.answer(key, partial(_reply_schemas, key, known))
-        if sum(map(len, self._definitions.values())) > len(self._publishers) + _MAX_UNUSED:
+        self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
+        if len(self._definitions) > len(self._publishers) + _MAX_UNUSED:
             used = {each.definition for each in self._publishers.values()}
-            items = self._definitions.items()
-            name, short = next((name, short) for name, known in items for short in known if known[short] not in used)
-            del self._definitions[name][short]
-            if not self._definitions[name]:
-                del self._definitions[name]
-                self._queries.end(schema_key(name, prefix=self.prefix))
+            del self._definitions[next(key for key, each in self._definitions.items() if each not in used)]
 
     def _reply(self, vehicle: str, query: zenoh.Query) -> None:
         """Reply with the last messages of a vehicle."""
@@ -179,12 +174,14 @@ class PublisherRegistry:
                 query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
 
 
-def _reply_schemas(key: str, definitions: Mapping[str, Definition[Any]], query: zenoh.Query) -> None:
-    """Reply with the schema of each definition of a message, or of the one with the hash in the query."""
+def _reply_schemas(
+    key_of: Callable[[str], str], definitions: Mapping[tuple[str, str], Definition[Any]], query: zenoh.Query
+) -> None:
+    """Reply with the schemas of the queried messages, or with the one that has the hash in the query."""
     wanted = query.parameters.get("hash")
-    for short, definition in tuple(definitions.items()):
-        if wanted in (None, short):
-            query.reply(key, json.dumps({**schema_of(definition), "hash": short}), encoding=JSON)
+    for (name, short), definition in tuple(definitions.items()):
+        if wanted in (None, short) and query.key_expr.intersects(key_of(name)):
+            query.reply(key_of(name), json.dumps({**schema_of(definition), "hash": short}), encoding=JSON)
 
 
 def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:

@@ -75,7 +75,7 @@ class Writer:
 class _Silence:
     """The silence of a writer since its message at monotonic time `since` [s]; the first one follows."""
 
-    publisher: zenoh.Publisher
+    key: str
     since: float = 0.0
     sent: int = 0  # heartbeats during this silence
     due: float = math.inf  # monotonic time of the next heartbeat, or of a look at the writer [s]
@@ -91,9 +91,7 @@ class Heartbeats:
 
     def add(self, writer: Writer) -> None:
         """Send heartbeats of a writer, from its first message on; without readers they cost no traffic."""
-        key, drop = heartbeat_key(writer.key, writer.name), zenoh.CongestionControl.DROP
-        publisher = self.session.declare_publisher(key, congestion_control=drop, priority=writer.priority)
-        self._silences[writer] = _Silence(publisher)
+        self._silences[writer] = _Silence(heartbeat_key(writer.key, writer.name))
 
     def resume(self, writer: Writer) -> None:
         """End the silence of a writer, which has put a message."""
@@ -134,8 +132,10 @@ class Heartbeats:
                 writer.is_silent = False
                 continue
             left -= 1
+            payload, drop = heartbeat_payload(writer.published), zenoh.CongestionControl.DROP
             with suppress(zenoh.ZError):  # the session is closed
-                silence.publisher.put(heartbeat_payload(writer.published))
+                # Not from a publisher: Zenoh keeps a few kB for each that was declared, until the session closes.
+                self.session.put(silence.key, payload, congestion_control=drop, priority=writer.priority)
             silence.sent += 1
             silence.due = now + _PAUSES[min(silence.sent, len(_PAUSES) - 1)]
         return min((silence.due for silence in tuple(self._silences.values())), default=math.inf) - now
