@@ -16,6 +16,7 @@ from .senders import Peer
 
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
+_RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: Linux's own holds 277 small datagrams
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
@@ -30,6 +31,7 @@ class _UdpLink:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
         self.close = self._socket.close
         self.peer: Peer = None if listens else address
         if listens:
