@@ -246,6 +246,13 @@ def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
         publish(again, 3)
 
 
+def test_closed_publishers_of_this_bus_are_not_listed(client: nedbus.Bus) -> None:
+    """A bus that lists vehicles for the first time lists none of the 50 that it has published and closed."""
+    for number in range(50):
+        client.publisher(VLP, vehicle=number).close()
+    assert not client.vehicles()
+
+
 def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
     """Every call on a closed bus raises ClosedError, and its subscriptions end."""
     subscription = client.subscribe(VLP)

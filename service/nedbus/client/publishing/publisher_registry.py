@@ -120,9 +120,11 @@ class PublisherRegistry:
         return shared
 
     def confirm(self, address: Address) -> None:
-        """Wait until the router has processed all declarations of an address, by a query for its own token."""
-        own = address.alive_key(str(self._session.zid()), prefix=self.prefix)
-        alive_keys(self._session, own, timeout=_TOKENS_TIMEOUT)
+        """Wait until the router has processed all declarations of an address, by a query without an answer.
+
+        After a query for a token of its own, Zenoh 1.10 at times lists that token for ever.
+        """
+        alive_keys(self._session, f"{self.prefix}/{address.vehicle}/@alive", timeout=_TOKENS_TIMEOUT)
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""
