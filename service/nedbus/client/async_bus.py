@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
@@ -22,6 +23,7 @@ from .sample import Mode
 from .subscription import AsyncSubscription
 
 _WAKE_INTERVAL: Final = 1.0  # s between checks for Ctrl-C while connecting
+_MAX_QUERIES: Final = 32  # of a bus at a time, each in a thread; further ones wait
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -35,7 +37,8 @@ def _awaited(
     @wraps(method)
     async def call(twin: Any, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         if waits(twin):
-            return await asyncio.to_thread(method, twin._blocking, *args, **kwargs)
+            result: _T = await twin._in_thread(method, twin._blocking, *args, **kwargs)
+            return result
         return method(twin._blocking, *args, **kwargs)
 
     return call
@@ -50,6 +53,7 @@ class AsyncBus:
     def __init__(self, open_bus: Callable[[threading.Event], Bus]) -> None:
         self._open_bus = open_bus
         self._bus: Bus | None = None
+        self._threads = ThreadPoolExecutor(_MAX_QUERIES, "nedbus-async")
 
     @property
     def _blocking(self) -> Bus:
@@ -91,7 +95,8 @@ class AsyncBus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
-        return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue)
+        open_receiver = partial(self._in_thread, bus._open_receiver, selection, pending_queue)
+        return AsyncSubscription(open_receiver, pending_queue)
 
     latest = last_async(_awaited(Bus.latest))
     vehicles = _awaited(Bus.vehicles)
@@ -112,16 +117,15 @@ class AsyncBus:
     ) -> AsyncPublisher:
         """Return a publisher with awaitable methods; see `Bus.publisher`."""
         call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance, definition=definition)
-        return AsyncPublisher(await asyncio.to_thread(call, lossless=lossless, source=source))
+        return AsyncPublisher(await self._in_thread(call, lossless=lossless, source=source))
 
     async def close(self) -> None:
-        """Close the bus; see `Bus.close`."""
-        if self._bus is not None:
-            await asyncio.to_thread(self._bus.close)
+        """Close the bus; see `Bus.close`. Cancelling it ends the wait for readers, and closes at once."""
+        await self.__aexit__(None)
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
-        opening = asyncio.create_task(asyncio.to_thread(self._open_bus, cancelled))
+        opening = asyncio.create_task(self._in_thread(self._open_bus, cancelled))
         try:
             while not opening.done():  # asyncio can miss a Ctrl-C just before it blocks, so it wakes up regularly
                 await asyncio.wait({opening}, timeout=_WAKE_INTERVAL)
@@ -132,9 +136,29 @@ class AsyncBus:
             raise
         return self
 
-    async def __aexit__(self, *exc: object) -> None:
-        if self._bus is not None:
-            await asyncio.to_thread(self._bus.__exit__, *exc)
+    async def __aexit__(self, exc: object, *_: object) -> None:
+        if (bus := self._bus) is not None:  # in a new thread, as all others may wait
+            thread = ThreadPoolExecutor(1, "nedbus-close")
+            await _run(thread, partial(bus.__exit__, exc), cancel=partial(_stop_waiting, bus))
+
+    async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(call, *args, **kwargs))
+
+
+def _stop_waiting(bus: Bus) -> None:
+    for publisher in bus._publishers.publishers:
+        publisher._flow_control.cancelled.set()
+
+
+async def _run(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
+    """Run a call in a thread; when cancelled, `cancel` has to end it soon."""
+    running = asyncio.get_running_loop().run_in_executor(thread, call)
+    try:
+        return await asyncio.shield(running)
+    except asyncio.CancelledError:
+        cancel()
+        await asyncio.wait([running])
+        raise
 
 
 def connect_async(
@@ -154,14 +178,16 @@ class AsyncPublisher:
     """A Publisher for asyncio; get one from `await bus.publisher(...)`.
 
     Attributes and errors are those of Publisher; all methods are awaited.
-    Methods that may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) run in a thread and do
-    not block the event loop. Await each call before the next one.
+    Methods that may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) run in a thread of this
+    publisher and do not block the event loop. Cancelling one, as a timeout does, ends its wait: `published` then has
+    the number of messages sent, and a cancelled `close` has closed without waiting. Await each call before the next.
     """
 
     def __init__(self, publisher: Publisher) -> None:
         self.address, self.key = publisher.address, publisher.key
         self.source, self.lossless = publisher.source, publisher.lossless
         self._blocking = publisher
+        self._thread = ThreadPoolExecutor(1, "nedbus-async")
 
     @property
     def published(self) -> int:
@@ -173,9 +199,19 @@ class AsyncPublisher:
     publish_many = _awaited(Publisher.publish_many)
     flush = _awaited(Publisher.flush)
     close = _awaited(Publisher.close)
+    __aexit__ = _awaited(Publisher.__exit__)
 
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(self, *exc: object) -> None:
-        await self.close()
+    async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        cancelled, flow_control = threading.Event(), self._blocking._flow_control
+
+        def run() -> _T:
+            flow_control.cancelled = cancelled
+            try:
+                return call(*args, **kwargs)
+            finally:
+                flow_control.cancelled = threading.Event()
+
+        return await _run(self._thread, run, cancel=cancelled.set)

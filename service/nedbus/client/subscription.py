@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, Generic, Self
@@ -125,7 +126,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
     It opens on first use and is bound to the event loop running at that time.
     """
 
-    def __init__(self, open_receiver: Callable[[], Receiver], pending_queue: PendingQueue) -> None:
+    def __init__(self, open_receiver: Callable[[], Awaitable[Receiver]], pending_queue: PendingQueue) -> None:
         super().__init__(pending_queue)
         self._open_receiver = open_receiver
         self._finalizer: Finalizer | None = None
@@ -155,7 +156,8 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         if self._opening is not None:
             await asyncio.wait([self._opening])
         if self._finalizer is not None:
-            await asyncio.to_thread(self._finalizer.close_now)
+            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new one, as all others may wait
+            await asyncio.get_running_loop().run_in_executor(thread, self._finalizer.close_now)
 
     def __aiter__(self) -> AsyncIterator[Sample[M_co]]:
         return self
@@ -211,7 +213,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
         self._queue.on_wake = partial(_wake, loop, self._arrival)
-        receiver = await asyncio.to_thread(self._open_receiver)
+        receiver = await self._open_receiver()
         receiver.pump()
         self._finalizer = Finalizer(self, receiver.close)
 

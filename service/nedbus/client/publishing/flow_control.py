@@ -12,6 +12,7 @@ from typing import Final
 from zenoh import CongestionControl
 
 from nedbus.client.protocol import CLOSED, write_parameters
+from nedbus.errors import ClosedError
 from nedbus.log_event import about
 from nedbus.transport import LEASE, Answers, ask
 from nedbus_msgs import ack_key
@@ -115,6 +116,7 @@ class FlowControl:
 
     def __init__(self, writer: Writer, window: SharedWindow, *, needs_router: bool) -> None:
         self._writer, self._shared, self._needs_router = writer, window, needs_router
+        self.cancelled = threading.Event()  # set to end a wait with ClosedError
         self._lock = threading.Lock()
         self._readers = ReaderProxies()
         self._request: _Request | None = None
@@ -149,6 +151,8 @@ class FlowControl:
     def _wait(self, published: int, window: int, *, read: bool, timeout: float) -> bool:
         end, pause = time.monotonic() + timeout, _POLLS[0]
         while True:
+            if self.cancelled.is_set():
+                raise ClosedError
             with self._lock:
                 now = time.monotonic()
                 self._poll(now)

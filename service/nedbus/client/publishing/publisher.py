@@ -135,7 +135,7 @@ class Publisher:
     def close(self) -> None:
         """Withdraw the address and free it for another publisher. Idempotent.
 
-        A lossless publisher is flushed first.
+        A lossless publisher is flushed first, unless a `with` block ends with an exception.
         """
         if self._writer.closed:
             return
@@ -151,7 +151,9 @@ class Publisher:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, exc: object, *_: object) -> None:
+        if exc is not None:
+            self._flow_control.cancelled.set()
         self.close()
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
