@@ -60,6 +60,7 @@ if TYPE_CHECKING:
         Mode,
         Monitor,
         Publisher,
+        Publishers,
         RejectionReport,
         Rejections,
         Sample,
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
         StreamHealth,
         StreamStatus,
         Subscription,
+        Vehicles,
         connect,
         connect_async,
     )
@@ -100,16 +102,16 @@ __version__ = "0.1.0"
 __all__ = [
     "ANY", "DTYPE", "TOPICS", "AccountReport", "Address", "AddressError", "AddressInUseError", "AsyncBus",
     "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "ClosedError", "Condition", "ConfigError", "ConnectError",
-    "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition", "Health",
-    "Histogram", "InvalidMessageError", "LayoutError", "ListenError", "LogStreamStatus", "MapProjection", "Message",
-    "MessageArray", "Mode", "Monitor", "NedbusError", "NoDataError", "NoOrigin", "OutputError", "PkiError",
-    "Provenance", "Publisher", "Quantity", "ReceiveError", "RejectionReport", "Rejections", "ResetTracker", "Row",
-    "Sample", "Selection", "ServiceStatus", "Session", "SourceError", "SourceStatus", "StreamHealth", "StreamStatus",
+    "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition", "Health", "Histogram",
+    "InvalidMessageError", "LayoutError", "ListenError", "LogStreamStatus", "MapProjection", "Message", "MessageArray",
+    "Mode", "Monitor", "NedbusError", "NoDataError", "NoOrigin", "OutputError", "PkiError", "Provenance", "Publisher",
+    "Publishers", "Quantity", "ReceiveError", "RejectionReport", "Rejections", "ResetTracker", "Row", "Sample",
+    "Selection", "ServiceStatus", "Session", "SourceError", "SourceStatus", "StreamHealth", "StreamStatus",
     "Subscription", "Tls", "Topic", "UnknownLayoutError", "UtcOffset", "Vector", "VehicleLocalPosition",
-    "VehicleReport", "addresses_of", "align", "connect", "connect_async", "define_msg", "dtype_of", "enu_to_ned",
-    "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "read",
-    "to_array", "to_global", "to_local", "to_message", "utc_of", "variances_enu_to_ned", "variances_ned_to_enu",
-    "yaw_enu_to_ned", "yaw_ned_to_enu",
+    "VehicleReport", "Vehicles", "addresses_of", "align", "connect", "connect_async", "define_msg", "dtype_of",
+    "enu_to_ned", "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu", "quaternion_enu_to_ned",
+    "quaternion_ned_to_enu", "read", "to_array", "to_global", "to_local", "to_message", "utc_of",
+    "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
 # Imported on first use of a name: `nedbus --version` needs none of them, and only the last two load NumPy.

@@ -88,7 +88,9 @@ async def read_and_publish() -> None:
         await publisher.publish_row(sample.message)
         assert_type(await publisher.flush(), bool)
         await publisher.flush("1")  # type: ignore[arg-type] # seconds
-        assert_type(await bus.vehicles(timeout=1.0), dict[str, list[nedbus.Address]])
+        vehicles = await bus.vehicles(timeout=1.0)
+        assert_type(vehicles["7"], list[nedbus.Address])
+        assert_type(vehicles.complete, bool)
         assert_type(await bus.latest(), list[nedbus.Sample])
 
 

@@ -9,11 +9,13 @@ from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
 from .discovery import (
     LogStreamStatus,
+    Publishers,
     RejectionReport,
     Rejections,
     ServiceStatus,
     SourceStatus,
     StreamStatus,
+    Vehicles,
     find_accounts,
     find_services,
 )
@@ -35,8 +37,8 @@ else:
 
 __all__ = [
     "HEARTBEAT", "AsyncBus", "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "Counts", "Health", "Histogram",
-    "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "QueryServer",
+    "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "Publishers", "QueryServer",
     "RejectionReport", "Rejections", "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState",
-    "StreamStatus", "Subscription", "check_max_rate", "connect", "connect_async", "connect_with", "describe_stream",
-    "find_accounts", "find_services", "health_of_last", "stream_state", "to_age",
+    "StreamStatus", "Subscription", "Vehicles", "check_max_rate", "connect", "connect_async", "connect_with",
+    "describe_stream", "find_accounts", "find_services", "health_of_last", "stream_state", "to_age",
 ]  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -21,7 +20,16 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Definition, Selection, vehi
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
-from .discovery import Rejections, ServiceStatus, VehicleDirectory, find_accounts, find_schemas, find_services
+from .discovery import (
+    Publishers,
+    Rejections,
+    ServiceStatus,
+    VehicleDirectory,
+    Vehicles,
+    find_accounts,
+    find_schemas,
+    find_services,
+)
 from .protocol import LIVE
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
@@ -115,18 +123,24 @@ class Bus:
         newest = {sample.address: sample for sample in samples}  # the last one of each address wins
         return [newest[address] for address in sorted(newest)]
 
-    def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
+    def vehicles(self, *, timeout: float = 2.0) -> Vehicles:
         """Return the published addresses by vehicle; use `latest` for their messages.
 
-        The first call queries the router and waits up to `timeout` seconds; later calls use the liveliness tokens that
-        the bus has subscribed to.
+        The first call subscribes to the liveliness tokens of the publishers, and waits up to `timeout` seconds until
+        the router has sent them. If that takes longer, it returns those that have arrived, `complete` is False, and
+        the next call waits again.
         """
-        addresses = sorted(self.publishers(timeout=timeout))
-        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
+        publishers = self.publishers(timeout=timeout)
+        by_vehicle = groupby(sorted(publishers), key=attrgetter("vehicle"))
+        vehicles = Vehicles({vehicle: list(group) for vehicle, group in by_vehicle})
+        vehicles.complete = publishers.complete
+        return vehicles
 
-    def publishers(self, *, timeout: float = 2.0) -> Counter[Address]:
+    def publishers(self, *, timeout: float = 2.0) -> Publishers:
         """Return the number of publishers of each address, like `vehicles`; readers of several get a mixture."""
-        return self._directory.publishers(self._session, timeout=timeout)
+        publishers = self._directory.publishers(self._session, timeout=timeout)
+        publishers.complete = publishers.complete and self.connected
+        return publishers
 
     def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Query the status of all nedbus services on this network."""

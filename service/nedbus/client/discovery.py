@@ -52,6 +52,21 @@ _SCHEMA_TIMEOUT: Final = 2.0  # s for a busy publisher to reply
 _POLL: Final = 0.002  # s between polls for tokens
 
 
+class Publishers(Counter[Address]):
+    """The number of publishers of each address; `complete` as in Vehicles."""
+
+    complete = True
+
+
+class Vehicles(dict[str, list[Address]]):
+    """The published addresses by vehicle.
+
+    `complete`: False if the router has not listed all of them yet, there are more than 10,000, or no router is there.
+    """
+
+    complete = True
+
+
 class VehicleDirectory:
     """The addresses and their publishers, by the liveliness tokens that it subscribes to at the first call."""
 
@@ -60,23 +75,28 @@ class VehicleDirectory:
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: AliveTokens | None = None
+        self._logged = False
 
-    def publishers(self, session: Session, *, timeout: float) -> Counter[Address]:
-        """Return the number of publishers of each address; the first call waits up to `timeout` seconds, if not 0."""
+    def publishers(self, session: Session, *, timeout: float) -> Publishers:
+        """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete."""
+        end = time.monotonic() + timeout
         with self._lock:
             if self._tokens is None:
                 self._tokens = AliveTokens(session, self._selection.alive_key_expr(prefix=self._prefix))
-                if timeout:
-                    self._tokens.ask()
-            self._poll(self._tokens, timeout)
-            while self._tokens.is_asking:
+            self._poll(self._tokens)
+            while self._tokens.is_listing and time.monotonic() < end:
                 time.sleep(_POLL)
-                self._poll(self._tokens, timeout)
-            self._poll(self._tokens, timeout)  # changes that the subscriber received before the last reply
-            return Counter(self._addresses.values())
+                self._poll(self._tokens)
+            publishers = Publishers(self._addresses.values())
+            publishers.complete = self._tokens.complete
+            if self._tokens.is_listing and timeout and not self._logged:
+                text = "the router has not listed all vehicles within %g s, only %d streams: it is slow, or refuses"
+                _log.warning(text, timeout, len(publishers), extra=about("incomplete"))
+            self._logged = self._tokens.is_listing and (self._logged or timeout > 0)
+            return publishers
 
-    def _poll(self, tokens: AliveTokens, timeout: float) -> None:
-        for key, alive in tokens.take(timeout=timeout):
+    def _poll(self, tokens: AliveTokens) -> None:
+        for key, alive in tokens.take():
             if not alive:
                 self._addresses.pop(key, None)
                 continue

@@ -13,10 +13,11 @@ import pytest
 import nedbus
 from nedbus.cli import follow
 from nedbus.cli.app import app
+from nedbus.cli.commands import query
 from nedbus.cli.commands.pki import pki
 from nedbus.client import Subscription, connect_with
 from nedbus.settings import Settings
-from nedbus.transport import open_router
+from nedbus.transport import alive_tokens, open_router
 from nedbus_msgs import ANY
 from tests.flights.first_message import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
@@ -85,6 +86,29 @@ def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
         assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [vehicle] * count
         assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
         assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), "nothing of permissions"
+
+
+def test_incomplete_list_fails(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A list that lacks a vehicle shows the others, a warning, and exits with 1."""
+    monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 1)
+    publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
+    listed = run_command("list", "-c", endpoint)
+    assert listed.exit_code == 1
+    assert "some vehicles are missing" in listed.err
+    assert sum(str(each.address) in listed.out for each in publishers) == 1
+
+
+def test_list_that_has_not_arrived_is_no_empty_list(
+    bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the router has not listed the vehicles, the command does not claim that there are none."""
+    monkeypatch.setattr(alive_tokens.AliveTokens, "take", lambda _: [])
+    monkeypatch.setattr(query, "_LIST_TIMEOUT", 0.01)
+    listed = run_command("list", "-c", endpoint)
+    assert listed.exit_code == 1
+    assert "the router has not listed all vehicles within 0.01 s" in listed.err
+    assert f"no vehicle is known yet at {endpoint}" in listed.err
+    assert "is published" not in listed.err
 
 
 def test_hz_measures(run_nedbus: Start, flying: str) -> None:

@@ -47,14 +47,18 @@ _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
 _SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
 _MAX_ROWS: Final = 200  # of a table, and services shown: any peer may claim to be a service
+_LIST_TIMEOUT: Final = 10.0  # s for the router to list all streams
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 
 @command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
-    """List published streams, the age of their last message and state."""
+    """List published streams, the age of their last message and state.
+
+    Exits with 1 if the list is incomplete, as the router is too slow or refuses.
+    """
     selection = Selection(ANY, vehicle)
-    everything = bus.publishers()
+    everything = bus.publishers(timeout=_LIST_TIMEOUT)
     published = Counter({each: count for each, count in everything.items() if selection.matches(each)})
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []
@@ -79,9 +83,10 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         elif bus.services():
             hint = "a service answers: see 'nedbus info', and check its and your permissions (docs/security.md)"
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
-        write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
-        if vehicle != ANY:
-            raise typer.Exit(1)
+        known = "is published" if everything.complete else "is known yet"
+        write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
+    if not everything.complete or (not rows and vehicle != ANY):
+        raise typer.Exit(1)
 
 
 @command

@@ -107,7 +107,7 @@ class MaxRateReceiver(Receiver):
 
     def _check_publishers(self, now: float) -> None:
         """Warn about live streams without a downsampled message."""
-        for token, alive in self._tokens.take(timeout=_TIMEOUT):
+        for token, alive in self._tokens.take():
             with suppress(AddressError):  # not a nedbus key
                 address = address_of_alive_key(token, prefix=self._prefix)
                 topic = get_topic(address.topic)

@@ -39,7 +39,6 @@ _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
 _REPORT_INTERVAL: Final = 1.0  # s between reports of absent topics
-_TOKENS_TIMEOUT: Final = 3.0  # s for a router to list all publishers again, after too many changed at once
 _MAX_PENDING: Final = 4096  # samples waiting to be decoded
 _MAX_PENDING_BYTES: Final = 4096  # per payload
 _RING_SIZE: Final = 16_384  # samples waiting for the thread
@@ -84,7 +83,7 @@ class Px4ZenohNode:
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=_TICK)
-            for token, alive in self._tokens.take(timeout=_TOKENS_TIMEOUT):  # older than the sample
+            for token, alive in self._tokens.take():  # older than the sample
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
             if (now := time.monotonic()) >= next_report:
