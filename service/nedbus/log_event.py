@@ -26,7 +26,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     # the process
     "router": Event("a router listens, or ignores part of its configuration file", limited=False),
     "client": Event("the service is a client of a router", limited=False),
-    "http": Event("metrics and health are served, and the hosts that can read them", limited=False),
+    "http": Event("metrics, health or the page are served, and to which hosts; or too many clients", limited=False),
     "setting": Event("a setting or an environment variable looks wrong", limited=False),
     "reload": Event("SIGHUP was received: the changes, or the reason for none", limited=False),
     "ending": Event("the process stops on a signal, or fails to stop in time", limited=False),

@@ -7,6 +7,7 @@ import json
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
@@ -21,6 +22,7 @@ _log = logging.getLogger(__name__)
 
 _MAX_REQUESTS: Final = 16  # concurrent requests
 _CLIENT_TIMEOUT: Final = 5.0  # s to send a request, to read the response, and to wait for a free thread
+_ACCEPT_PAUSE: Final = 0.2  # s
 _ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # Prometheus and probes may use any host name
 
 
@@ -82,6 +84,14 @@ class HttpServer(ThreadingHTTPServer):
         self._free.release(_MAX_REQUESTS)
         self.shutdown()
         self.server_close()
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """Accept a client; without a file for it, pause, as it would be tried again at once."""
+        try:
+            return super().get_request()
+        except OSError:
+            time.sleep(_ACCEPT_PAUSE)
+            raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a client in its own thread; wait up to 5 s for a free one, then disconnect the client."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import resource
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,14 +17,20 @@ from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.models.widgets import Div
 from bokeh.server.auth_provider import NullAuth
-from bokeh.server.server import Server
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets
+from bokeh.util.token import get_token_payload
+from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.iostream import IOStream
 from tornado.web import HTTPError, RequestHandler
 
 from nedbus import clock
 from nedbus.client import Bus
 from nedbus.errors import ListenError
 from nedbus.events import ALL
+from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, leads_here
 from nedbus.settings import is_loopback
 from nedbus_msgs import Selection
@@ -33,13 +41,18 @@ from .fleet import Fleet
 from .playback import Player, Recording
 from .viewer import Viewer
 
+_log = logging.getLogger(__name__)
+
 MAX_VIEWERS: Final = 32
-"""Maximum number of pages open at the same time."""
+"""Maximum number of pages open at the same time: each has a WebSocket."""
 
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - wildcard hosts, only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
 _MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before Host is checked
 _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
+_MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, of which all but the newest are about to expire
+_MAX_CONNECTIONS: Final = 512  # or half of the open files that the process may have
+_REQUEST_TIMEOUT: Final = 10.0  # s for a client to send a request, and between two requests
 _UNUSED_LIFETIME: Final = 15_000  # ms; a page is kept this long without its browser, for example during a short sleep
 
 
@@ -144,27 +157,37 @@ class WebServer:
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
-            if len(self._server.get_sessions("/")) >= MAX_VIEWERS:
+            sessions = self._server.get_sessions("/")
+            waiting = [each for each in sessions if not each.connection_count]
+            for each in waiting[:-MAX_VIEWERS]:  # requested by a program that opens no WebSocket
+                each.request_expiration()
+            if len(sessions) - len(waiting) >= MAX_VIEWERS or len(waiting) >= _MAX_WAITING:
+                _log_once("limit of open pages reached", limit=MAX_VIEWERS)
                 document.add_root(Div(text=f"limit of {MAX_VIEWERS} open pages reached: close one"))
             else:
                 open_page(document)
 
         try:
-            self._server = Server(
-                {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=where.port,
-                allow_websocket_origin=["*"], auth_provider=_Names(where), keep_alive_milliseconds=5000,
-                unused_session_lifetime_milliseconds=_UNUSED_LIFETIME,
-                check_unused_sessions_milliseconds=_UNUSED_LIFETIME // 3,
-                websocket_max_message_size=_MAX_MESSAGE_BYTES,
-                http_server_kwargs={"max_body_size": _MAX_BODY_BYTES, "max_buffer_size": 2 * _MAX_MESSAGE_BYTES},
-                extra_patterns=[(path, _Text, {"make": make, "where": where}) for path, make in pages.items()],
-            )  # fmt: skip
+            sockets, port = bind_sockets(host, where.port)
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --http"
             raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
+        tornado = BokehTornado(
+            {"/": Application(FunctionHandler(open_or_refuse))},
+            extra_websocket_origins=["*"], auth_provider=_Names(where), keep_alive_milliseconds=5000,
+            unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
+            websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
+            extra_patterns=[(path, _Text, {"make": make, "where": where}) for path, make in pages.items()],
+        )  # fmt: skip
+        http = _HttpServer(
+            tornado, max_body_size=_MAX_BODY_BYTES, max_buffer_size=2 * _MAX_MESSAGE_BYTES,
+            idle_connection_timeout=_REQUEST_TIMEOUT, body_timeout=_REQUEST_TIMEOUT,
+        )  # fmt: skip
+        self._loop.add_callback(http.add_sockets, sockets)
+        self._server = BaseServer(self._loop, tornado, http)
         shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
-        self.url = f"http://{shown}:{self._server.port}"
+        self.url = f"http://{shown}:{port}"
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set, in this thread."""
@@ -175,6 +198,29 @@ class WebServer:
         poll.stop()  # otherwise it would stop the loop again while the server shuts down
         self._server.stop()
         self._loop.close(all_fds=True)
+
+
+class _HttpServer(HTTPServer):
+    """Closes connections beyond a limit: with no file left, accepting the next one would fail again and again."""
+
+    def initialize(self, *args: Any, **kwargs: Any) -> None:
+        super().initialize(*args, **kwargs)
+        self._streams: list[IOStream] = []
+        self._limit = min(_MAX_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        self._streams = [each for each in self._streams if not each.closed()]
+        if len(self._streams) >= self._limit:
+            _log_once("limit of connections reached", limit=self._limit)
+            stream.close()
+            return
+        self._streams.append(stream)
+        super().handle_stream(stream, address)
+
+
+@cache
+def _log_once(text: str, *, limit: int) -> None:
+    _log.warning("%s, further ones are refused: %d", text, limit, extra=about("http"))
 
 
 class _Names(NullAuth):
@@ -192,6 +238,8 @@ class _Names(NullAuth):
 
         async def check(handler: RequestHandler) -> str:
             _require_name(handler, self._where)
+            if handler.request.path.endswith("/ws"):
+                _require_token(handler)
             return "viewer"
 
         return check
@@ -205,6 +253,19 @@ def _require_name(handler: RequestHandler, where: Where) -> None:
     if not is_own or origin not in (host, *where.origins):
         name = origin if is_own else host
         raise HTTPError(403, reason=f"host name {name[:100]} is not allowed: add it with --origin")
+    if headers.get("Sec-Fetch-Site") == "cross-site" and headers.get("Sec-Fetch-Dest") != "document":
+        raise HTTPError(403, reason="part of a page of another site")
+
+
+def _require_token(handler: RequestHandler) -> None:
+    """Refuse a WebSocket without the token of a page, which Bokeh would log with a traceback."""
+    name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
+    try:
+        is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
+    except Exception:  # noqa: BLE001 - Bokeh raises whatever its decoders raise
+        is_valid = False
+    if not is_valid:
+        raise HTTPError(403, reason="no valid token of a page")
 
 
 class _Text(RequestHandler):

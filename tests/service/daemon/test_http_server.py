@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, nullcontext, suppress
+from types import SimpleNamespace
 
 import pytest
 
@@ -173,3 +175,26 @@ def test_more_clients_than_it_has_room_for(server: Pages) -> None:
         assert not BUSY.acquire(timeout=0.2)
         GO.set()
         assert {answer.result(DEADLINE) for answer in answers} == {(200, "True\n")}
+
+
+def test_server_pauses_without_a_file_for_a_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of open files a client stays in the queue, and accepting it is not tried again without a pause."""
+    pauses: list[float] = []
+    is_full = threading.Event()
+    accept = socket.socket.accept
+
+    def try_accept(listening: socket.socket) -> tuple[socket.socket, object]:
+        if is_full.is_set():
+            raise OSError(errno.EMFILE, "too many open files")
+        return accept(listening)
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        is_full.clear()
+
+    monkeypatch.setattr(socket.socket, "accept", try_accept)
+    monkeypatch.setattr(http_server, "time", SimpleNamespace(sleep=sleep))
+    is_full.set()
+    with closing(HttpServer("127.0.0.1:0", {"/page": lambda: Page.text("a page")})) as server:
+        assert Pages(server.port).ask("/page") == (200, "a page\n")
+    assert pauses == [http_server._ACCEPT_PAUSE]

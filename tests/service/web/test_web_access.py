@@ -19,7 +19,7 @@ from bokeh.models.widgets import Div
 from websockets.sync.client import ClientConnection, connect
 
 from nedbus.monitoring import Page
-from nedbus.web.server import WebServer, Where
+from nedbus.web.server import WebServer, Where, _log_once
 from tests.peers.ports import free_port
 from tests.peers.processes import Start
 from tests.service.web.page import in_thread
@@ -132,6 +132,73 @@ def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, url: str) ->
     for said in ("a word", "limit of 1 open pages reached: close one"):
         session = pull_session(url=url)
         assert [root.text for root in session.document.roots if isinstance(root, Div)] == [said]
+
+
+def test_parts_of_foreign_pages_are_refused(url: str) -> None:
+    """An image, a script or a frame of another site gets nothing, where a browser names it; a link to here works."""
+    for path, (site, kind, status) in product(
+        PATHS,
+        [
+            ("cross-site", "image", 403), ("same-site", "iframe", 200), ("cross-site", "iframe", 403),
+            ("cross-site", "document", 200), ("same-origin", "script", 200), ("none", "document", 200),
+        ],
+    ):  # fmt: skip
+        assert status_of(url + path, **{"Sec-Fetch-Site": site, "Sec-Fetch-Dest": kind}) == status
+
+
+@pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
+def test_requests_without_a_socket_take_no_place(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """Ten requests of a program that opens no WebSocket leave the one place, and the pages made for them are few."""
+    monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
+    for _ in range(10):
+        assert status_of(url) == 200
+    session = pull_session(url=url)
+    assert [root.text for root in session.document.roots if isinstance(root, Div)] == ["a word"]
+    monkeypatch.setattr("nedbus.web.server._MAX_WAITING", 0)
+    refused = pull_session(url=url)
+    assert [root.text for root in refused.document.roots if isinstance(root, Div)] != ["a word"]
+
+
+@pytest.fixture
+def tight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the limits of a server that is started later."""
+    monkeypatch.setattr("nedbus.web.server._REQUEST_TIMEOUT", 0.3)
+    monkeypatch.setattr("nedbus.web.server._MAX_CONNECTIONS", 3)
+    _log_once.cache_clear()
+
+
+@pytest.mark.parametrize("start", ["", "GET / HTTP/1.1\r\nHost: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\nx"])
+@pytest.mark.usefixtures("tight")
+def test_half_a_request_is_timed_out(url: str, start: str) -> None:
+    """A client that sends nothing, half a header or half a body is disconnected."""
+    with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE) as client:
+        client.sendall(start.encode())
+        while client.recv(1000):
+            pass
+
+
+@pytest.mark.usefixtures("tight")
+def test_connections_beyond_the_limit_are_closed(url: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Each connection takes a file: those beyond the limit are closed at once, logged once, and later ones served."""
+    where = ("127.0.0.1", int(url.rpartition(":")[2]))
+    open_files = [socket.create_connection(where, DEADLINE) for _ in range(10)]
+    wait_for(lambda: "limit of connections reached" in caplog.text, what="the warning")
+    for each in open_files:
+        with each:
+            each.recv(1)  # the end
+    assert status_of(url) == 200
+    assert caplog.text.count("limit of connections reached, further ones are refused: 3") == 1
+
+
+@pytest.mark.parametrize("protocols", [[], ["bokeh"], ["bokeh", "e30"], ["other", "e30"]])
+def test_socket_without_a_token_leaves_no_traceback(
+    url: str, protocols: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A WebSocket without the subprotocol or the token of a page is refused."""
+    offered = [websockets.Subprotocol(each) for each in protocols]
+    with pytest.raises(websockets.InvalidStatus, match="403"):
+        connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(url), subprotocols=offered or None)
+    assert not caplog.records
 
 
 def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: str) -> None:
