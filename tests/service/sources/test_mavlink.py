@@ -178,9 +178,9 @@ def test_flight_reaches_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, po
             assert sample.message.timestamp == line["time_boot_ms"] * 1000
             assert [getattr(sample.message, name) for name in NED] == [line[name] for name in NED]
             assert "heading" in sample.missing or abs(sample.message.heading) <= math.pi + 1e-6
-        assert list(bus.vehicles()) == ["7"]
     wait_for(lambda: status_of_source(bus).published == len(sent), what="the last one to be counted")
     now = status_of_source(bus)
+    assert (*now.addresses, *now.stale) == (f"7/{VLP}",), "stale after 3 s"
     assert (now.rejected, now.reboots, now.retries) == (0, 1, 0)
     # Losses before the first packet, around the reboot and after the last position cannot be counted.
     assert 0 < now.lost <= end["packets_dropped"]
