@@ -53,7 +53,7 @@ _MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
 _PAYLOAD: Final = itemgetter(1)
-_SLOW: Final = "dropped", "the reader is slower than the data: messages are dropped"
+_SLOW: Final = "the reader is slower than the data: messages are dropped"
 
 
 @dataclass(slots=True, eq=False)
@@ -134,7 +134,7 @@ class PendingQueue:
         if self.on_wake is not None:
             self.on_wake()
         if overflowed and not self.newest_only:
-            self._warn_once(*_SLOW)
+            self._warn_once("dropped", _SLOW)
         if self._ack_requests:
             self.acknowledge(drained=True)
 
@@ -443,7 +443,7 @@ class PendingQueue:
         every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
             self._drop(every.popleft())
-            self._warn_once(*_SLOW)
+            self._warn_once("dropped", _SLOW)
         return len(arrivals)
 
     def _supersede(self, arrival: Arrival) -> None:
