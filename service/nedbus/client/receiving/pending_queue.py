@@ -134,7 +134,7 @@ class PendingQueue:
         if self.on_wake is not None:
             self.on_wake()
         if overflowed and not self.newest_only:
-            self._warn_once("dropped", _SLOW)
+            self._warn_once(_SLOW)
         if self._ack_requests:
             self.acknowledge(drained=True)
 
@@ -323,7 +323,7 @@ class PendingQueue:
             if since >= now - MAX_SILENCE:
                 self.account.forgotten += 1
                 text = "those silent longest are forgotten, and their next gap is not counted"
-                self._warn_once("incomplete", f"more than {MAX_KEYS:,} keys: {text}")
+                self._warn_once(f"more than {MAX_KEYS:,} keys: {text}")
 
     def _admit(self, batch: Sequence[RawSample]) -> list[Arrival]:
         """Return the arrivals of a batch, with 0 losses each; rejected ones keep their number but lose the payload.
@@ -443,7 +443,7 @@ class PendingQueue:
         every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
             self._drop(every.popleft())
-            self._warn_once("dropped", _SLOW)
+            self._warn_once(_SLOW)
         return len(arrivals)
 
     def _supersede(self, arrival: Arrival) -> None:
@@ -461,7 +461,7 @@ class PendingQueue:
         stream.unreported += lost
         self.account.dropped += 1
 
-    def _warn_once(self, event: str, text: str) -> None:
-        if event not in self._warned:
-            self._warned.add(event)
-            _log.warning("%s: %s", self.name, text, extra=about(event))
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            _log.warning("%s: %s", self.name, text, extra=about("dropped" if text == _SLOW else "incomplete"))
