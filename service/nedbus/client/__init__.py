@@ -18,6 +18,7 @@ from .discovery import (
     Vehicles,
     find_accounts,
     find_services,
+    reply_parts,
 )
 from .health.stream_health import Health, Histogram, Monitor, StreamHealth
 from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
@@ -40,5 +41,5 @@ __all__ = [
     "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "Publishers", "QueryServer",
     "RejectionReport", "Rejections", "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState",
     "StreamStatus", "Subscription", "Vehicles", "check_max_rate", "connect", "connect_async", "connect_with",
-    "describe_stream", "find_accounts", "find_services", "health_of_last", "stream_state", "to_age",
+    "describe_stream", "find_accounts", "find_services", "health_of_last", "reply_parts", "stream_state", "to_age",
 ]  # fmt: skip

@@ -14,15 +14,15 @@ from typing import Annotated, Final
 
 import zenoh
 from pydantic import Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
-from pydantic_core import PydanticUseDefault
+from pydantic_core import PydanticUseDefault, to_json
 
 from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health.stream_health import Health
 from nedbus.client.receiving.layout_lookup import Schemas, Wanted
-from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json
+from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
-from nedbus.transport import AliveTokens, RawSample, Session, query, while_open
+from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, while_open
 from nedbus_msgs import (
     ANY,
     MESSAGES,
@@ -43,8 +43,6 @@ _log = logging.getLogger(__name__)
 _MAX_FIELDS: Final = 256  # per layout
 _MAX_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
-_MAX_REPLY_BYTES: Final = 2**18
-_MAX_ACCOUNT_BYTES: Final = 2**20  # enough for a thousand vehicles
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
@@ -242,6 +240,12 @@ class ServiceStatus(_FromPeer):
     refused: tuple[str, ...] = ()
     sources: tuple[SourceStatus, ...] = ()
 
+    def split(self, _: int) -> list[ServiceStatus]:
+        """Return a status of each source; of a single one without the health of its streams; none without streams."""
+        if len(self.sources) > 1:
+            return [replace(self, sources=(each,)) for each in self.sources]
+        return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
+
 
 _STATUS: Final = TypeAdapter(ServiceStatus)
 
@@ -263,19 +267,35 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
     """Query the status of all nedbus services; replies that are too large are ignored."""
-    replies = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
-    return [
-        replace(_STATUS.validate_python(content), service=key.split("/")[-2])
-        for key, content in _parse(replies)
-        if isinstance(content, dict)
-    ]
+    found: dict[str, ServiceStatus] = {}
+    for key, content in _parse(query(session, status_key(ANY, prefix=prefix), timeout=timeout, newest=False)):
+        if isinstance(content, dict):
+            part = replace(_STATUS.validate_python(content), service=key.split("/")[-2])
+            found[key] = replace(part, sources=(*found[key].sources, *part.sources)) if key in found else part
+    return list(found.values())
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
     """Query the accounts of all services for the last `within` seconds; invalid and too large replies are ignored."""
-    replies = query(session, f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}", timeout=timeout)
-    found = (from_json(content) for _, content in _parse(replies, limit=_MAX_ACCOUNT_BYTES))
-    return [report for report in found if report is not None]
+    selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
+    found: dict[str, list[AccountReport]] = {}
+    for key, content in _parse(query(session, selector, timeout=timeout, newest=False)):
+        if (part := from_json(content)) is not None:
+            found.setdefault(key, []).append(part)
+    return list(map(joined, found.values()))
+
+
+def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
+    """Yield the JSON texts of a report that readers accept and join; log a part that is too large, and leave it out."""
+    text = to_json(report, inf_nan_mode="constants")
+    if len(text) <= MAX_REPLY_BYTES:
+        yield text
+    elif parts := report.split(5 * len(text) // (4 * MAX_REPLY_BYTES) + 1):
+        for part in parts:
+            yield from reply_parts(part)
+    else:
+        reason = "left out %d bytes of a reply, as readers accept at most %d in one part: use fewer or shorter names"
+        _log.warning(reason, len(text), MAX_REPLY_BYTES, extra=about("incomplete"))
 
 
 def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
@@ -347,14 +367,14 @@ class Rejections:
         return RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()) if reason else None
 
 
-def _parse(replies: Iterable[RawSample], *, limit: int = _MAX_REPLY_BYTES) -> Iterator[tuple[str, object]]:
+def _parse(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     """Yield key and content of JSON replies within the memory limit; log all others in one line per reason."""
     room, too_large, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
         # Upper estimate of its memory when parsed, measured with CPython 3.11.
         size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
-        if len(text) > limit or size > room:
+        if len(text) > MAX_REPLY_BYTES or size > room:
             too_large += 1
             continue
         room -= size

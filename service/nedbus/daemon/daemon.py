@@ -7,14 +7,13 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from functools import partial
 from typing import Final, Literal
 
 from nedbus import clock
-from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
+from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus, reply_parts
 from nedbus.errors import ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
@@ -127,14 +126,12 @@ class Daemon:
             self.look(), self.id, socket.gethostname(), clock.steady(), within=within, to_utc=clock.to_utc()
         )
 
-    def _answer(self, parameter: Callable[[str], str | None]) -> dict[str, object]:
+    def _answer(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
         """Answer a query with the status, or with the events if it has the parameter for them."""
-        within = parameter(ACCOUNT_PARAMETER)
-        if within is None:
-            return asdict(self.status)
+        within, seconds = parameter(ACCOUNT_PARAMETER), 0.0
         with suppress(ValueError):
-            return asdict(self.report(within=float(within)))
-        return asdict(self.report())
+            seconds = float(within or 0.0)
+        return reply_parts(self.status if within is None else self.report(within=seconds))
 
     def stop(self) -> None:
         """Stop `run`; safe in any thread and in signal handlers."""

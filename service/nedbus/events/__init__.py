@@ -4,18 +4,19 @@ To add a kind of event: a row in KINDS (`event.py`), its flags or thresholds (`r
 the finding (`detectors.py` or `position.py`).
 """
 
-from .account import KEPT, Account
+from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
 from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State
 from .faults import VALID, Expectation, faults_of, merge_vehicles, unknown_text
-from .report import ACCOUNT_PARAMETER, FORGOTTEN, AccountReport, VehicleReport, by_vehicle, from_json, report_of
+from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import Times, since_text, to_age, to_clock
 from .vehicle import EKF_SELECTOR, Vehicle
 
 __all__ = [
-    "ACCOUNT_PARAMETER", "ALL", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MODES", "RECENT", "SEVERITIES",
-    "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation", "Severity", "Span", "State",
-    "Story", "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json", "merge_vehicles", "report_of",
-    "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age", "to_clock", "unknown_text",
+    "ACCOUNT_PARAMETER", "ALL", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MAX_VEHICLES", "MODES",
+    "RECENT", "SEVERITIES", "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation",
+    "Severity", "Span", "State", "Story", "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json",
+    "joined", "merge_vehicles", "report_of", "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age",
+    "to_clock", "unknown_text",
 ]  # fmt: skip

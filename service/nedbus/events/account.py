@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections import Counter, deque
-from collections.abc import Mapping
+from collections import Counter, defaultdict, deque
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from itertools import takewhile
 from typing import Final
 
+from nedbus.log_event import about
 from nedbus_msgs import Address
 
 from .detectors import Finding
-from .event import ALL, Condition, Event, Severity, State, state_of
-from .rules import MAX_SILENCE, PAUSE
+from .event import ALL, SEVERITIES, Condition, Event, Severity, State, state_of
+from .rules import MAX_SILENCE, PAUSE, RECENT
 from .vehicle import Vehicle
 
-KEPT: Final = 2000
-"""Maximum number of events in an account; older ones are discarded."""
+_log = logging.getLogger(__name__)
 
-_MAX_VEHICLES: Final = 1000
+FORGOTTEN: Final = 3600.0
+"""Seconds after which a vehicle that is gone, or has been silent, counts as switched off and is forgotten."""
+
+KEPT: Final = 2000
+"""Maximum number of events in an account; beyond, the vehicle with the most events loses its oldest."""
+
+MAX_VEHICLES: Final = 1000
+"""Maximum number of vehicles in an account; those gone longest make room."""
+
+MAX_GONE: Final = 100
+"""Vehicles gone for a minute that are remembered; beyond, those gone longest are forgotten earlier."""
+
+_SHARE: Final = 20  # events that a vehicle keeps while others have more
 _NONE: Final[frozenset[str]] = frozenset()
 
 
@@ -26,19 +41,29 @@ class Account:
 
     All times are of one clock that is never set, or of a file: a step would end or hide conditions.
 
-    `events`: the most recent events, in the order they were reported. `reported`: the total number of events.
-    `counts`: the number of events by vehicle and severity.
+    `reported`: the total number of events.
+    `counts`: the number of events by vehicle and severity, until the vehicle is forgotten.
+    `refused`: vehicles that are not followed, as there are too many, with the time of their last message.
+    `limit_reached`: how often a vehicle was refused.
     """
 
     def __init__(self, keep: int = KEPT) -> None:
-        self.events: deque[Event] = deque(maxlen=keep)
+        self._events: dict[int, Event] = {}
         self.vehicles: dict[str, Vehicle] = {}
         self.counts: Counter[tuple[str, Severity]] = Counter()
-        self.reported = 0
+        self.refused: dict[str, float] = {}
+        self.reported = self.limit_reached = 0
+        self._keep = keep
+        self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # of its events, by vehicle
         self._common = Vehicle(ALL, self._record)  # the link, and the reader itself
         self._dropped = 0
-        self._last_overload = self._settled = 0.0
+        self._last_overload = self._settled = self._full_until = 0.0
         self._lock = threading.RLock()
+
+    @property
+    def events(self) -> list[Event]:
+        """The events kept, in the order they were reported."""
+        return self.events_since(0)[0]
 
     @property
     def overload(self) -> Condition | None:
@@ -53,19 +78,19 @@ class Account:
         `missing`: names of fields that were not provided. `lost`: messages lost before this one.
         """
         with self._lock:
-            if vehicle := self._vehicle(address.vehicle):
+            if vehicle := self._vehicle(address.vehicle, time):
                 vehicle.add(address, message, time, missing=missing, lost=lost)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
         """Record that the logger of a vehicle recorded nothing for some seconds from `time` on."""
         with self._lock:
-            if known := self._vehicle(vehicle):
+            if known := self._vehicle(vehicle, time):
                 known.add_dropout(seconds, time)
 
     def reject(self, address: Address, reason: str, time: float) -> None:
         """Record a rejected message."""
         with self._lock:
-            if vehicle := self._vehicle(address.vehicle):
+            if vehicle := self._vehicle(address.vehicle, time):
                 vehicle.reject(address.stream, reason, time)
 
     def update(
@@ -76,12 +101,14 @@ class Account:
         link: str = "",
         dropped: int = 0,
         is_behind: bool = False,
+        present: Collection[str] | None = None,
     ) -> None:
         """Update the conditions of the link, of this reader, and of all vehicles.
 
         `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
         `link`: the fault of the link, "" if it is up. `dropped`: messages dropped by this reader since it started.
-        `is_behind`: it has a backlog.
+        `is_behind`: it has a backlog. `present`: vehicles that have a publisher; all others are forgotten once they
+        have been silent for an hour with a link, or earlier if more than a hundred are gone. None: none is forgotten.
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:
@@ -96,6 +123,8 @@ class Account:
             for vehicle in self.vehicles.values():
                 state = None if states is None or vehicle.main is None else states.get(vehicle.main)
                 vehicle.update(time, state, is_connected=not link)
+            if present is not None:
+                self._forget_gone(time, self.vehicles if link else present)
 
     def settle(self, time: float) -> None:
         """Report bursts of losses and rejections, and flapping, that have ended; call it at the end of a file."""
@@ -107,24 +136,73 @@ class Account:
         """Return the current state of a vehicle; `time` is now."""
         with self._lock:
             known = self.vehicles.get(vehicle)
+            if known is None and vehicle in self.refused:
+                return State("watch", f"no events: more than {MAX_VEHICLES} vehicles", None, ())
             return known.state(time) if known is not None else state_of(())
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
         """Return the events after the first `seen` ones that are still kept, and the total number of events."""
         with self._lock:
-            new = min(self.reported - seen, len(self.events))
-            return list(self.events)[len(self.events) - new :], self.reported
+            new = [self._events[number] for number in takewhile(lambda number: number >= seen, reversed(self._events))]
+            return new[::-1], self.reported
 
-    def _vehicle(self, name: str) -> Vehicle | None:
+    def label_first_events(self) -> None:
+        """Set the time since boot of events before the first message that gave it; for files."""
+        for number, event in self._events.items():
+            known = self.vehicles.get(event.vehicle)
+            if event.boot is None and known is not None and known.boot is not None:
+                self._events[number] = replace(event, boot=known.boot + event.time - known.time)
+
+    def _vehicle(self, name: str, time: float) -> Vehicle | None:
+        """Return the vehicle of a message, a new one if there is room."""
         known = self.vehicles.get(name)
-        if known is None and len(self.vehicles) < _MAX_VEHICLES:
+        if known is None and len(self.vehicles) >= MAX_VEHICLES and time >= self._full_until:
+            self._full_until = time + 1.0
+            oldest = min(self.vehicles.values(), key=lambda each: each.heard)
+            if time - oldest.heard > RECENT:
+                self._forget(oldest.name)
+        if known is None and len(self.vehicles) < MAX_VEHICLES:
+            self.refused.pop(name, None)
             known = self.vehicles[name] = Vehicle(name, self._record, self._common)
-        return known
+        if known is not None:
+            known.heard = time
+            return known
+        if not self.limit_reached:
+            text = "more than %d vehicles: further ones have no events; follow some of them with --vehicle"
+            _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
+        self.limit_reached += name not in self.refused
+        if name in self.refused or len(self.refused) < MAX_VEHICLES:
+            self.refused[name] = time
+        return None
+
+    def _forget_gone(self, time: float, present: Collection[str]) -> None:
+        for name in present:
+            if name in self.vehicles:
+                self.vehicles[name].heard = time
+        gone = sorted((each.heard, name) for name, each in self.vehicles.items() if time - each.heard > RECENT)
+        for index, (heard, name) in enumerate(gone):
+            if index < len(gone) - MAX_GONE or time - heard > FORGOTTEN:
+                self._forget(name)
+        self.refused = {name: heard for name, heard in self.refused.items() if time - heard <= RECENT}
+
+    def _forget(self, name: str) -> None:
+        del self.vehicles[name]
+        self._full_until = 0.0
+        for severity in SEVERITIES:
+            del self.counts[name, severity]
 
     def _record(self, event: Event) -> None:
-        self.events.append(event)
+        self._events[self.reported] = event
+        self._numbers[event.vehicle].append(self.reported)
         self.counts[event.vehicle, event.severity] += 1
         self.reported += 1
+        if len(self._events) > self._keep:
+            name = max(self._numbers, key=lambda each: len(self._numbers[each]))
+            if len(self._numbers[name]) <= _SHARE:
+                name = next(iter(self._events.values())).vehicle
+            del self._events[self._numbers[name].popleft()]
+            if not self._numbers[name]:
+                del self._numbers[name]
 
     def _update_link(self, time: float, link: str) -> None:
         is_down = ("link_down", "") in self._common.conditions

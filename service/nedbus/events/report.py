@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from nedbus_msgs import check_vehicle
 
-from .account import Account
+from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
 from .event import Condition, Event, Seconds
 
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
 
-FORGOTTEN: Final = 3600.0
-"""Seconds of silence after which a vehicle that is not expected counts as switched off, not as a fault."""
-
-_MIN_EVENTS: Final = 10  # per vehicle, while the report has room
-_MAX_EVENTS: Final = 300  # per report
 _MAX_TOPICS: Final = 30  # per vehicle
-_MAX_VEHICLES: Final = 1000  # per report
-_MAX_BYTES: Final = 2**17  # estimated, of the events of a report, and again of the conditions without an event
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +63,23 @@ class AccountReport:
     service: str
     host: str
     now: Seconds
-    vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=_MAX_VEHICLES)]
-    events: Annotated[tuple[Event, ...], Field(max_length=_MAX_EVENTS)] = ()
+    vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=MAX_VEHICLES)]
+    events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
+
+    def split(self, number: int) -> list[AccountReport]:
+        """Return the report in up to `number` parts; none if it has no more than one vehicle and one event."""
+        number = min(number, max(len(self.vehicles), len(self.events)))
+        vehicles, events = list(self.vehicles.items()), self.events
+
+        def share(length: int, index: int) -> slice:
+            return slice(length * index // number, length * (index + 1) // number)
+
+        return [
+            replace(
+                self, vehicles=dict(vehicles[share(len(vehicles), index)]), events=events[share(len(events), index)]
+            )
+            for index in range(number if number > 1 else 0)
+        ]
 
 
 _REPORT: Final = TypeAdapter(AccountReport)
@@ -81,24 +88,13 @@ _REPORT: Final = TypeAdapter(AccountReport)
 def report_of(
     account: Account, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
 ) -> AccountReport:
-    """Return a report of the last `within` seconds; if it is full, each vehicle keeps its most recent events.
+    """Return a report of all events kept of the last `within` seconds, and the state of each vehicle.
 
     `now`: by the account's clock [s]; `to_utc`: what its times need to become Unix time [s].
     """
-    recent = [event for event in account.events_since(0)[0] if event.time > now - within]
-    share = max(_MIN_EVENTS, _MAX_EVENTS // max(1, len({event.vehicle for event in recent})))
-    counts: Counter[str] = Counter()
-    events: deque[Event] = deque()
-    size = 0
-    for event in reversed(recent):
-        counts[event.vehicle] += 1
-        if counts[event.vehicle] <= share:
-            size += 200 * (1 + len(event.evidence)) + len(event.text)
-            if size > _MAX_BYTES or len(events) >= _MAX_EVENTS:
-                break
-            events.appendleft(event)
+    events = [event for event in account.events if event.time > now - within]
     reported = {event.identity for event in events}
-    vehicles, size = {}, 0
+    vehicles = {}
     for name, vehicle in list(account.vehicles.items()):
         state = account.state(name, now)
         held = list(vehicle.conditions.items())
@@ -108,13 +104,18 @@ def report_of(
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
         bad = (each for _, each in held if each.severity != "info")
         unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))
-        size += 500 * len(unreported)
         vehicles[name] = VehicleReport(
             state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
             tuple(sorted(vehicle.topics))[:_MAX_TOPICS], vehicle.main is not None,
-            tuple(each.later(to_utc) for each in unreported) if size < _MAX_BYTES else (), vehicle.unknown,
+            tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
         )  # fmt: skip
     return AccountReport(service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events))
+
+
+def joined(parts: Sequence[AccountReport]) -> AccountReport:
+    """Return the report that a service has sent in these parts."""
+    vehicles = {name: vehicle for part in parts for name, vehicle in part.vehicles.items()}
+    return replace(parts[0], vehicles=vehicles, events=tuple(event for part in parts for event in part.events))
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:

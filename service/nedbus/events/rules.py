@@ -148,6 +148,7 @@ JAMMING_END: Final = 60
 JUMP_DISTANCE: Final = 1.0  # m of unexplained motion; JUMP_SHARE of the distance flown is added
 JUMP_SHARE: Final = 0.2
 SMALL_RESET: Final = 0.5  # m or m/s; the severity of a smaller reset is info
+FLAPPING_CHANGES_OF_KIND: Final = 20  # of a kind, which combinations of flags may change without one of them flapping
 FLAPPING_CHANGES: Final = 4  # of a condition within WINDOW; further changes are suppressed, except for the last
 PAUSE: Final = 5.0  # s without a further one after which flapping, losses, rejections or an overload have ended
 MAX_BURST: Final = 20.0  # s after which losses are reported even if they continue

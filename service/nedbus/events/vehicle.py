@@ -13,7 +13,17 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 from .detectors import ChangeDetector, Finding, make_detector
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .position import PositionDetector
-from .rules import FLAPPING_CHANGES, KEPT_ON_REBOOT, MAX_BURST, MAX_SILENCE, PAUSE, RECENT, RULES, flags_of
+from .rules import (
+    FLAPPING_CHANGES,
+    FLAPPING_CHANGES_OF_KIND,
+    KEPT_ON_REBOOT,
+    MAX_BURST,
+    MAX_SILENCE,
+    PAUSE,
+    RECENT,
+    RULES,
+    flags_of,
+)
 from .times import to_age
 
 EKF_SELECTOR: Final = "estimator_selector_status"
@@ -43,7 +53,8 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions that held in the first messages.
     `topics`: the topics that it publishes.
     `main`: the address of the position estimate in use: vehicle_local_position if published, else another estimate.
-    `time`: time of the last message with a detector, by the account's clock [s]. `boot`: its time since boot [s].
+    `heard`: time of the last message, by the account's clock [s], or of the last update while it has a publisher.
+    `time`: time of the last message with a detector. `boot`: its time since boot [s].
     `recent`: the most recent events, searched for evidence.
     """
 
@@ -54,7 +65,7 @@ class Vehicle:
         self.topics: set[str] = set()
         self.main: Address | None = None
         self.armed: bool | None = None
-        self.time = 0.0
+        self.time = self.heard = 0.0
         self.boot: float | None = None
         self._on_event = on_event
         self._common = common
@@ -63,8 +74,9 @@ class Vehicle:
         self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use of each group
         self._main_time = math.inf  # time of the last position
         self._rebooted = -math.inf
-        self._changes: dict[tuple[str, tuple[str, ...]], deque[Event]] = {}  # recent changes of each condition
-        self._suppressed: Counter[tuple[str, tuple[str, ...]]] = Counter()  # changes of flapping conditions
+        # Recent changes of each condition, and of all conditions of a kind, which flags may change in combinations.
+        self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}
+        self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
         self._lost, self._rejected = _Burst(), _Burst()
         self._dropouts = _Burst()  # in ms
         self._primary = 0  # instance of the EKF in use
@@ -166,7 +178,9 @@ class Vehicle:
         for event in reversed(self.recent):
             if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
-            elif event.change == "begin" and (event.kind, event.names) in self._suppressed and event.kind not in kinds:
+            elif event.change == "begin" and event.kind not in kinds and (
+                (event.kind, event.names) in self._suppressed or (event.kind, None) in self._suppressed
+            ):  # fmt: skip
                 kinds.add(event.kind)
                 text = f"{event.text} (flapping)"
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
@@ -267,13 +281,17 @@ class Vehicle:
         """Return True if a condition changes too often to report each change; `settle` reports the last one."""
         if event.change == "once":
             return False
-        key = event.kind, event.names
-        events = self._changes.setdefault(key, deque(maxlen=FLAPPING_CHANGES))
-        is_fast = len(events) == FLAPPING_CHANGES and event.time - events[0].time < WINDOW
-        events.append(event)
-        if is_fast:
-            self._suppressed[key] += 1
-        return is_fast
+        limits: list[tuple[tuple[str, ...] | None, int]] = [(None, FLAPPING_CHANGES_OF_KIND)]
+        if (event.kind, None) not in self._suppressed:
+            limits.insert(0, (event.names, FLAPPING_CHANGES))
+        for names, limit in limits:
+            events = self._changes.setdefault((event.kind, names), deque(maxlen=limit))
+            is_fast = len(events) == limit and event.time - events[0].time < WINDOW
+            events.append(event)
+            if is_fast:
+                self._suppressed[event.kind, names] += 1
+                return True
+        return False
 
 
 @dataclass(slots=True)

@@ -117,10 +117,7 @@ def read_account(*paths: Path) -> FileAccount:
     flights, account, due = Flights(paths), Account(KEPT_OF_FILE), 0.0
     for message, _, _ in follow(flights.messages(), account, ended=flights.ended):
         due = message.due
-    for index, event in enumerate(account.events):  # before the first message that gave the time since boot
-        known = account.vehicles.get(event.vehicle)
-        if event.boot is None and known is not None and known.boot is not None:
-            account.events[index] = replace(event, boot=known.boot + event.time - known.time)
+    account.label_first_events()
     return FileAccount(account, flights.times, due, flights.warnings)
 
 

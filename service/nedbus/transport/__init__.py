@@ -22,6 +22,7 @@ from .router_log import Uplinks, log_refusals
 from .router_state import RouterState, ask_routers
 from .session import (
     LEASE,
+    MAX_REPLY_BYTES,
     RawSample,
     Session,
     SourceInfo,
@@ -44,8 +45,8 @@ from .zenoh_ext import (
 )
 
 __all__ = [
-    "BRIDGED_ENCODING", "DEFAULT_ENDPOINT", "LEASE", "LONGEST_TOKEN", "MAX_ANSWERS", "NO_HASH", "PX4_TYPES",
-    "AliveTokens", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
+    "BRIDGED_ENCODING", "DEFAULT_ENDPOINT", "LEASE", "LONGEST_TOKEN", "MAX_ANSWERS", "MAX_REPLY_BYTES", "NO_HASH",
+    "PX4_TYPES", "AliveTokens", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
     "RetransmitRequest", "RouterConfig", "RouterState", "Session", "SourceInfo", "Tls", "TopicKey", "Uplinks",
     "Verdict", "alive_keys", "ask", "ask_routers", "check_endpoints", "check_pem", "dial_endpoint", "entity_name",
     "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload", "is_forked", "log_refusals",

@@ -11,7 +11,24 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from nedbus.events import ALL, FORGOTTEN, AccountReport, Event, Expectation, faults_of, from_json, report_of, stories_of
+from nedbus.client import ServiceStatus, SourceStatus, StreamHealth, StreamStatus, reply_parts
+from nedbus.events import (
+    ALL,
+    FORGOTTEN,
+    KEPT,
+    MAX_VEHICLES,
+    AccountReport,
+    Event,
+    Expectation,
+    VehicleReport,
+    faults_of,
+    from_json,
+    joined,
+    report_of,
+    stories_of,
+)
+from nedbus.transport import MAX_REPLY_BYTES
+from tests.flights.messages import VLP
 
 from .flight import ARMED, Flight
 
@@ -65,30 +82,50 @@ def test_story_is_the_same_from_a_report() -> None:
         assert [(each.what, each.since, each.until) for each in told] == [("xy not valid", flight.now, None)]
 
 
-def test_report_is_bounded() -> None:
-    """A report has the most recent events, within the size that readers accept."""
+def test_report_has_all_events_of_the_period() -> None:
+    """A report has all events of the period that the account keeps, and none for a period that is no number."""
     flight = Flight()
-    flight.gps()
     for number in range(1500):
         flight.wait(0.1).status(ARMED, nav_state=number % 3)
     sent = report(flight)
-    assert len(sent.events) == 300
+    assert len(sent.events) == 1499
     assert sent.events[-1].time == flight.now
-    for number in range(3000):
-        flight.wait(0.1).send(x=float(number % 2) * 50, xy_reset_counter=number % 256, xy_valid=number % 7 != 0)
-    assert len(json.dumps(asdict(report(flight)))) < 2**18
     assert report(flight, within=math.nan).events == ()
 
 
-def test_report_of_many_vehicles_is_read() -> None:
-    """The report of a thousand bad vehicles, with all topics, is accepted by readers."""
+def test_report_of_any_size_is_read_in_parts() -> None:
+    """The parts of a report of a thousand vehicles with faults and events are accepted by readers, who join them."""
     flight = Flight()
-    topics = ["vehicle_gps_position", "vehicle_status", "battery_status", "estimator_status_flags", "failsafe_flags"]
-    for number in range(1000):
-        flight.send(vehicle=f"vehicle-{number}", xy_valid=False)
-        for topic in topics:
-            flight.account.vehicles[f"vehicle-{number}"].topics.add(topic)
-    assert len(json.dumps(asdict(report(flight)))) < 2**20
+    steps: list[dict[str, Any]] = [{}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False, "v_xy_valid": False}]
+    for faults in steps:
+        for number in range(MAX_VEHICLES):
+            flight.send(vehicle=f"vehicle-{number}", **faults)
+    sent = report(flight)
+    parts = list(reply_parts(sent))
+    assert sum(map(len, parts)) > 2 * MAX_REPLY_BYTES
+    assert max(map(len, parts)) <= MAX_REPLY_BYTES
+    read = [from_json(json.loads(part)) for part in parts]
+    assert asdict(joined([each for each in read if each])) == asdict(sent)
+
+
+def test_parts_of_a_status_have_all_sources() -> None:
+    """The status of many sources is split between them; one source that is too large loses the health of streams."""
+    address = f"{'v' * 60}/{VLP}"
+    stream = StreamStatus(address, StreamHealth(VLP).snapshot(0))
+    sources = tuple(SourceStatus(f"ulog:{number}", addresses=(address,) * 100) for number in range(100))
+    parts = [json.loads(part) for part in reply_parts(ServiceStatus("s", sources=sources))]
+    assert len(parts) > 1
+    assert [each["source"] for part in parts for each in part["sources"]] == [each.source for each in sources]
+    [part] = reply_parts(ServiceStatus("s", sources=(replace(sources[0], streams=(stream,) * 1000),)))
+    assert [len(each["streams"]) for each in json.loads(part)["sources"]] == [0]
+
+
+def test_part_that_is_too_large_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    """A vehicle whose report alone is larger than readers accept is left out, with a line in the log."""
+    vehicles = {name: VehicleReport("bad", "x" * size) for name, size in (("1", MAX_REPLY_BYTES), ("2", 9))}
+    [part] = reply_parts(AccountReport("s", "h", 1.0, vehicles))
+    assert json.loads(part)["vehicles"].keys() == {"2"}
+    assert [each.about.event for each in caplog.records if hasattr(each, "about")] == ["incomplete"]
 
 
 @pytest.mark.parametrize(
@@ -120,10 +157,10 @@ def test_huge_answer_is_bounded() -> None:
     """A peer cannot make a reader keep more events and vehicles than a service sends."""
     event = asdict(Event("1", "jump", "once", "info", "", 0.0))
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
-    assert from_json(content | {"events": [event] * 301}) is None
+    assert from_json(content | {"events": [event] * (KEPT + 1)}) is None
     vehicle = {"severity": "info", "text": "ok"}
     assert from_json(content | {"vehicles": {str(number): vehicle for number in range(1001)}}) is None
-    read = from_json(content | {"events": [event] * 300, "vehicles": {str(number): vehicle for number in range(1000)}})
+    read = from_json(content | {"events": [event] * KEPT, "vehicles": {str(number): vehicle for number in range(1000)}})
     assert read is not None
 
 

@@ -11,7 +11,9 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import example, given
 
-from nedbus.events import ALL, KEPT, KINDS, RECENT, WINDOW, Event
+from nedbus.events import ALL, FORGOTTEN, KEPT, KINDS, MAX_VEHICLES, RECENT, WINDOW, Account, Event
+from nedbus.events.account import MAX_GONE
+from nedbus.events.rules import FLAPPING_CHANGES_OF_KIND, PAUSE, RULES
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, message
 
@@ -447,6 +449,22 @@ def test_flapping_is_reported_when_it_ends(flight: Flight) -> None:
     assert told[-1].change == "begin"
 
 
+def test_flapping_in_combinations_is_suppressed(flight: Flight) -> None:
+    """Flags of one kind that change in ever new combinations are reported twenty times, then when they rest."""
+    names = [name for rule in RULES["FailsafeFlags"] if rule.kind == "failsafe_flag" for name in rule.flags][:8]
+    flags: dict[str, Any] = dict.fromkeys(names, False)
+    told = flight.send("failsafe_flags", **flags)
+    for number in range(1, 256):
+        gray = number ^ number >> 3
+        flags |= {name: bool(gray >> bit & 1) for bit, name in enumerate(names)}
+        told += flight.wait(0.1).send("failsafe_flags", **flags)
+        told += flight.look()
+    assert FLAPPING_CHANGES_OF_KIND <= len(told) < 2 * FLAPPING_CHANGES_OF_KIND
+    told += flight.wait(PAUSE + 0.1).look()
+    assert "suppressed changes" in told[-1].text
+    assert len(told) < 2 * FLAPPING_CHANGES_OF_KIND
+
+
 def test_flapping_of_one_is_not_of_another(flight: Flight) -> None:
     """Each kind of condition is counted separately."""
     for index in range(20):
@@ -535,6 +553,60 @@ def test_memory_is_bounded() -> None:
     new, told = flight.account.events_since(0)
     assert (len(new), told) == (KEPT, KEPT + 99)
     assert flight.account.events_since(told - 1) == ([new[-1]], told)
+
+
+def look(account: Account, now: float, *present: str, link: str = "") -> set[str]:
+    """Update an account of which these vehicles have a publisher; return the vehicles that it follows."""
+    account.update(now, {}, link=link, present=present)
+    return set(account.vehicles)
+
+
+def test_vehicle_beyond_the_limit_is_told_and_gets_the_place_of_one_that_left(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A vehicle too many has no events and says so, once in the log; of those gone, the longest gone makes room."""
+    flight = Flight()
+    for number in range(MAX_VEHICLES):
+        flight.send(vehicle=f"v{number}")
+    for _ in range(3):
+        flight.send(vehicle="more")
+    account = flight.account
+    assert account.state("more", flight.now).text == "no events: more than 1000 vehicles"
+    assert (account.limit_reached, len(account.vehicles), len(caplog.records)) == (1, MAX_VEHICLES, 1)
+    flight.wait(RECENT + 1).send(vehicle="v0")
+    flight.send(vehicle="more")
+    assert {"v0", "more"} <= account.vehicles.keys()
+    assert "v1" not in account.vehicles
+    assert account.state("more", flight.now).text == "ok"
+    assert look(account, flight.now + RECENT + 2, "more") >= {"more"}
+    assert not account.refused
+
+
+def test_vehicle_that_is_gone_is_forgotten() -> None:
+    """After an hour without a publisher and with a link, a vehicle and its counts are forgotten; its events stay."""
+    flight = Flight()
+    for vehicle in ("here", "gone"):
+        flight.send(vehicle=vehicle)
+        flight.send(vehicle=vehicle, xy_valid=False)
+    account, start = flight.account, flight.now
+    assert look(account, start + FORGOTTEN, "here") == {"here", "gone"}
+    assert look(account, start + FORGOTTEN + 1, link="no link") == {"here", "gone"}
+    assert look(account, start + 2 * FORGOTTEN, "here") == {"here", "gone"}
+    assert look(account, start + 2 * FORGOTTEN + 2, "here") == {"here"}
+    assert {name for name, _ in account.counts} == {ALL, "here"}
+    assert [each.vehicle for each in account.events if each.kind == "xy_invalid"] == ["here", "gone"]
+    account.update(start + 9 * FORGOTTEN, {})  # of a file
+    assert set(account.vehicles) == {"here"}
+
+
+def test_of_many_that_left_the_last_hundred_are_known() -> None:
+    """Vehicles that come and go leave the last hundred behind, and those of the last minute."""
+    flight = Flight()
+    for number in range(3000):
+        flight.wait(2.0).send(vehicle=f"v{number}")
+        known = look(flight.account, flight.now, f"v{number}")
+    assert known == {f"v{number}" for number in range(3000 - MAX_GONE - 31, 3000)}
+    assert len(flight.account.counts) <= 3 * len(known)
 
 
 def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:

@@ -89,7 +89,9 @@ def reporting(session: Session, name: str = "imitation", *, offset: float = 0.0,
     """Answer as a service with this status does, whose clock is ahead by this many seconds."""
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
-    server.answer_json(status_key(name), lambda _: {"now": time.time() + offset, **known, **status})
+    server.answer_json(
+        status_key(name), lambda _: [json.dumps({"now": time.time() + offset, **known, **status}).encode()]
+    )
     with closing(server):
         yield
 
@@ -237,7 +239,7 @@ def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -
     """Answer as a service does that remembers these vehicles."""
     server = QueryServer(session)
     report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
-    server.answer_json(status_key(name), lambda get: report if get("events") else {})
+    server.answer_json(status_key(name), lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server):
         yield
 
@@ -287,7 +289,7 @@ def test_account_that_makes_no_sense(raw: Session, endpoint: str, told: Mapping[
     """Nothing of it is said, and no check is lost; the peer answers in place of a service."""
     server = QueryServer(raw)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **told}
-    server.answer_json(status_key("x"), lambda get: report if get("events") else {})
+    server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
     with closing(server), reporting(raw, sources=[source(state="failed", error="the disk is gone")]):
         findings = look(endpoint)
     found(findings, "source", "wrong", "the disk is gone")

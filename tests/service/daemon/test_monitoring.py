@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus import SourceStatus, StreamHealth, StreamStatus
+from nedbus import SourceStatus, StreamHealth, StreamStatus, clock
 from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
@@ -438,6 +438,28 @@ def test_stream_that_has_ended_has_no_age(
     expected = {name: {"on", "off"} for name in counts} | {f"stream_{name}": active for name in of_now}
     for name, vehicles in expected.items():
         assert {each.labels["vehicle"] for each in found[f"nedbus_{name}"].samples} == vehicles, name
+
+
+def test_account_of_a_thousand_vehicles_with_faults_arrives(endpoint: str) -> None:
+    """A reader gets every vehicle, its faults and their events, and the sources of a status of many megabytes."""
+    daemon = Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0")
+    running = threading.Thread(target=daemon.run)
+    running.start()
+    names = {f"vehicle-{number}" for number in range(999)}
+    try:
+        with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
+            wait_for(bus.services, what="the service")
+            for seconds, flags in enumerate(({}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False})):
+                for name in names:
+                    sent = message((seconds + 1) * 10**6, **VALID | flags)
+                    daemon.account.add(Address(name, VLP), sent, clock.steady())
+            [account] = bus.accounts(within=60.0)
+    finally:
+        daemon.stop()
+        running.join()
+    assert account.vehicles.keys() >= names
+    assert all({"xy_invalid", "z_invalid"} <= set(account.vehicles[name].kinds) for name in names)
+    assert len(account.events) >= 1998
 
 
 def test_a_scrape_looks_at_each_stream_once(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
@@ -45,9 +44,14 @@ class QueryServer:
         if key_expr not in self._queryables:
             self._queryables[key_expr] = _Queryable(self._session, key_expr, reply)
 
-    def answer_json(self, key: str, content: Callable[[Callable[[str], str | None]], Mapping[str, object]]) -> None:
-        """Reply to queries on a key with JSON; `content` is called with a getter of the query's parameters."""
-        self.answer(key, lambda query: query.reply(key, json.dumps(content(query.parameters.get)), encoding=JSON))
+    def answer_json(self, key: str, parts: Callable[[Callable[[str], str | None]], Iterable[bytes]]) -> None:
+        """Reply to queries on a key with one or several JSON texts; `parts` gets a getter of the query's parameters."""
+
+        def reply(query: zenoh.Query) -> None:
+            for part in parts(query.parameters.get):
+                query.reply(key, part, encoding=JSON)
+
+        self.answer(key, reply)
 
     def end(self, key_expr: str) -> None:
         """Reply no more to queries on a key expression. Idempotent."""
