@@ -86,3 +86,30 @@ def test_home_of_before_a_reboot_is_never_back() -> None:
     sky.hear(0, ATTITUDE, timestamp=12_100_000)
     assert set(sky.output.addresses) == {POSITION, ATTITUDE}
     assert [address for address, _ in sky.published].count(HOME) == 1
+
+
+def test_addresses_that_come_one_after_the_other_are_published() -> None:
+    """Of more addresses than a source may have, the one that is stale longest makes room for the next."""
+    sky = Sky()
+    for number in range(1500):
+        sky.hear(1, Address(f"v{number}", VLP))
+    assert Address("v1499", VLP) in sky.output.addresses
+    assert 990 <= len(sky.output.addresses + sky.output.stale) <= 1000
+    assert sky.output.refused == 0
+
+
+def test_address_beyond_the_limit_is_refused_until_another_is_stale() -> None:
+    """Of a thousand addresses that are published none makes room; what is left out is counted, and said once."""
+    sky = Sky()
+    present = [Address(f"v{number}", VLP) for number in range(1000)]
+    sky.hear(1, *present, OTHER)
+    sky.hear(1, *present, OTHER)
+    assert OTHER not in sky.output.addresses
+    assert (sky.output.refused, sky.output.warnings) == (
+        2,
+        (f"vehicles: more than 1000 addresses: {OTHER} is ignored",),
+    )
+    sky.hear(4, *present[1:])
+    sky.hear(1, OTHER)
+    assert OTHER in sky.output.addresses
+    assert present[0] not in sky.output.stale

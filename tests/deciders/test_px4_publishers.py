@@ -173,3 +173,18 @@ def test_keys_are_bounded(monkeypatch: pytest.MonkeyPatch, streams: StreamRegist
         streams.hear(str(key(domain=3)), 0.0)
     streams.report(0.0)
     streams.hear(str(key(domain=3)), 0.0)
+
+
+def test_keys_that_come_and_go_are_forgotten(streams: StreamRegistry) -> None:
+    """A key without a publisher is forgotten after a minute of silence, so that vehicles that left fill no table."""
+    token = px4("a")
+    streams.add_publisher(token, 0.0)
+    for number in range(3000):
+        now = float(number)
+        came = streams.hear(str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now)
+        streams.form_of(came)
+        send(streams, came, 1, now)
+        streams.report(now)
+    sizes = len(streams._streams), len(streams._owners), len(streams._reboots)
+    assert sizes == (61, 60, 0)
+    assert str(token.key) in streams._streams

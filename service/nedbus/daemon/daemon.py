@@ -113,11 +113,12 @@ class Daemon:
             measured |= source.states
         mains = [vehicle.main for vehicle in list(self.account.vehicles.values()) if vehicle.main is not None]
         shared = set() if self._registry is None else self._registry.shared_vehicles()
+        present = set() if self._registry is None else {each.address.vehicle for each in self._registry.publishers}
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         states |= {main: "duplicate" for main in states if main.vehicle in shared}
         is_cut = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_cut else ""
-        self.account.update(clock.steady(), states, link=link)
+        self.account.update(clock.steady(), states, link=link, present=present)
         return self.account
 
     def report(self, *, within: float = 0.0) -> AccountReport:

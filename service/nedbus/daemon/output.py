@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 from nedbus import clock
 from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
-from nedbus.events import Account
+from nedbus.events import FORGOTTEN, Account
 from nedbus.log_event import about
 from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
@@ -49,7 +49,7 @@ class SourceOutput:
     def __init__(
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
     ) -> None:
-        self.published = self.rejected = self.lost = self.reboots = 0
+        self.published = self.rejected = self.lost = self.reboots = self.refused = 0
         self.rejections: Counter[str] = Counter()
         """Number of rejected messages by violated rule."""
         self.absence = Absence()
@@ -67,7 +67,8 @@ class SourceOutput:
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # addresses logged as silent
-        self._invalid = self._live = 0
+        self._invalid = 0
+        self._is_full = False  # of addresses that are published
 
     @property
     def addresses(self) -> list[Address]:
@@ -164,7 +165,8 @@ class SourceOutput:
         publisher = stream.publisher if stream is not None else None
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
             back = stream is not None and stream.heard is not None
-            if not back and self._live >= _MAX_ADDRESSES:
+            if not back and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
+                self.refused += 1
                 self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"))
                 return
             try:
@@ -172,7 +174,6 @@ class SourceOutput:
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
-            self._live += not back
             event = "back" if back else "published"
             _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
             self._bring_back(message)
@@ -200,7 +201,24 @@ class SourceOutput:
                 text = f"{address} is stale: no message for {_STALE:.0f} s"
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
+        for address, stream in list(self._streams.items()):
+            is_known = address.vehicle in self._account.vehicles and stream.heard is not None
+            if stream.publisher is None and not (is_known and now - (stream.heard or 0.0) < FORGOTTEN):
+                del self._streams[address]
+        self._is_full = False
         return bool(fresh)
+
+    def _make_room(self) -> bool:
+        """Forget the address that has been stale longest; return False if all are published."""
+        stale = (
+            []
+            if self._is_full
+            else [(each.heard or 0.0, address) for address, each in self._streams.items() if each.publisher is None]
+        )
+        if stale:
+            del self._streams[min(stale)[1]]
+        self._is_full = not stale
+        return bool(stale)
 
     def reject(self, rejection: Rejection) -> None:
         """Count invalid input, log it once per origin, and publish a report if it has an address."""

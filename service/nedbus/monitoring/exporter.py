@@ -8,7 +8,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
@@ -28,7 +28,6 @@ from .metrics import (
     MAX_STREAMS,
     MeasuredStream,
     build_info,
-    is_switched_off,
     make_metrics,
     metrics_page,
     stream_metrics,
@@ -73,7 +72,6 @@ class Exporter:
             "/vehicles": self._vehicles,
             "/status": self._status,
         }
-        self._alive: Collection[Address] = ()
         self._routers: list[RouterState] = []
         self.log_streams: Mapping[str, LogStreamStatus] = {}
         """The ULog streams of vehicles with MAVLink, by vehicle."""
@@ -89,7 +87,9 @@ class Exporter:
             try:
                 while not stop.wait(_POLL_INTERVAL):
                     snapshot = self._observer.poll()
-                    self._alive = snapshot.alive
+                    for address in [*self._sources]:
+                        if address not in snapshot.healths:
+                            del self._sources[address]
                     self._on_poll(snapshot)
             finally:
                 stop.set()
@@ -108,6 +108,7 @@ class Exporter:
             "nedbus_messages_invalid": [((), counts.invalid)],
             "nedbus_keys_forgotten": [((), counts.forgotten)],
             "nedbus_queue_messages": [((), self._subscription.waiting)],
+            "nedbus_limit_reached": [((limit,), count) for limit, count in self._observer.limits_reached.items()],
             "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
             "nedbus_router_sessions_max": [
                 ((state.zid,), state.max_sessions) for state in self._routers if state.max_sessions is not None
@@ -120,7 +121,7 @@ class Exporter:
         return [
             MeasuredStream(
                 (address.vehicle, address.stream, self._sources.get(address, "")), health,
-                address in self._alive or not is_switched_off(health), latencies,
+                latencies=latencies,
             )
             for address, (health, latencies) in self._observer.measure().items()
         ]  # fmt: skip

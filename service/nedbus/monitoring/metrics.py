@@ -28,9 +28,6 @@ from .http_server import Page
 MAX_STREAMS: Final = 1000
 """Streams exported individually, positions first; the rest are summed under vehicle and topic "other"."""
 
-SWITCHED_OFF: Final = 3600.0
-"""Seconds without a message after which a stream without a publisher counts as inactive."""
-
 _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
@@ -47,6 +44,10 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
         _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, 0 if they pass",
     ),
     "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
+    "nedbus_limit_reached": (
+        _COUNTER, ("limit",),
+        "What a limit left out: vehicles without events, messages of further addresses, forgotten health of streams",
+    ),
     # Exporters
     "nedbus_connected": (_GAUGE, (), "1 while connected to a router"),
     "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
@@ -116,7 +117,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
 class MeasuredStream:
     """Measurements of one stream, labelled with vehicle, topic and source.
 
-    `active` is False once the source has ended or the vehicle is off; then only counts are exported, no age or rate.
+    `active` is False once the source has ended; then only counts are exported, no age or rate.
     """
 
     labels: tuple[str, str, str]
@@ -150,11 +151,6 @@ def make_metrics(series: Mapping[str, Iterable[tuple[Any, ...]]]) -> Iterator[co
         for row in rows:
             metric.add_metric(*row)
         yield metric
-
-
-def is_switched_off(health: Health) -> bool:
-    """Return whether a stream without a publisher has been silent long enough to count as switched off."""
-    return health.age is not None and health.age >= SWITCHED_OFF
 
 
 def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Iterator[core.Metric]:
@@ -200,7 +196,7 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
 
 def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
     """Yield the vehicle metrics; a vehicle without an active stream has event counts but no state."""
-    now, vehicles = clock.steady(), list(account.vehicles)
+    now, vehicles = clock.steady(), [*account.vehicles, *account.refused]
     active = {stream.labels[0] for stream in streams if stream.active}
     states = {name: account.state(name, now) for name in vehicles if name in active}
     kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
@@ -228,9 +224,12 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     })  # fmt: skip
     streams = [stream for label, measures in sources.items() for stream in _streams(label, measures)]
     yield from stream_metrics(streams, messages="nedbus_messages_published")
-    yield from vehicle_metrics(daemon.look(list(sources.values())), streams)
+    account = daemon.look(list(sources.values()))
+    yield from vehicle_metrics(account, streams)
     of = {label: measures.status for label, measures in sources.items()}
+    limits = {"vehicles": account.limit_reached, "addresses": sum(each.refused for each in sources.values())}
     yield from make_metrics({
+        "nedbus_limit_reached": [((limit,), count) for limit, count in limits.items()],
         "nedbus_source_rejected": [((label,), status.rejected) for label, status in of.items()],
         "nedbus_messages_rejected": [
             ((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()
@@ -281,8 +280,7 @@ def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:
 def _streams(source: str, measures: SourceMeasures) -> Iterator[MeasuredStream]:
     for stream in measures.streams:
         vehicle, _, topic = stream.address.partition("/")
-        is_off = stream.address in measures.status.stale and is_switched_off(stream.health)
-        yield MeasuredStream((vehicle, topic, source), stream.health, active=not (measures.status.ended or is_off))
+        yield MeasuredStream((vehicle, topic, source), stream.health, active=not measures.status.ended)
 
 
 def _histogram_row(labels: Sequence[str], measured: Histogram) -> tuple[Any, ...]:

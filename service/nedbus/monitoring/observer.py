@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from nedbus import clock
 from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
-from nedbus.events import Account
+from nedbus.events import FORGOTTEN, RECENT, Account
 from nedbus_msgs import Address, Selection
 
 _MAX_WAITING: Final = 200  # queued messages that do not yet count as falling behind, at any rate
@@ -25,6 +25,7 @@ class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
     `time`: by the steady clock [s], as the times of `rejected`; `alive`: the number of publishers of each address.
+    `healths`: without streams that are forgotten, as their vehicles are, or were silent for an hour.
     `link`, `behind`: the fault of the link and of this reader, "" if there is none.
     """
 
@@ -68,6 +69,11 @@ class Observer:
             healths = self._monitor.snapshot()
             return {address: (health, self._monitor.latencies(address)) for address, health in healths.items()}
 
+    @property
+    def limits_reached(self) -> dict[str, int]:
+        """Number of vehicles and streams left out or forgotten, as there are too many."""
+        return {"vehicles": self.account.limit_reached, "streams": self._monitor.evicted}
+
     def poll(self) -> Snapshot:
         """Poll streams, rejections and the link, and record changes in the account."""
         now, connected = clock.steady(), self._bus.connected
@@ -90,7 +96,16 @@ class Observer:
         paused, self._looked = self._looked is not None and now - self._looked > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
-        self.account.update(now, states, link=link, dropped=dropped, is_behind=is_behind)
+        self.account.update(
+            now, states, link=link, dropped=dropped, is_behind=is_behind, present={each.vehicle for each in alive}
+        )
+        if settled:
+            silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
+            for age, address in silent:
+                if age > FORGOTTEN or (age > RECENT and address.vehicle not in self.account.vehicles):
+                    del healths[address]
+                    with self._lock:
+                        self._monitor.forget(address)
         behind = ""
         if self.account.overload is not None:
             behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"

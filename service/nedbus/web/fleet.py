@@ -7,6 +7,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -20,7 +21,7 @@ from nedbus.client import (
     health_of_last,
     stream_state,
 )
-from nedbus.events import FIXES, MODES, State
+from nedbus.events import FIXES, FORGOTTEN, MODES, State
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .stream import LONG, Origin, PageStream, is_position
@@ -151,11 +152,14 @@ class Fleet:
         self._numbers: dict[str, int] = {}
         self._truths: dict[str, PageStream] = {}
         self._left_out: set[Address] = set()
+        self._gone: list[Address] = []  # removed by the thread that adds samples
         self._rejected: Counter[Address] = Counter()
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
 
     def add(self, sample: Sample[Any], time: float) -> None:
         """Add a sample received at `time`, in seconds since the Unix epoch or since the start of a recording."""
+        while self._gone:
+            self._remove(self._gone.pop())
         address = sample.address
         stream = self.streams.get(address)
         if stream is None:
@@ -191,6 +195,8 @@ class Fleet:
         `states`, `logs`: states and ULog streams by vehicle; `alive`: the number of publishers of each address, None
         if unknown.
         """
+        if alive is not None and not link:
+            self._find_gone(time, alive, states)
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
@@ -212,7 +218,10 @@ class Fleet:
         state = state or State("info", "ok", None, ())
         if state.severity == "info" and main.state.name == "slow" and not own:  # otherwise the page itself is slow
             state = replace(state, severity="watch", text=str(main.state))
-        number = self._numbers.setdefault(vehicle, len(self._numbers)) if len(self._numbers) < MAX_STREAMS else 0
+        if vehicle not in self._numbers:
+            used = set(self._numbers.values())
+            self._numbers[vehicle] = next(number for number in count() if number not in used)
+        number = self._numbers[vehicle]
         return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number, log)
 
     def _facts(self, vehicle: str) -> dict[str, str]:
@@ -232,14 +241,30 @@ class Fleet:
         stream = self.streams.get(Address(vehicle, topic, instance))
         return stream.last.message if stream is not None and stream.last is not None else None
 
+    def _find_gone(self, time: float, alive: Counter[Address], states: Mapping[str, State]) -> None:
+        """Find streams without a publisher whose vehicle has no state any more, or that were silent for an hour."""
+        self._gone = [
+            address for address, stream in [*self.streams.items()]
+            if not alive[address]
+            and time - stream.time > (_SILENT if address.vehicle not in states else FORGOTTEN)
+        ]  # fmt: skip
+        self._left_out.intersection_update(alive)
+        vehicles = {address.vehicle for address in [*self.streams]}
+        self._numbers = {name: number for name, number in self._numbers.items() if name in vehicles}
+        for address in [each for each in self._rejected if each.vehicle not in vehicles]:
+            del self._rejected[address]
+
+    def _remove(self, address: Address) -> None:
+        self.streams.pop(address, None)
+        if address.topic == TRUTH:
+            self._truths.pop(address.vehicle, None)
+
     def _make_room(self, time: float) -> bool:
         """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False
-        del self.streams[address]
-        if address.topic == TRUTH:
-            del self._truths[address.vehicle]
+        self._remove(address)
         return True
 
 

@@ -214,6 +214,7 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         observer.poll()
         new, seen = observer.account.events_since(seen)
         show(event.later(clock.to_utc()) for event in new)
+        known.intersection_update(observer.account.vehicles)
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)

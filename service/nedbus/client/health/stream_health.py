@@ -6,6 +6,7 @@ Rates and ages use a monotonic clock, as the wall clock may be set at any time.
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from bisect import bisect_left
@@ -16,7 +17,10 @@ from operator import itemgetter
 from typing import Final, cast
 
 from nedbus.client.sample import Sample
+from nedbus.log_event import about
 from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
+
+_log = logging.getLogger(__name__)
 
 _REBOOT_STEP: Final = 1_000_000  # us by which PX4's time steps back in a reboot; less is a message out of order
 _GAP_FACTOR: Final = 3.0  # multiple of the usual step of PX4's time
@@ -248,9 +252,11 @@ class Monitor:
     """Measure all streams of a subscription, at most 4096; beyond, the least recently updated one is evicted.
 
     The first sample of each address does not count: it may be a last value sent on subscribing.
+    `evicted`: the number of evicted streams.
     """
 
     def __init__(self) -> None:
+        self.evicted = 0
         self._streams: dict[Address, StreamHealth | None] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
@@ -264,6 +270,10 @@ class Monitor:
             lacking = sample.provenance.missing
             stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=lacking)
         elif len(self._streams) >= _MAX_STREAMS:
+            if not self.evicted:
+                text = "more than %d streams: the health of those that are silent longest is forgotten"
+                _log.warning(text, _MAX_STREAMS, extra=about("incomplete"))
+            self.evicted += 1
             del self._streams[next(iter(self._streams))]
         self._streams[address] = stream
         return known

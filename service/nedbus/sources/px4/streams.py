@@ -31,6 +31,7 @@ _MAX_STREAMS: Final = 10_000  # keys; a vehicle has a few dozen
 _MAX_PUBLISHERS: Final = 64  # per key
 _MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a gap
 _TIMEOUT: Final = 3.0  # s without messages after which another publisher may take the address
+_FORGOTTEN: Final = 60.0  # s without messages after which a key without a publisher is forgotten
 _SETTLE_TIME: Final = 1.0  # s in which messages may still arrive from a publisher whose token is gone
 _SILENCE: Final = 5.0  # s without messages, or periods of the nominal rate if that is longer
 _MAX_NAMES: Final = 100  # per report
@@ -190,8 +191,15 @@ class StreamRegistry:
     def report(self, now: float) -> Absence:
         """Return messages that are not carried, and topics that are silent while others of the same node arrive."""
         self._streams = {
-            key: each for key, each in self._streams.items() if each.tokens or each.form or now < each.alike_until
+            key: each
+            for key, each in self._streams.items()
+            if each.tokens or (each.form and now - each.heard < _FORGOTTEN) or now < each.alike_until
         }
+        known = {each.address.vehicle for each in self._streams.values()}
+        self._owners = {
+            address: each for address, each in self._owners.items() if self._streams.get(str(each.key)) is each
+        }
+        self._reboots = {vehicle: count for vehicle, count in self._reboots.items() if vehicle in known}
         nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
         # If no topic of a node arrives, its link is down.
         sending = {node for stream, own in nodes if now - stream.heard < _TIMEOUT for node in own}

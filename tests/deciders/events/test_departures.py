@@ -1,0 +1,119 @@
+"""State of vehicles that come and go for an hour, eight at a time, in a service, a reader and a page; fake clocks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any, Final, cast
+
+import pytest
+
+from nedbus import Bus, Counts, Sample, Selection
+from nedbus.client import PublisherRegistry
+from nedbus.daemon import Daemon
+from nedbus.daemon.output import SourceOutput
+from nedbus.events import FORGOTTEN
+from nedbus.events.account import MAX_GONE
+from nedbus.monitoring import Observer
+from nedbus.settings import load_settings
+from nedbus.sources import SourceMessage
+from nedbus.web.fleet import Fleet
+from nedbus_msgs import BY_TOPIC, Address
+from tests.flights.messages import VALID, VLP, message
+
+AT_A_TIME: Final = 8
+
+
+class World:
+    """A service with a live source, a reader and its page; all messages arrive at all of them."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.now, self.open, self.alive = 0.0, set[Address](), Counter[Address]()
+        patch.setattr("nedbus.clock.steady", lambda: self.now)
+        patch.setattr("time.monotonic_ns", lambda: round(self.now * 1e9))
+        self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
+        registry = SimpleNamespace(publisher=self._publisher, shared_vehicles=set, publishers=())
+        self.daemon._registry = cast("PublisherRegistry", registry)
+        self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.account)
+        bus = SimpleNamespace(
+            connected=True,
+            subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
+            rejections=lambda: SimpleNamespace(take=list),
+            publishers=lambda **_: self.alive,
+        )
+        self.reader, self.fleet = Observer(cast("Bus", bus), Selection("*")), Fleet()
+
+    def _publisher(self, address: Address, *_: object, **__: object) -> SimpleNamespace:
+        self.open.add(address)
+        known: Any = {"publish": lambda _: None, "relabel": lambda _: None, "close": lambda: self.open.discard(address)}
+        return SimpleNamespace(definition=BY_TOPIC[address.topic], **known)
+
+    def hear(self, address: Address) -> None:
+        sent = message(round(self.now * 1e6) + 1, **VALID)
+        self.output.publish_live(SourceMessage(0.0, address, sent.__dict__))
+        sample = Sample(sent, address, 0, _sent=round(self.now * 1e9))
+        self.reader.add(sample)
+        self.fleet.add(sample, self.now)
+
+    def look(self, *alive: Address) -> None:
+        self.alive = Counter(alive)
+        self.daemon.look()
+        self.output.expire_stale()
+        snapshot, account = self.reader.poll(), self.reader.account
+        states = {name: account.state(name, self.now) for name in account.vehicles}
+        self.fleet.update(self.now, snapshot.healths, states, alive=snapshot.alive)
+
+    def sizes(self) -> dict[str, int]:
+        """Return the number of objects for each kind of state."""
+        accounts = self.daemon.account, self.reader.account
+        return {
+            "vehicles": max(len(each.vehicles) for each in accounts),
+            "counts": max(len(each.counts) for each in accounts),
+            "addresses": len(self.output.addresses + self.output.stale),
+            "streams": len(self.reader.measure()),
+            "page": len(self.fleet.streams),
+            "rows": len(self.fleet.picture.rows),
+            "colours": len(self.fleet._numbers),
+        }
+
+
+def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After hundreds of vehicles, eight at a time, the state is that of the last hundred and the last minute."""
+    world = World(monkeypatch)
+    sizes = []
+    for number in range(400):
+        world.now += 2.0
+        there = [Address(f"v{each}", VLP) for each in range(max(0, number - AT_A_TIME + 1), number + 1)]
+        for address in there:
+            world.hear(address)
+        world.look(*there)
+        sizes.append(world.sizes())
+    assert sizes[200:400:20] == [sizes[-1]] * 10
+    most = AT_A_TIME + MAX_GONE + 31
+    assert all(number <= most for name, number in sizes[-1].items() if name != "counts")
+    assert sizes[-1]["counts"] <= 3 * most
+    assert max(world.fleet._numbers.values()) <= most
+    world.now += FORGOTTEN
+    for _ in range(10):  # after the pause the reader counts as overloaded
+        world.now += 1.0
+        world.hear(there[-1])
+        world.look(there[-1])
+    assert {name: number for name, number in world.sizes().items() if number != 1}.keys() == {"counts"}
+
+
+def test_stream_of_a_vehicle_that_is_there_is_forgotten_after_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic that a vehicle publishes no longer is stale for an hour, then it is unknown."""
+    world, position, attitude = World(monkeypatch), Address("1", VLP), Address("1", "estimator_local_position", 0)
+    for second in range(3):
+        world.now = float(second)
+        world.hear(position)
+        world.hear(attitude)
+        world.look(position, attitude)
+    for seconds, known in ((FORGOTTEN - 9, {position, attitude}), (10, {position})):
+        world.now += seconds
+        world.hear(position)
+        world.look(position)
+        world.hear(position)
+        assert world.reader.measure().keys() == known
+        assert {*world.output.addresses, *world.output.stale} == known
+        assert world.fleet.streams.keys() == known
