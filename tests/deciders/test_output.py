@@ -95,7 +95,7 @@ def test_addresses_that_come_one_after_the_other_are_published() -> None:
         sky.hear(1, Address(f"v{number}", VLP))
     assert Address("v1499", VLP) in sky.output.addresses
     assert 990 <= len(sky.output.addresses + sky.output.stale) <= 1000
-    assert sky.output.refused == 0
+    assert not sky.output.rejected
 
 
 def test_address_beyond_the_limit_is_refused_until_another_is_stale() -> None:
@@ -105,10 +105,8 @@ def test_address_beyond_the_limit_is_refused_until_another_is_stale() -> None:
     sky.hear(1, *present, OTHER)
     sky.hear(1, *present, OTHER)
     assert OTHER not in sky.output.addresses
-    assert (sky.output.refused, sky.output.warnings) == (
-        2,
-        (f"vehicles: more than 1000 addresses: {OTHER} is ignored",),
-    )
+    assert sky.output.rejections == {"too many addresses": 2}
+    assert sky.output.warnings == (f"vehicles: more than 1000 addresses: {OTHER} is ignored",)
     sky.hear(4, *present[1:])
     sky.hear(1, OTHER)
     assert OTHER in sky.output.addresses

@@ -27,6 +27,9 @@ _MAX_TEXT: Final = 300  # logged characters of a rejection, which any peer may h
 _MAX_LOGGED: Final = 5  # logged invalid messages of a source
 _MAX_RULES: Final = 50  # with a counter of their own
 _NO_MESSAGE: Final = "input that is no message"
+TOO_MANY: Final = "too many addresses"
+"""Rule of messages that are rejected as their source has too many addresses."""
+
 _DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 1e-1, 1.0)  # s
 
 
@@ -49,7 +52,7 @@ class SourceOutput:
     def __init__(
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
     ) -> None:
-        self.published = self.rejected = self.lost = self.reboots = self.refused = 0
+        self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()
         """Number of rejected messages by violated rule."""
         self.absence = Absence()
@@ -166,8 +169,8 @@ class SourceOutput:
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
             back = stream is not None and stream.heard is not None
             if not back and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
-                self.refused += 1
-                self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"))
+                reason = f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"
+                self.reject(Rejection("vehicles", reason), rule=TOO_MANY)
                 return
             try:
                 self.claim(address, message.definition)
@@ -210,19 +213,15 @@ class SourceOutput:
 
     def _make_room(self) -> bool:
         """Forget the address that has been stale longest; return False if all are published."""
-        stale = (
-            []
-            if self._is_full
-            else [(each.heard or 0.0, address) for address, each in self._streams.items() if each.publisher is None]
-        )
+        stale = () if self._is_full else {*self._streams}.difference(self.addresses)
         if stale:
-            del self._streams[min(stale)[1]]
+            del self._streams[min(stale, key=lambda each: self._streams[each].heard or 0.0)]
         self._is_full = not stale
-        return bool(stale)
+        return not self._is_full
 
-    def reject(self, rejection: Rejection) -> None:
+    def reject(self, rejection: Rejection, rule: str = _NO_MESSAGE) -> None:
         """Count invalid input, log it once per origin, and publish a report if it has an address."""
-        self._count_rejected(_NO_MESSAGE, rejection.count)
+        self._count_rejected(rule, rejection.count)
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"

@@ -37,15 +37,11 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 
 @dataclass(frozen=True, slots=True)
 class SourceMeasures:
-    """Measurements of one source for metrics: status, all streams, and times to publish a message [s].
-
-    `refused`: messages left out as too many addresses are published.
-    """
+    """Measurements of one source for metrics: status, all streams, and times to publish a message [s]."""
 
     status: SourceStatus
     streams: tuple[StreamStatus, ...]
     durations: Histogram
-    refused: int = 0
 
     @property
     def states(self) -> dict[str, str]:
@@ -122,9 +118,7 @@ class Worker:
     def measures(self) -> SourceMeasures:
         """Measurements of the source for metrics."""
         streams = self._output.streams()
-        return SourceMeasures(
-            self._status(streams[:_MAX_STREAMS]), streams, self._output.durations, self._output.refused
-        )
+        return SourceMeasures(self._status(streams[:_MAX_STREAMS]), streams, self._output.durations)
 
     def _status(self, streams: tuple[StreamStatus, ...]) -> SourceStatus:
         run, output = self._run, self._output

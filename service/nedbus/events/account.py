@@ -43,16 +43,14 @@ class Account:
 
     `reported`: the total number of events.
     `counts`: the number of events by vehicle and severity, until the vehicle is forgotten.
-    `refused`: vehicles that are not followed, as there are too many, with the time of their last message.
-    `limit_reached`: how often a vehicle was refused.
+    `refused`: the number of messages of vehicles that are not followed, as there are too many.
     """
 
     def __init__(self, keep: int = KEPT) -> None:
         self._events: dict[int, Event] = {}
         self.vehicles: dict[str, Vehicle] = {}
         self.counts: Counter[tuple[str, Severity]] = Counter()
-        self.refused: dict[str, float] = {}
-        self.reported = self.limit_reached = 0
+        self.reported = self.refused = 0
         self._keep = keep
         self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # of its events, by vehicle
         self._common = Vehicle(ALL, self._record)  # the link, and the reader itself
@@ -64,6 +62,11 @@ class Account:
     def events(self) -> list[Event]:
         """The events kept, in the order they were reported."""
         return self.events_since(0)[0]
+
+    @property
+    def is_full(self) -> bool:
+        """True if further vehicles are not followed."""
+        return len(self.vehicles) >= MAX_VEHICLES
 
     @property
     def overload(self) -> Condition | None:
@@ -114,6 +117,12 @@ class Account:
         with self._lock:
             self._update_link(time, link)
             self._update_reader(time, dropped, is_behind=is_behind)
+            if present is not None:
+                for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
+                    here.heard = time
+                gone = self._gone(time)
+                for _, name in [each for each in gone if time - each[0] > FORGOTTEN] or gone[:-MAX_GONE]:
+                    self._forget(name)
             if self.overload is not None:
                 self._settled = time + MAX_SILENCE  # delayed messages need time to arrive
             if time < self._settled:
@@ -123,8 +132,6 @@ class Account:
             for vehicle in self.vehicles.values():
                 state = None if states is None or vehicle.main is None else states.get(vehicle.main)
                 vehicle.update(time, state, is_connected=not link)
-            if present is not None:
-                self._forget_gone(time, self.vehicles if link else present)
 
     def settle(self, time: float) -> None:
         """Report bursts of losses and rejections, and flapping, that have ended; call it at the end of a file."""
@@ -136,7 +143,7 @@ class Account:
         """Return the current state of a vehicle; `time` is now."""
         with self._lock:
             known = self.vehicles.get(vehicle)
-            if known is None and vehicle in self.refused:
+            if known is None and self.is_full:
                 return State("watch", f"no events: more than {MAX_VEHICLES} vehicles", None, ())
             return known.state(time) if known is not None else state_of(())
 
@@ -154,40 +161,29 @@ class Account:
                 self._events[number] = replace(event, boot=known.boot + event.time - known.time)
 
     def _vehicle(self, name: str, time: float) -> Vehicle | None:
-        """Return the vehicle of a message, a new one if there is room."""
+        """Return the vehicle of a message, a new one if there is room, else None."""
         known = self.vehicles.get(name)
-        if known is None and len(self.vehicles) >= MAX_VEHICLES and time >= self._full_until:
-            self._full_until = time + 1.0
-            oldest = min(self.vehicles.values(), key=lambda each: each.heard)
-            if time - oldest.heard > RECENT:
-                self._forget(oldest.name)
-        if known is None and len(self.vehicles) < MAX_VEHICLES:
-            self.refused.pop(name, None)
+        if known is None:
+            if self.is_full and time >= self._full_until:
+                self._full_until = time + 1.0
+                for _, oldest in self._gone(time)[:1]:
+                    self._forget(oldest)
+            if self.is_full:
+                if not self.refused:
+                    text = "more than %d vehicles: further ones have no events; follow some of them with --vehicle"
+                    _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
+                self.refused += 1
+                return None
             known = self.vehicles[name] = Vehicle(name, self._record, self._common)
-        if known is not None:
-            known.heard = time
-            return known
-        if not self.limit_reached:
-            text = "more than %d vehicles: further ones have no events; follow some of them with --vehicle"
-            _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
-        self.limit_reached += name not in self.refused
-        if name in self.refused or len(self.refused) < MAX_VEHICLES:
-            self.refused[name] = time
-        return None
+        known.heard = time
+        return known
 
-    def _forget_gone(self, time: float, present: Collection[str]) -> None:
-        for name in present:
-            if name in self.vehicles:
-                self.vehicles[name].heard = time
-        gone = sorted((each.heard, name) for name, each in self.vehicles.items() if time - each.heard > RECENT)
-        for index, (heard, name) in enumerate(gone):
-            if index < len(gone) - MAX_GONE or time - heard > FORGOTTEN:
-                self._forget(name)
-        self.refused = {name: heard for name, heard in self.refused.items() if time - heard <= RECENT}
+    def _gone(self, time: float) -> list[tuple[float, str]]:
+        """Return when vehicles that have been gone for a minute were heard, and their names, the longest gone first."""
+        return sorted((each.heard, name) for name, each in self.vehicles.items() if time - each.heard > RECENT)
 
     def _forget(self, name: str) -> None:
         del self.vehicles[name]
-        self._full_until = 0.0
         for severity in SEVERITIES:
             del self.counts[name, severity]
 

@@ -67,18 +67,12 @@ class AccountReport:
     events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
 
     def split(self, number: int) -> list[AccountReport]:
-        """Return the report in up to `number` parts; none if it has no more than one vehicle and one event."""
-        number = min(number, max(len(self.vehicles), len(self.events)))
+        """Return the report in at least two, about `number` parts; none if it has at most one vehicle and one event."""
         vehicles, events = list(self.vehicles.items()), self.events
-
-        def share(length: int, index: int) -> slice:
-            return slice(length * index // number, length * (index + 1) // number)
-
+        many, some = -(-len(vehicles) // number), -(-len(events) // number)
         return [
-            replace(
-                self, vehicles=dict(vehicles[share(len(vehicles), index)]), events=events[share(len(events), index)]
-            )
-            for index in range(number if number > 1 else 0)
+            replace(self, vehicles=dict(vehicles[each * many :][:many]), events=events[each * some :][:some])
+            for each in range(number if max(len(vehicles), len(events)) > 1 else 0)
         ]
 
 

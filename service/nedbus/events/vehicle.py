@@ -13,17 +13,7 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 from .detectors import ChangeDetector, Finding, make_detector
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .position import PositionDetector
-from .rules import (
-    FLAPPING_CHANGES,
-    FLAPPING_CHANGES_OF_KIND,
-    KEPT_ON_REBOOT,
-    MAX_BURST,
-    MAX_SILENCE,
-    PAUSE,
-    RECENT,
-    RULES,
-    flags_of,
-)
+from .rules import FLAPPING_CHANGES, KEPT_ON_REBOOT, MAX_BURST, MAX_SILENCE, PAUSE, RECENT, RULES, flags_of
 from .times import to_age
 
 EKF_SELECTOR: Final = "estimator_selector_status"
@@ -74,8 +64,7 @@ class Vehicle:
         self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use of each group
         self._main_time = math.inf  # time of the last position
         self._rebooted = -math.inf
-        # Recent changes of each condition, and of all conditions of a kind, which flags may change in combinations.
-        self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}
+        self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}  # of a condition, and of a kind
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
         self._lost, self._rejected = _Burst(), _Burst()
         self._dropouts = _Burst()  # in ms
@@ -178,9 +167,7 @@ class Vehicle:
         for event in reversed(self.recent):
             if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
-            elif event.change == "begin" and event.kind not in kinds and (
-                (event.kind, event.names) in self._suppressed or (event.kind, None) in self._suppressed
-            ):  # fmt: skip
+            elif event.change == "begin" and event.kind not in kinds and self._is_suppressed(event):
                 kinds.add(event.kind)
                 text = f"{event.text} (flapping)"
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
@@ -277,19 +264,20 @@ class Vehicle:
         held = [each for each in conditions if each.begin is not event]
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
+    def _is_suppressed(self, event: Event) -> bool:
+        return (event.kind, event.names) in self._suppressed or (event.kind, None) in self._suppressed
+
     def _is_flapping(self, event: Event) -> bool:
         """Return True if a condition changes too often to report each change; `settle` reports the last one."""
         if event.change == "once":
             return False
-        limits: list[tuple[tuple[str, ...] | None, int]] = [(None, FLAPPING_CHANGES_OF_KIND)]
-        if (event.kind, None) not in self._suppressed:
-            limits.insert(0, (event.names, FLAPPING_CHANGES))
-        for names, limit in limits:
-            events = self._changes.setdefault((event.kind, names), deque(maxlen=limit))
+        keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in combinations
+        for key, limit in [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]:
+            events = self._changes.setdefault(key, deque(maxlen=limit))
             is_fast = len(events) == limit and event.time - events[0].time < WINDOW
             events.append(event)
             if is_fast:
-                self._suppressed[event.kind, names] += 1
+                self._suppressed[key] += 1
                 return True
         return False
 

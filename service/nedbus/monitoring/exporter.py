@@ -25,7 +25,6 @@ from nedbus_msgs import Address, Selection
 
 from .http_server import Page
 from .metrics import (
-    MAX_STREAMS,
     MeasuredStream,
     build_info,
     make_metrics,
@@ -37,7 +36,6 @@ from .observer import Observer, Snapshot
 from .pages import vehicles_page
 
 _POLL_INTERVAL: Final = 0.5  # s between polls of all vehicles
-_MAX_SOURCES: Final = 4 * MAX_STREAMS  # addresses whose source is kept
 _MAX_ROUTERS: Final = 16  # routers exported; any peer may claim to be one
 _ROUTERS_INTERVAL: Final = 30.0  # s between router queries; a reply has 183 bytes per session
 _SERVICES_INTERVAL: Final = 5.0  # s between queries of services, while messages from MAVLink arrive
@@ -108,7 +106,9 @@ class Exporter:
             "nedbus_messages_invalid": [((), counts.invalid)],
             "nedbus_keys_forgotten": [((), counts.forgotten)],
             "nedbus_queue_messages": [((), self._subscription.waiting)],
-            "nedbus_limit_reached": [((limit,), count) for limit, count in self._observer.limits_reached.items()],
+            "nedbus_limit_reached": [
+                (("vehicles",), self.account.refused), (("streams",), self._observer.monitor.evicted),
+            ],
             "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
             "nedbus_router_sessions_max": [
                 ((state.zid,), state.max_sessions) for state in self._routers if state.max_sessions is not None
@@ -129,8 +129,7 @@ class Exporter:
     def _read(self) -> None:
         for sample in self._subscription.rows():
             self._observer.add(sample)
-            if sample.address in self._sources or len(self._sources) < _MAX_SOURCES:
-                self._sources[sample.address] = sample.source or ""
+            self._sources[sample.address] = sample.source or ""
             self._on_sample(sample)
 
     def _ask_peers(self, stop: threading.Event) -> None:

@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 
 from nedbus import clock
 from nedbus.client import Health, Histogram, SourceStatus
-from nedbus.daemon import STATES, Daemon, SourceMeasures
+from nedbus.daemon import STATES, TOO_MANY, Daemon, SourceMeasures
 from nedbus.events import SEVERITIES, Account
 
 from .http_server import Page
@@ -44,10 +44,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
         _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, 0 if they pass",
     ),
     "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
-    "nedbus_limit_reached": (
-        _COUNTER, ("limit",),
-        "What a limit left out: vehicles without events, messages of further addresses, forgotten health of streams",
-    ),
+    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages left out, or streams forgotten, as there are too many"),
     # Exporters
     "nedbus_connected": (_GAUGE, (), "1 while connected to a router"),
     "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
@@ -196,9 +193,9 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
 
 def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
     """Yield the vehicle metrics; a vehicle without an active stream has event counts but no state."""
-    now, vehicles = clock.steady(), [*account.vehicles, *account.refused]
+    now, vehicles = clock.steady(), list(account.vehicles)
     active = {stream.labels[0] for stream in streams if stream.active}
-    states = {name: account.state(name, now) for name in vehicles if name in active}
+    states = {name: account.state(name, now) for name in active if name in vehicles or account.is_full}
     kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
     yield from make_metrics({
         "nedbus_vehicle_state": [
@@ -227,9 +224,9 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     account = daemon.look(list(sources.values()))
     yield from vehicle_metrics(account, streams)
     of = {label: measures.status for label, measures in sources.items()}
-    limits = {"vehicles": account.limit_reached, "addresses": sum(each.refused for each in sources.values())}
+    addresses = sum(each.status.rejections.get(TOO_MANY, 0) for each in sources.values())
     yield from make_metrics({
-        "nedbus_limit_reached": [((limit,), count) for limit, count in limits.items()],
+        "nedbus_limit_reached": [(("vehicles",), account.refused), (("addresses",), addresses)],
         "nedbus_source_rejected": [((label,), status.rejected) for label, status in of.items()],
         "nedbus_messages_rejected": [
             ((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()

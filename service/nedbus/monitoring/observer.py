@@ -48,7 +48,7 @@ class Observer:
         self.account = Account()
         self.subscription = bus.subscribe_to(selection, mode="every")
         self._bus, self._selection = bus, selection
-        self._monitor = Monitor()
+        self.monitor = Monitor()
         self._rejections = bus.rejections()
         self._looked: float | None = None
         self._disconnected = 0.0  # time of the last poll without a link
@@ -57,7 +57,7 @@ class Observer:
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample just read; the account ignores the cached last sample of a stream that ended long ago."""
         with self._lock:
-            is_known = self._monitor.add(sample)
+            is_known = self.monitor.add(sample)
         now = clock.steady()
         if is_known or sample.sent is None or now - sample.sent / 1e9 <= _MAX_AGE:
             missing = sample.provenance.missing
@@ -66,20 +66,15 @@ class Observer:
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
         """Return the current health and latencies of each stream."""
         with self._lock:
-            healths = self._monitor.snapshot()
-            return {address: (health, self._monitor.latencies(address)) for address, health in healths.items()}
-
-    @property
-    def limits_reached(self) -> dict[str, int]:
-        """Number of vehicles and streams left out or forgotten, as there are too many."""
-        return {"vehicles": self.account.limit_reached, "streams": self._monitor.evicted}
+            healths = self.monitor.snapshot()
+            return {address: (health, self.monitor.latencies(address)) for address, health in healths.items()}
 
     def poll(self) -> Snapshot:
         """Poll streams, rejections and the link, and record changes in the account."""
         now, connected = clock.steady(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
         with self._lock:
-            healths = self._monitor.snapshot()
+            healths = self.monitor.snapshot()
         taken = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
@@ -105,7 +100,7 @@ class Observer:
                 if age > FORGOTTEN or (age > RECENT and address.vehicle not in self.account.vehicles):
                     del healths[address]
                     with self._lock:
-                        self._monitor.forget(address)
+                        self.monitor.forget(address)
         behind = ""
         if self.account.overload is not None:
             behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"

@@ -45,7 +45,6 @@ COMMON_SETTINGS: Final = {
 MAX_REPLY_BYTES: Final = 2**18
 """Largest payload of a reply to a query: services split what is longer, readers refuse it."""
 
-_MAX_KEY_BYTES: Final = 2**12  # of a reply, with its headers
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
@@ -99,7 +98,8 @@ def open_client(
         "connect/timeout_ms": 0,
         "connect/retry": draw_retry(),
         "listen/endpoints": [],
-        "transport/link/rx/max_message_size": MAX_REPLY_BYTES + _MAX_KEY_BYTES,  # no peer is trusted with more
+        "transport/link/rx/max_message_size": MAX_REPLY_BYTES
+        + 2**12,  # with key and headers; no peer is trusted with more
     }
     timeout = math.inf if timeout is None else timeout
     end = time.monotonic() + timeout

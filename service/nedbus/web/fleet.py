@@ -21,7 +21,7 @@ from nedbus.client import (
     health_of_last,
     stream_state,
 )
-from nedbus.events import FIXES, FORGOTTEN, MODES, State
+from nedbus.events import FIXES, MODES, State
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .stream import LONG, Origin, PageStream, is_position
@@ -149,7 +149,8 @@ class Fleet:
         self.streams: dict[Address, PageStream] = {}
         self.picture = Picture(0.0)
         self._long = long
-        self._numbers: dict[str, int] = {}
+        self._numbers: dict[str, int] = {}  # most recently shown last
+        self._next_number = count()
         self._truths: dict[str, PageStream] = {}
         self._left_out: set[Address] = set()
         self._gone: list[Address] = []  # removed by the thread that adds samples
@@ -177,8 +178,9 @@ class Fleet:
         """Add reports of rejected messages."""
         self._reports.extendleft(reports)
         for report in reports:
-            if report.address in self._rejected or len(self._rejected) < MAX_STREAMS:
-                self._rejected[report.address] += 1
+            self._rejected[report.address] += 1
+            if len(self._rejected) > MAX_STREAMS:
+                del self._rejected[next(iter(self._rejected))]
 
     def clear(self) -> None:
         """Remove all streams and reports, but keep the common origin; called before a seek."""
@@ -196,7 +198,11 @@ class Fleet:
         if unknown.
         """
         if alive is not None and not link:
-            self._find_gone(time, alive, states)
+            known, silent = {*alive, *healths}, time - _SILENT
+            self._gone = [
+                each for each, stream in [*self.streams.items()] if each not in known and stream.time < silent
+            ]
+            self._left_out.intersection_update(alive)
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
@@ -218,10 +224,10 @@ class Fleet:
         state = state or State("info", "ok", None, ())
         if state.severity == "info" and main.state.name == "slow" and not own:  # otherwise the page itself is slow
             state = replace(state, severity="watch", text=str(main.state))
-        if vehicle not in self._numbers:
-            used = set(self._numbers.values())
-            self._numbers[vehicle] = next(number for number in count() if number not in used)
-        number = self._numbers[vehicle]
+        number = self._numbers.pop(vehicle) if vehicle in self._numbers else next(self._next_number)
+        self._numbers[vehicle] = number
+        if len(self._numbers) > MAX_STREAMS:
+            del self._numbers[next(iter(self._numbers))]
         return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number, log)
 
     def _facts(self, vehicle: str) -> dict[str, str]:
@@ -240,19 +246,6 @@ class Fleet:
     def _last(self, vehicle: str, topic: str, instance: int | None = None) -> Any:
         stream = self.streams.get(Address(vehicle, topic, instance))
         return stream.last.message if stream is not None and stream.last is not None else None
-
-    def _find_gone(self, time: float, alive: Counter[Address], states: Mapping[str, State]) -> None:
-        """Find streams without a publisher whose vehicle has no state any more, or that were silent for an hour."""
-        self._gone = [
-            address for address, stream in [*self.streams.items()]
-            if not alive[address]
-            and time - stream.time > (_SILENT if address.vehicle not in states else FORGOTTEN)
-        ]  # fmt: skip
-        self._left_out.intersection_update(alive)
-        vehicles = {address.vehicle for address in [*self.streams]}
-        self._numbers = {name: number for name, number in self._numbers.items() if name in vehicles}
-        for address in [each for each in self._rejected if each.vehicle not in vehicles]:
-            del self._rejected[address]
 
     def _remove(self, address: Address) -> None:
         self.streams.pop(address, None)

@@ -131,7 +131,8 @@ class LiveFleet:
         account = self._exporter.account
         self.chronicle.start = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
         self.fleet.reject(snapshot.rejected)
-        states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in [*account.vehicles, *account.refused]}
+        vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
+        states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}
         own = snapshot.behind.replace("this reader", "this page")
         self.fleet.update(
             snapshot.time, snapshot.healths, states,

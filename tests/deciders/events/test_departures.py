@@ -73,7 +73,6 @@ class World:
             "streams": len(self.reader.measure()),
             "page": len(self.fleet.streams),
             "rows": len(self.fleet.picture.rows),
-            "colours": len(self.fleet._numbers),
         }
 
 
@@ -92,7 +91,6 @@ def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.Monk
     most = AT_A_TIME + MAX_GONE + 31
     assert all(number <= most for name, number in sizes[-1].items() if name != "counts")
     assert sizes[-1]["counts"] <= 3 * most
-    assert max(world.fleet._numbers.values()) <= most
     world.now += FORGOTTEN
     for _ in range(10):  # after the pause the reader counts as overloaded
         world.now += 1.0
