@@ -104,10 +104,10 @@ class Exporter:
             "nedbus_connected": [((), self._bus.connected)],
             "nedbus_messages_dropped": [((), counts.dropped)],
             "nedbus_messages_invalid": [((), counts.invalid)],
-            "nedbus_keys_forgotten": [((), counts.forgotten)],
             "nedbus_queue_messages": [((), self._subscription.waiting)],
             "nedbus_limit_reached": [
                 (("vehicles",), self.account.refused), (("streams",), self._observer.monitor.evicted),
+                (("keys",), counts.forgotten),
             ],
             "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
             "nedbus_router_sessions_max": [

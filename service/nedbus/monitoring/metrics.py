@@ -44,12 +44,11 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
         _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, 0 if they pass",
     ),
     "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
-    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages left out, or streams forgotten, as there are too many"),
+    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages left out, or streams or keys forgotten, beyond a limit"),
     # Exporters
     "nedbus_connected": (_GAUGE, (), "1 while connected to a router"),
     "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
     "nedbus_messages_invalid": (_COUNTER, (), "Payloads discarded because they are not valid messages"),
-    "nedbus_keys_forgotten": (_COUNTER, (), "Keys beyond 10,000 whose next gap is not counted as lost"),
     "nedbus_queue_messages": (_GAUGE, (), "Messages queued in the exporter"),
     "nedbus_router_sessions": (_GAUGE, ("router",), "Zenoh sessions open at a router, by router id"),
     "nedbus_router_sessions_max": (_GAUGE, ("router",), "Session limit of a router, by router id"),

@@ -119,7 +119,11 @@ def test_pages_of_an_exporter(
         assert pages.values("nedbus_latency_seconds_count", **of_stream) == [len(numbers) - 1]
         assert 0 <= pages.values("nedbus_latency_seconds_sum", **of_stream)[0] < 60
         wait_for(lambda: pages.values("nedbus_messages_invalid_total") == [1], what="what is invalid")
-        assert pages.values("nedbus_messages_dropped_total") == pages.values("nedbus_keys_forgotten_total") == [0]
+        assert (
+            pages.values("nedbus_messages_dropped_total")
+            == pages.values("nedbus_limit_reached_total", limit="keys")
+            == [0]
+        )
         assert pages.values("nedbus_connected") == [1]
         assert pages.ask("/healthz") == (200, "ok\n")
         status = json.loads(pages.ask("/status")[1])
