@@ -29,7 +29,7 @@ KEPT: Final = 2000
 MAX_VEHICLES: Final = 1000
 """Maximum number of vehicles in an account; those gone longest make room."""
 
-MAX_GONE: Final = 100
+MAX_GONE: Final = 50
 """Vehicles gone for a minute that are remembered; beyond, those gone longest are forgotten earlier."""
 
 _SHARE: Final = 20  # events that a vehicle keeps while others have more
@@ -111,7 +111,7 @@ class Account:
         `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
         `link`: the fault of the link, "" if it is up. `dropped`: messages dropped by this reader since it started.
         `is_behind`: it has a backlog. `present`: vehicles that have a publisher; all others are forgotten once they
-        have been silent for an hour with a link, or earlier if more than a hundred are gone. None: none is forgotten.
+        have been silent for an hour with a link, or earlier if more than 50 are gone. None: none is forgotten.
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:

@@ -77,7 +77,7 @@ class World:
 
 
 def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After hundreds of vehicles, eight at a time, the state is that of the last hundred and the last minute."""
+    """After hundreds of vehicles, eight at a time, the state is that of the last fifty and the last minute."""
     world = World(monkeypatch)
     sizes = []
     for number in range(400):

@@ -597,8 +597,8 @@ def test_vehicle_that_is_gone_is_forgotten() -> None:
     assert set(account.vehicles) == {"here"}
 
 
-def test_of_many_that_left_the_last_hundred_are_known() -> None:
-    """Vehicles that come and go leave the last hundred behind, and those of the last minute."""
+def test_of_many_that_left_the_last_fifty_are_known() -> None:
+    """Vehicles that come and go leave the last fifty behind, and those of the last minute."""
     flight = Flight()
     for number in range(3000):
         flight.wait(2.0).send(vehicle=f"v{number}")
