@@ -98,8 +98,8 @@ def open_client(
         "connect/timeout_ms": 0,
         "connect/retry": draw_retry(),
         "listen/endpoints": [],
-        "transport/link/rx/max_message_size": MAX_REPLY_BYTES
-        + 2**12,  # with key and headers; no peer is trusted with more
+        # With key and headers; no peer is trusted with more.
+        "transport/link/rx/max_message_size": MAX_REPLY_BYTES + 2**12,
     }
     timeout = math.inf if timeout is None else timeout
     end = time.monotonic() + timeout
