@@ -30,7 +30,7 @@ MAX_VEHICLES: Final = 1000
 """Maximum number of vehicles in an account; those gone longest make room."""
 
 MAX_GONE: Final = 50
-"""Vehicles gone for a minute that are remembered; beyond, those gone longest are forgotten earlier."""
+"""Vehicles gone for a minute that are remembered, or as many as were present at once; further ones are forgotten."""
 
 _SHARE: Final = 20  # events that a vehicle keeps while others have more
 _NONE: Final[frozenset[str]] = frozenset()
@@ -54,7 +54,7 @@ class Account:
         self._keep = keep
         self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # of its events, by vehicle
         self._common = Vehicle(ALL, self._record)  # the link, and the reader itself
-        self._dropped = 0
+        self._dropped = self._most_present = 0
         self._last_overload = self._settled = self._full_until = 0.0
         self._lock = threading.RLock()
 
@@ -111,7 +111,8 @@ class Account:
         `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
         `link`: the fault of the link, "" if it is up. `dropped`: messages dropped by this reader since it started.
         `is_behind`: it has a backlog. `present`: vehicles that have a publisher; all others are forgotten once they
-        have been silent for an hour with a link, or earlier if more than 50 are gone. None: none is forgotten.
+        have been silent for an hour with a link, or earlier if more are gone than were ever present at once, and more
+        than 50. None: none is forgotten.
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:
@@ -120,8 +121,10 @@ class Account:
             if present is not None:
                 for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
                     here.heard = time
+                self._most_present = max(self._most_present, len(present))
                 gone = self._gone(time)
-                for _, name in [each for each in gone if time - each[0] > FORGOTTEN] or gone[:-MAX_GONE]:
+                beyond = gone[: -max(MAX_GONE, self._most_present)]
+                for _, name in [each for each in gone if time - each[0] > FORGOTTEN] or beyond:
                     self._forget(name)
             if self.overload is not None:
                 self._settled = time + MAX_SILENCE  # delayed messages need time to arrive

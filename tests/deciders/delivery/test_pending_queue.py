@@ -173,11 +173,12 @@ def test_key_with_an_open_gap_is_forgotten_last(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
-def test_state_of_departed_streams_is_freed(mode: Mode) -> None:
+def test_state_of_departed_streams_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 2,000 vehicles that come and go, eight at a time, those of the last ten minutes are remembered.
 
     A vehicle of which messages or heartbeats still arrive is not forgotten.
     """
+    monkeypatch.setattr("nedbus.client.receiving.pending_queue.KEPT_KEYS", 10)
     now = [0.0]
     pending_queue = make_queue(mode, clock=lambda: now[0])
     for number in range(2000):
@@ -191,6 +192,19 @@ def test_state_of_departed_streams_is_freed(mode: Mode) -> None:
     assert {"steady", "silent", *map(str, range(1935, 1999))} <= kept.keys()
     assert len(kept) <= 72
     assert set(kept.values()) == {2}
+
+
+def test_loss_of_a_long_outage_is_counted() -> None:
+    """What a vehicle published in an hour without a link is lost, whatever other vehicles appeared meanwhile."""
+    now = [0.0]
+    pending_queue = make_queue("latest", clock=lambda: now[0])
+    put(pending_queue, [raw(0, key=key_of("7"), publisher="7")])
+    for other in range(100):
+        now[0] += 36.0
+        put(pending_queue, [raw(0, key=key_of(f"v{other}"), publisher=f"v{other}")])
+    put(pending_queue, [raw(90, key=key_of("7"), publisher="7")])
+    drain(pending_queue)
+    assert pending_queue.counts.lost == 89
 
 
 def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:

@@ -607,6 +607,16 @@ def test_of_many_that_left_the_last_fifty_are_known() -> None:
     assert len(flight.account.counts) <= 3 * len(known)
 
 
+def test_fleet_that_drops_at_once_is_remembered() -> None:
+    """Of 300 vehicles that vanish together behind a link that works, none is forgotten before an hour has passed."""
+    flight, fleet = Flight(), [f"v{number}" for number in range(300)]
+    for vehicle in fleet:
+        flight.send(vehicle=vehicle)
+    assert look(flight.account, flight.now, *fleet) == set(fleet)
+    assert look(flight.account, flight.now + FORGOTTEN - 1) == set(fleet)
+    assert look(flight.account, flight.now + FORGOTTEN + 1) == set()
+
+
 def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
     """Reasons of ended rejections are not kept, as each one may be different."""
     for number in range(200):

@@ -39,7 +39,10 @@ MAX_KEYS: Final = 10_000
 """Keys that a reader follows, a bound on memory; beyond, those silent longest are forgotten, and counted."""
 
 MAX_SILENCE: Final = 600.0
-"""Seconds without a message or heartbeat after which the state of a key is freed once another key appears."""
+"""Seconds without a message or heartbeat after which the state of a key is freed where there are many keys."""
+
+KEPT_KEYS: Final = 1_000
+"""Keys that are remembered however long they are silent, so that the losses of a long outage are counted."""
 
 MAX_HELD: Final = 131_072
 """Messages held back behind gaps, about 90 MB; beyond, gaps are given up."""
@@ -304,9 +307,9 @@ class PendingQueue:
         return stream
 
     def _make_room(self, now: float) -> None:
-        """Forget keys that have been silent for long and, at the limit, the one silent longest; open gaps go last."""
+        """Forget keys, of many, that are silent for long and, at the limit, the one silent longest; gaps go last."""
         order = self._by_silence
-        while order and (len(order) >= MAX_KEYS or order[0][0] < now - MAX_SILENCE):
+        while len(order) >= MAX_KEYS or (len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE):
             since, key = order[0]
             stream = self._streams[key]
             if any(writer.request for writer in stream.writers.values()):
