@@ -71,6 +71,8 @@ bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck reade
 	$(BIN)/python -m benchmarks.stuck
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
+	$(BIN)/python -m benchmarks.restart
+	$(BIN)/python -m benchmarks.soak --names 10000
 	$(BIN)/python -m benchmarks.ulog.files
 	$(BIN)/python -m benchmarks.ulog.stream
 	$(BIN)/python -m benchmarks.metrics

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, NamedTuple
 
 import psutil
 
@@ -19,6 +19,24 @@ ROOT: Final = Path(__file__).parents[1]
 PATIENCE: Final = 120.0  # s that a process may take to say something
 
 Process = subprocess.Popen[str]
+
+
+class Checkout(NamedTuple):
+    """A checkout of nedbus; its own .venv runs it, if it has one."""
+
+    folder: Path
+
+    def start(self, *arguments: str) -> Process:
+        """Start a Python process that imports this checkout."""
+        python, packages = (
+            self.folder / ".venv/bin/python",
+            [str(self.folder / each) for each in ("service", "schemas")],
+        )
+        environment = {"PYTHONPATH": os.pathsep.join(packages)}
+        return start(*arguments, python=str(python) if python.exists() else sys.executable, environment=environment)
+
+
+HERE: Final = Checkout(ROOT)
 
 
 def start(
@@ -68,9 +86,9 @@ def end(*processes: Process, patience: float = 0.0) -> None:
 
 
 @contextmanager
-def nedbus_process(*arguments: str) -> Iterator[Process]:
-    """Run a nedbus command until the measurement is over."""
-    process = start("-m", "nedbus", *arguments)
+def nedbus_process(*arguments: str, checkout: Checkout = HERE, setup: str = "") -> Iterator[Process]:
+    """Run a nedbus command until the measurement is over; `setup` is Python code that runs before it."""
+    process = checkout.start("-c", f"{setup}\nfrom nedbus.cli import main\nmain()", *arguments)
     try:
         yield process
     finally:
@@ -79,10 +97,10 @@ def nedbus_process(*arguments: str) -> Iterator[Process]:
 
 
 @contextmanager
-def router() -> Iterator[tuple[Process, str]]:
+def router(checkout: Checkout = HERE) -> Iterator[tuple[Process, str]]:
     """Run a router on a free port, and give its endpoint."""
     port = free_port()
-    with nedbus_process("router", "--listen", f"tcp/127.0.0.1:{port}") as process:
+    with nedbus_process("router", "--listen", f"tcp/127.0.0.1:{port}", checkout=checkout) as process:
         wait_for_router(port, process)
         yield process, f"tcp/127.0.0.1:{port}"
 

@@ -1,0 +1,123 @@
+"""Vehicles that come and go, eight at a time: memory of all processes, /metrics, and the time to open a publisher.
+
+`python -m benchmarks.soak` does it as fast as possible, `--names 1800 --interval 2` for an hour.
+The bars, from the first fifth of the names to the last: resident memory within 10 % beyond the growth of `raw`, a
+reader with eclipse-zenoh alone; the time to open a publisher is unchanged; /metrics in under 50 ms at the end.
+The router is Zenoh alone as well, and in the publisher's process Zenoh keeps all keys: they have no bar.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import threading
+import time
+import urllib.request
+from collections import deque
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from .processes import PATIENCE, ROOT, Checkout, Process, end, expect, free_port, memory_mb, router, tell
+
+STAGES: Final = 5
+PUBLISHER: Final = """
+import collections, json, os, statistics, sys, time
+import nedbus
+endpoint, count, interval = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+messages = [nedbus.VehicleLocalPosition(timestamp=1), nedbus.VehicleStatus(timestamp=1)]
+bus, here, name, opening = nedbus.connect(endpoint), collections.deque(), 0, collections.deque(maxlen=500)
+print("ready", flush=True)
+while os.read(0, 1):
+    start = time.monotonic()
+    for number in range(1, count + 1):
+        name, begin = name + 1, time.perf_counter()
+        here.append([bus.publisher(topic, vehicle=name) for topic in ("vehicle_local_position", "vehicle_status")])
+        opening.append(500 * (time.perf_counter() - begin))
+        for publisher, message in zip(here[-1], messages):
+            publisher.publish(message)
+        for publisher in here.popleft() if len(here) > 8 else ():
+            publisher.close()
+        time.sleep(max(0.0, start + number * interval - time.monotonic()) if interval else 0.0)
+    print(json.dumps([statistics.median(opening), time.monotonic() - start]), flush=True)
+"""
+READER: Final = """
+import sys, nedbus
+with nedbus.connect(sys.argv[1]) as bus, bus.subscribe("*", mode="every") as subscription:
+    print("ready", flush=True)
+    for sample in subscription:
+        pass
+"""
+RAW: Final = """
+import sys, zenoh
+from nedbus.transport import open_client
+from nedbus_msgs import Selection
+session, ring = open_client([sys.argv[1]], timeout=10.0), zenoh.handlers.RingChannel(16384)
+history = zenoh.ext.HistoryConfig(max_samples=1)
+subscriber = zenoh.ext.declare_advanced_subscriber(session, "nedbus/**", ring, history=history)
+alive = session.liveliness().declare_subscriber(Selection().alive_key_expr(prefix="nedbus"), ring, history=True)
+print("ready", flush=True)
+while subscriber.handler.recv():
+    pass
+"""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--names", type=int, default=50_000)
+    parser.add_argument("--interval", type=float, default=0.0, help="seconds between two vehicles")
+    parser.add_argument("--checkout", type=Path, default=ROOT, help="measure this checkout in place of this one")
+    arguments = parser.parse_args()
+    checkout, stage = Checkout(arguments.checkout), arguments.names // STAGES
+    pages = {name: f"127.0.0.1:{free_port()}" for name in ("service", "export", "web")}
+    with router(checkout) as (routing, endpoint):
+        run = partial(checkout.start, "-m", "nedbus")
+        processes = {
+            "service": run("serve", "-c", endpoint, "--http", pages["service"], "-s", "px4-zenoh:"),
+            "export": run("export", "-c", endpoint, "--http", pages["export"]),
+            "web": run("web", "-c", endpoint, "--http", pages["web"]),
+            "events": run("events", "-c", endpoint),
+            "reader": checkout.start("-c", READER, endpoint),
+            "raw": checkout.start("-c", RAW, endpoint),
+            "publisher": checkout.start("-c", PUBLISHER, endpoint, str(stage), str(arguments.interval)),
+        }
+        try:
+            for name in ("reader", "raw", "publisher"):
+                expect(processes[name])
+            threading.Thread(target=deque, args=(processes["events"].stdout, 0), daemon=True).start()
+            measure({**processes, "router": routing}, pages, stage, PATIENCE + stage * max(1.0, 2 * arguments.interval))
+        finally:
+            end(*processes.values())
+
+
+def measure(processes: dict[str, Process], pages: dict[str, str], stage: int, patience: float) -> None:
+    """Let vehicles come and go, print the state after each stage, and the growth from the first stage to the last."""
+    print("   names  names/s  open ms  MB: " + " ".join(f"{name:>9}" for name in processes))
+    stages = []
+    for number in range(1, STAGES + 1):
+        tell(processes["publisher"])
+        opening, seconds = json.loads(expect(processes["publisher"], patience))
+        time.sleep(3.0)
+        stages.append([memory_mb(process) for process in processes.values()])
+        memory = " ".join(f"{each:9.1f}" for each in stages[-1])
+        scrapes = "; ".join(f"{name} {scrape(pages[name])}" for name in ("service", "export"))
+        print(f"{number * stage:8} {stage / seconds:8.1f} {opening:8.2f}      {memory}   {scrapes}", flush=True)
+    growth = dict(
+        zip(processes, (late - early for early, late in zip(stages[0], stages[-1], strict=True)), strict=True)
+    )
+    for name, first in zip(processes, stages[0], strict=True):
+        kilobytes, beyond = 1024 * growth[name] / stage / (STAGES - 1), (growth[name] - growth["raw"]) / first
+        verdict = "" if name in {"raw", "publisher", "router"} else "holds" if beyond <= 0.1 else "MISSED: 10 %"
+        print(f"{name:10} {kilobytes:8.2f} kB a name, {beyond:.0%} beyond raw  {verdict}")
+
+
+def scrape(address: str) -> str:
+    """Return size and time of a page of metrics."""
+    begin = time.perf_counter()
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=PATIENCE) as answer:
+        return f"{len(answer.read()) / 1e3:.0f} kB in {1e3 * (time.perf_counter() - begin):.0f} ms"
+
+
+if __name__ == "__main__":
+    main()
