@@ -61,6 +61,7 @@ while os.read(0, 1):
 READER: Final = """
 import sys, nedbus
 with nedbus.connect(sys.argv[1]) as bus, bus.subscribe("*", mode="every") as subscription:
+    bus.vehicles()  # follows the tokens from now on, as raw does
     print("ready", flush=True)
     for sample in subscription:
         pass
