@@ -67,8 +67,8 @@ bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck reade
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.record --seconds 60
-	$(BIN)/python -m benchmarks.busy
-	$(BIN)/python -m benchmarks.stuck
+	$(BIN)/python -m benchmarks.readers.busy
+	$(BIN)/python -m benchmarks.readers.stuck
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 	$(BIN)/python -m benchmarks.restart

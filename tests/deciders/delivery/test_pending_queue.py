@@ -195,7 +195,7 @@ def test_state_of_departed_streams_is_freed(mode: Mode, monkeypatch: pytest.Monk
 
 
 def test_loss_of_a_long_outage_is_counted() -> None:
-    """What a vehicle published in an hour without a link is lost, whatever other vehicles appeared meanwhile."""
+    """The messages of an hour without a link are lost, and counted, although other vehicles appeared meanwhile."""
     now = [0.0]
     pending_queue = make_queue("latest", clock=lambda: now[0])
     put(pending_queue, [raw(0, key=key_of("7"), publisher="7")])

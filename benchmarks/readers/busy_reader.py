@@ -1,4 +1,4 @@
-"""A reader that computes in pure Python: python -m benchmarks.busy_reader FORM SCRIPT ENDPOINT.
+"""A reader that computes in pure Python: python -m benchmarks.readers.busy_reader FORM SCRIPT ENDPOINT.
 
 It prints "ready", and once it was told and nothing more comes, what it measured as JSON: ages of messages in ms, from
 their own timestamp until they are handed out.
@@ -17,10 +17,9 @@ from dataclasses import dataclass, field
 import zenoh
 
 import nedbus
-
-from .compare.case import TOPIC
-from .compare.zenoh_session import KEY, open_session
-from .processes import wait_for_quiet
+from benchmarks.compare.case import TOPIC
+from benchmarks.compare.zenoh_session import KEY, open_session
+from benchmarks.processes import wait_for_quiet
 
 QUIET = 1.0  # s without a message after which nothing more comes
 PATIENCE = 5.0  # s after the last was sent, whatever is still to come

@@ -1,4 +1,4 @@
-"""A reader of every message that may be stuck: python -m benchmarks.stuck_reader HABIT ENDPOINT VEHICLE...
+"""A reader of every message that may be stuck: python -m benchmarks.readers.stuck_reader HABIT ENDPOINT VEHICLE...
 
 HABIT is `reads`, `never` (does not read) or `slowly` (one message a second); each vehicle has a subscription and a
 thread of its own.
@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import nedbus
-
-from .compare.case import TOPIC
-from .processes import wait_for_quiet
+from benchmarks.compare.case import TOPIC
+from benchmarks.processes import wait_for_quiet
 
 QUIET: Final = 3.0  # s without a message after which nothing more comes
 PATIENCE: Final = 60.0  # s for it

@@ -1,4 +1,4 @@
-"""Readers in scripts that compute in pure Python: python -m benchmarks.busy [--seconds N].
+"""Readers in scripts that compute in pure Python: python -m benchmarks.readers.busy [--seconds N].
 
 One vehicle is published live at 2,000 messages a second.
 A script is idle; or it computes all the time, and reads in a thread of its own; or it computes for 10 ms between two
@@ -12,7 +12,7 @@ import argparse
 import json
 from typing import Final
 
-from .processes import end, expect, router, start, tell
+from benchmarks.processes import end, expect, router, start, tell
 
 RATE: Final = 2000  # Hz
 MAX_AGE: Final = 50.0  # ms
@@ -40,7 +40,7 @@ def measure(form: str, script: str, seconds: int) -> str:
     """Run one reader and return a line about it."""
     sent = RATE * seconds
     with router() as (_, endpoint):
-        reader = start("-m", "benchmarks.busy_reader", form, script, endpoint)
+        reader = start("-m", "benchmarks.readers.busy_reader", form, script, endpoint)
         sender = "raw" if form.startswith("raw") else "rows"
         publisher = start("-m", "benchmarks.compare.role", sender, "publish", endpoint, str(sent), str(RATE))
         try:

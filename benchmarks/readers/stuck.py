@@ -1,4 +1,4 @@
-"""A reader of every message that is stuck, beside a healthy one at the same router: python -m benchmarks.stuck.
+"""A reader of every message that is stuck, beside a healthy one at the same router: python -m benchmarks.readers.stuck.
 
 It never reads, reads one message a second, or is stopped with SIGSTOP, for --seconds; then it reads on.
 Vehicle 1 is live at --rate Hz, and in all cases the healthy reader follows it; vehicle 2 is replayed by a lossless
@@ -20,7 +20,7 @@ import signal
 import time
 from typing import Any, Final
 
-from .processes import Process, end, expect, router, start, tell
+from benchmarks.processes import Process, end, expect, router, start, tell
 
 BEFORE: Final = 2.0  # s that all read
 AFTER: Final = 10  # s that live goes on when the stuck one reads on
@@ -54,9 +54,9 @@ def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) ->
     stuck_reads, healthy_reads = CASES[case]
     sent = {LIVE: round((BEFORE + seconds + AFTER) * rate), REPLAYED: messages}
     with router() as (_, endpoint):
-        healthy = start("-m", "benchmarks.stuck_reader", "reads", endpoint, *healthy_reads)
+        healthy = start("-m", "benchmarks.readers.stuck_reader", "reads", endpoint, *healthy_reads)
         behaves = "reads" if habit == "stopped" else habit
-        stuck = start("-m", "benchmarks.stuck_reader", behaves, endpoint, stuck_reads)
+        stuck = start("-m", "benchmarks.readers.stuck_reader", behaves, endpoint, stuck_reads)
         live = _publisher(endpoint, sent[LIVE], rate, LIVE)
         replay = _publisher(endpoint, messages, 0, REPLAYED) if REPLAYED in healthy_reads else None
         processes = [each for each in (healthy, stuck, live, replay) if each is not None]

@@ -1,0 +1,1 @@
+"""Readers that compute or are stuck, beside healthy ones."""
