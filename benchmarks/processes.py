@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import select
 import socket
 import subprocess
@@ -106,10 +107,11 @@ def router(checkout: Checkout = HERE) -> Iterator[tuple[Process, str]]:
 
 
 def free_port() -> int:
-    """Return a port of the loopback on which nothing listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    """Return a port of the loopback on which nothing listens, and which no client gets while a router is down."""
+    while True:
+        with socket.socket() as free, suppress(OSError):
+            free.bind(("127.0.0.1", random.randint(20_000, 32_000)))  # below the ports of clients, from 32,768 on
+            return int(free.getsockname()[1])
 
 
 def cpu_seconds(*processes: Process) -> list[float]:
