@@ -1,6 +1,6 @@
 """CPU time, wake-ups and threads of processes at rest: python -m benchmarks.idle [--vs CHECKOUT].
 
-The bars: a service with one simulated vehicle which nobody reads: below 10 % of a core and below 120 MB;
+The bars: a service with one simulated vehicle and no reader: below 10 % of a core and below 120 MB;
 100 buses with a publisher at 1 Hz each: at most 4 % of a core, 400 context switches a second, 5 Python threads, and a
 median of 50 ms for `latest()`;
 a service with nothing to publish, and a subscription that waits: at most 25 wake-ups a second each.
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def measure_at_rest(checkout: Checkout, seconds: float) -> None:
-    """Measure services that nobody reads, a subscription that waits, and many buses."""
+    """Measure services without readers, a subscription that waits, and many buses."""
     with tempfile.TemporaryDirectory() as folder:
         ended = f"ulog:{write_log(Path(folder) / 'flight.ulg', range(0, 100_000, 10_000), x=1.0)}"
         for source, name in (("sim:", "one simulated vehicle"), (ended, "ended replay"), ("px4-zenoh:", "no PX4 yet")):
