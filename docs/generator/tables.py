@@ -59,7 +59,7 @@ def settings_page() -> str:
 def events_page() -> str:
     """Return the page of the events of the log, and of those of vehicles."""
     rows = [[code(name), cell(each.doc), "yes" if each.limited else "never"] for name, each in EVENTS.items()]
-    kinds = [[code(kind), ", ".join(map(code, evidence))] for kind, evidence in KINDS.items()]
+    kinds = [[code(name), ", ".join(map(code, kind.causes))] for name, kind in KINDS.items()]
     return page(
         "Events of the log, and of vehicles",
         section(

@@ -1,12 +1,13 @@
 """Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
 
-To add a kind of event: a row in KINDS (`event.py`), its flags or thresholds (`rules.py`), and a detector that yields
-the finding (`detectors.py` or `position.py`).
+To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`). One that needs more than a flag needs
+a detector, too, which yields its findings (`detectors.py` or `position.py`).
 """
 
 from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
-from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State
+from .event import ALL, WINDOW, Condition, Event, State
 from .faults import VALID, Expectation, faults_of, merge_vehicles, unknown_text
+from .kinds import KINDS, SEVERITIES, Kind, Severity
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
@@ -15,7 +16,7 @@ from .vehicle import EKF_SELECTOR, Vehicle
 
 __all__ = [
     "ACCOUNT_PARAMETER", "ALL", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MAX_VEHICLES", "MODES",
-    "RECENT", "SEVERITIES", "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation",
+    "RECENT", "SEVERITIES", "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation", "Kind",
     "Severity", "Span", "State", "Story", "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json",
     "joined", "merge_vehicles", "report_of", "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age",
     "to_clock", "unknown_text",

@@ -14,7 +14,8 @@ from nedbus.log_event import about
 from nedbus_msgs import Address
 
 from .detectors import Finding
-from .event import ALL, SEVERITIES, Condition, Event, Severity, State, state_of
+from .event import ALL, Condition, Event, State, state_of
+from .kinds import SEVERITIES, Severity
 from .rules import MAX_SILENCE, PAUSE, RECENT
 from .vehicle import Vehicle
 
@@ -206,18 +207,18 @@ class Account:
     def _update_link(self, time: float, link: str) -> None:
         is_down = ("link_down", "") in self._common.conditions
         if link and not is_down:
-            self._common.emit(Finding("link_down", "begin", "bad", link), "", time)
+            self._common.emit(Finding("link_down", "begin", link), "", time)
         elif is_down and not link:
-            self._common.emit(Finding("link_down", "end", "info", "link is back"), "", time)
+            self._common.emit(Finding("link_down", "end", "link is back"), "", time)
 
     def _update_reader(self, time: float, dropped: int, *, is_behind: bool) -> None:
         if dropped > self._dropped or is_behind:
             self._last_overload = time
             if self.overload is None:
                 text = "the reader is slower than the data: messages are dropped"
-                self._common.emit(Finding("overload", "begin", "watch", text), "", time)
+                self._common.emit(Finding("overload", "begin", text), "", time)
         elif self.overload is not None and time - self._last_overload > PAUSE:
             text = f"the reader keeps up again: {dropped} messages were dropped"
-            ended = Finding("overload", "end", "info", text, numbers={"messages": dropped})
+            ended = Finding("overload", "end", text, numbers={"messages": dropped})
             self._common.emit(ended, "", time, changed=self._last_overload)
         self._dropped = dropped

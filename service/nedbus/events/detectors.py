@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from operator import attrgetter, itemgetter
 from typing import Any, Final, Literal, cast
 
 from . import rules
-from .event import Severity
+from .kinds import Kind, Severity, flagged
 
 Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
@@ -21,18 +20,17 @@ _UNKNOWN_SATELLITES: Final = 255
 class Finding:
     """A change detected in one message; Vehicle turns it into an event.
 
-    `on_ground`: the severity while the vehicle is disarmed, None if it is the same.
+    `severity`: None if it is that of its kind.
     `first`: the text of an end if the condition has held since the first message.
     `initial`: it already held in the first message, and becomes a condition without an event.
     """
 
     kind: str
     change: Change
-    severity: Severity
     text: str
     names: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
-    on_ground: Severity | None = None
+    severity: Severity | None = None
     first: str = ""
     initial: bool = False
 
@@ -117,7 +115,7 @@ class GpsDetector(ChangeDetector):
         fix, was = after["fix_type"], before.get("fix_type")
         satellites, earlier = after["satellites_used"], before.get("satellites_used")
         if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
-            yield Finding("gps_fix_lost", "begin", "info", "no GPS fix", initial=True)
+            yield Finding("gps_fix_lost", "begin", "no GPS fix", severity="info", initial=True)
         elif was is not None and fix is not None and was != fix:
             names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
             numbers = {"fix_before": was, "fix": fix}
@@ -126,11 +124,11 @@ class GpsDetector(ChangeDetector):
                 numbers |= {"satellites_before": earlier, "satellites": satellites}
                 text += f", {earlier} satellites to {satellites}"
             if was >= rules.MIN_FIX_TYPE > fix:
-                yield Finding("gps_fix_lost", "begin", "watch", text, names, numbers)
+                yield Finding("gps_fix_lost", "begin", text, names, numbers)
             elif was < rules.MIN_FIX_TYPE <= fix:
-                yield Finding("gps_fix_lost", "end", "info", text, names, numbers)
+                yield Finding("gps_fix_lost", "end", text, names, numbers)
             elif names[0] != names[1]:
-                yield Finding("gps_fix", "once", "info", text, names, numbers)
+                yield Finding("gps_fix", "once", text, names, numbers)
         if satellites is not None and satellites != _UNKNOWN_SATELLITES:
             is_few, is_enough = satellites < rules.FEW_SATELLITES, satellites >= rules.ENOUGH_SATELLITES
             text = f"{'only ' * is_few}{satellites} satellites"
@@ -149,71 +147,90 @@ class GpsDetector(ChangeDetector):
         holds = self._active[kind] = begins or (held and not ends)
         if holds and not held:
             is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS at all
-            yield Finding(kind, "begin", "info" if is_info else "watch", text, numbers=numbers, initial=initial)
+            severity: Severity | None = "info" if is_info else None
+            yield Finding(kind, "begin", text, numbers=numbers, severity=severity, initial=initial)
         elif held and not holds:
             text = text if kind == "few_satellites" else f"{text}: over"
-            yield Finding(kind, "end", "info", text, numbers=numbers)
+            yield Finding(kind, "end", text, numbers=numbers)
+
+
+class TextDetector(ChangeDetector):
+    """Detector of PX4's own texts, each of which is an event with PX4's severity."""
+
+    def __init__(self) -> None:
+        super().__init__(("severity", "text"), self._detect_text)
+
+    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
+        """Return the finding of a message, which may repeat the one before."""
+        self._state = ()
+        return super().add(message, missing)
+
+    def _detect_text(self, _: Fields, after: Fields) -> Iterator[Finding]:
+        level, text = after["severity"], after["text"]
+        if level is not None and text:
+            severity: Severity = "bad" if level <= rules.CRITICAL else "watch" if level <= rules.WARNING else "info"
+            name = rules.LEVELS.get(level, str(level))
+            yield Finding("text", "once", text, (name,), {"level": level}, severity=severity)
 
 
 def make_detector(message: str) -> ChangeDetector | None:
-    """Return a detector for a message type, None if it has no events."""
-    flag_rules = rules.RULES.get(message, ())
-    flags = [flag for rule in flag_rules for flag in rule.flags]
+    """Return a detector for a message type, None if it has no events; a PositionDetector is for the estimate in use."""
     match message:
-        case "VehicleStatus":
-            return ChangeDetector(["arming_state", "nav_state", *flags], detect_status)
-        case "EstimatorStatusFlags":
-            return ChangeDetector([*flags, *rules.FAKE_AIDING], partial(detect_estimator, flag_rules))
-        case "FailsafeFlags":
-            return ChangeDetector(flags, partial(detect_flags, flag_rules))
+        case "VehicleLocalPosition":
+            return None
         case "SensorGps":
             return GpsDetector()
-        case "BatteryStatus":
-            return ChangeDetector(["warning", "connected"], detect_battery, context=["remaining"])
-    return ChangeDetector(["landed"], detect_landing) if message == "VehicleLandDetected" else None
+        case "LogMessage":
+            return TextDetector()
+    kinds = flagged(message)
+    fields, context, detect = _FURTHER.get(message, ((), (), None))
+
+    def detect_all(before: Fields, after: Fields) -> Iterator[Finding]:
+        yield from detect_flags(kinds, before, after)
+        if detect is not None:
+            yield from detect(before, after)
+
+    compared = [*fields, *(flag for kind in kinds for flag in kind.flags)]
+    return ChangeDetector(compared, detect_all, context=context) if compared else None
 
 
-def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
+def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the conditions that begin or end; a change from or to an unknown value is not an event."""
-    for rule in flag_rules:
+    for kind in kinds:
         found: dict[tuple[bool, Change], list[str]] = {}  # key: is an event, not an initial condition; change
-        for name in rule.flags:
+        for name in kind.flags:
             was, now = before.get(name), after.get(name)
-            if was is None and now == rule.bad and rule.initial:
+            if was is None and now == kind.bad and kind.initial:
                 found.setdefault((False, "begin"), []).append(name)
-            elif now is None and was == rule.bad:
+            elif now is None and was == kind.bad:
                 found.setdefault((False, "end"), []).append(name)
             elif was is not None and now is not None and was != now:
-                found.setdefault((True, "begin" if now == rule.bad else "end"), []).append(name)
+                found.setdefault((True, "begin" if now == kind.bad else "end"), []).append(name)
         for (is_event, change), flags in sorted(found.items()):
-            is_info = change == "end" or rule.minor.issuperset(flags)
-            text = (rule.begin if change == "begin" else rule.end).format(", ".join(rule.flags[name] for name in flags))
-            yield Finding(
-                rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), on_ground=rule.on_ground,
-                first=rule.first, initial=not is_event,
-            )  # fmt: skip
+            severity: Severity | None = "info" if kind.minor.issuperset(flags) else None
+            text = (kind.begin if change == "begin" else kind.end).format(", ".join(map(kind.flags.__getitem__, flags)))
+            names = tuple(flags)
+            yield Finding(kind.name, change, text, names, severity=severity, first=kind.first, initial=not is_event)
 
 
-def detect_estimator(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the findings of an EstimatorStatusFlags: its flags, and a fake position that nothing replaces."""
-    yield from detect_flags(flag_rules, before, after)
+def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the end of a fake position in an EstimatorStatusFlags that nothing replaces."""
     was, now = ([name for name in rules.AIDING if fields.get(name)] for fields in (before, after))
     if was and not now and rules.FAKE_AIDING.keys() >= set(was):
         text = f"no horizontal aiding: {', '.join(map(rules.AIDING.__getitem__, was))} ended, nothing else is fused"
-        yield Finding("not_aided", "once", "watch", text, on_ground="info")
+        yield Finding("not_aided", "once", text)
 
 
 def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the findings of a VehicleStatus: arming, mode, failsafe, link to the ground station."""
+    """Yield the changes of arming and mode in a VehicleStatus."""
     was, now = before.get("arming_state"), after["arming_state"]
     if now is not None and (was is None or (was == rules.ARMED) != (now == rules.ARMED)):
         kind = "armed" if now == rules.ARMED else "disarmed"
-        yield Finding(kind, "once", "info", kind, initial=was is None)
-    yield from detect_flags(rules.RULES["VehicleStatus"], before, after)
+        yield Finding(kind, "once", kind, initial=was is None)
     was, now = before.get("nav_state"), after["nav_state"]
     if was is not None and now is not None and was != now:
         names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
-        yield Finding("mode", "once", "info", f"mode {names[0]} to {names[1]}", names, {"from": was, "to": now})
+        yield Finding("mode", "once", f"mode {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
 
 def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -221,7 +238,7 @@ def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("landed"), after["landed"]
     if was is not None and now is not None and was != now:
         kind, text = ("landed", "landed") if now else ("takeoff", "took off")
-        yield Finding(kind, "once", "info", text)
+        yield Finding(kind, "once", text)
 
 
 def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -233,14 +250,22 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     if remaining is not None and 0 <= remaining <= 1:
         numbers, left = {"warning": warning, "remaining": remaining}, f", {100 * remaining:.0f} % left"
     if warning:
-        severity: Severity = "watch" if warning in (1, 7) else "bad"
+        severity: Severity | None = "watch" if warning in (1, 7) else None
         text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
-        yield Finding("battery", "begin", severity, text, numbers=numbers, initial=not before)
+        yield Finding("battery", "begin", text, numbers=numbers, severity=severity, initial=not before)
     else:
-        yield Finding(
-            "battery", "end", "info", f"battery no longer {rules.WARNINGS.get(was, was)}{left}", numbers=numbers
-        )
+        text = f"battery no longer {rules.WARNINGS.get(was, was)}{left}"
+        yield Finding("battery", "end", text, numbers=numbers)
 
 
 def _warning_of(battery: Fields) -> int | None:
     return 0 if battery["connected"] is False else cast("int | None", battery["warning"])
+
+
+# Further detection in a message, beyond flags: the fields that it compares, and those that it needs besides.
+_FURTHER: Final[Mapping[str, tuple[Sequence[str], Sequence[str], Callable[[Fields, Fields], Iterator[Finding]]]]] = {
+    "VehicleStatus": (("arming_state", "nav_state"), (), detect_status),
+    "EstimatorStatusFlags": (tuple(rules.FAKE_AIDING), (), detect_aiding),
+    "BatteryStatus": (("warning", "connected"), ("remaining",), detect_battery),
+    "VehicleLandDetected": (("landed",), (), detect_landing),
+}

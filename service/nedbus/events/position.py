@@ -10,12 +10,12 @@ from typing import Any, Final, cast
 from nedbus_msgs import RESET_COUNTERS, MapProjection, ResetTracker
 
 from .detectors import ChangeDetector, FieldReader, Fields, Finding, detect_flags
-from .event import Severity
-from .rules import JUMP_DISTANCE, JUMP_SHARE, RULES, SMALL_RESET
+from .kinds import Severity, flagged
+from .rules import JUMP_DISTANCE, JUMP_SHARE, SMALL_RESET
 
-_RULES: Final = RULES["VehicleLocalPosition"]
+_KINDS: Final = flagged("VehicleLocalPosition")
 _COMPARED: Final = (
-    "xy_valid", *(name for rule in _RULES for name in rule.flags if name != "xy_valid"), *RESET_COUNTERS.values(),
+    "xy_valid", *(flag for kind in _KINDS for flag in kind.flags if flag != "xy_valid"), *RESET_COUNTERS.values(),
     "ref_timestamp",
 )  # fmt: skip
 # Fields read when a compared one changes, with their values for messages that lack them.
@@ -79,7 +79,7 @@ class PositionDetector(ChangeDetector):
             if values["xy_valid"] and not track.origin_changed and "xy" not in track.reset:
                 step = self._unexplained_step()
             yield from self._track_jump(step)
-        yield from detect_flags(_RULES, before, after)
+        yield from detect_flags(_KINDS, before, after)
 
     def _unexplained_step(self) -> Step | None:
         """Return the motion since the last message that the velocity does not explain, None if it is small."""
@@ -100,7 +100,7 @@ class PositionDetector(ChangeDetector):
             distance, seconds = math.hypot(*jump[1:]), self.stamp / 1e6 - jump[0]
             text = f"position jumps by {distance:.1f} m within {seconds:.2f} s, without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
-            yield Finding("jump", "once", "watch", text, numbers=numbers)
+            yield Finding("jump", "once", text, numbers=numbers)
 
 
 def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
@@ -126,9 +126,8 @@ def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
         numbers["heading"] = values["delta_heading"]
         words.append(f"heading by {_signed(math.degrees(numbers['heading']), 0)} deg")
     words += [f"{name} by an unknown amount" for name in quantities if name not in explained]
-    severity: Severity = "info" if is_small else "watch"
-    text = f"reset of {', '.join(words)}"
-    return Finding("reset", "once", severity, text, tuple(quantities), numbers, on_ground="info")
+    severity: Severity | None = "info" if is_small else None
+    return Finding("reset", "once", f"reset of {', '.join(words)}", tuple(quantities), numbers, severity=severity)
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -137,16 +136,16 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
     if has and not had:
         text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
         numbers = {"latitude": after["ref_lat"], "longitude": after["ref_lon"]}
-        yield Finding("origin_set", "once", "info", text, numbers=numbers)
+        yield Finding("origin_set", "once", text, numbers=numbers)
     elif has and had:
         moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(after["ref_lat"], after["ref_lon"])
         distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
         up = up if math.isfinite(up) else 0.0
         if distance >= 0.01 or abs(up) >= 0.01:
             text = f"origin moved by {distance:.1f} m, {_signed(up)} m up"
-            severity: Severity = "info" if max(distance, abs(up)) < SMALL_RESET else "watch"
+            severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
             numbers = {"distance": distance, "up": up}
-            yield Finding("origin_moved", "once", severity, text, numbers=numbers, on_ground="info")
+            yield Finding("origin_moved", "once", text, numbers=numbers, severity=severity)
 
 
 def _signed(value: float, digits: int = 1) -> str:

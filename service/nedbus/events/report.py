@@ -12,6 +12,7 @@ from nedbus_msgs import check_vehicle
 
 from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
 from .event import Condition, Event, Seconds
+from .kinds import KINDS
 
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
@@ -92,9 +93,7 @@ def report_of(
     for name, vehicle in list(account.vehicles.items()):
         state = account.state(name, now)
         held = list(vehicle.conditions.items())
-        flags = {
-            flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if kind.endswith("_invalid") and flag
-        }
+        flags = {flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if KINDS[kind].validity}
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
         bad = (each for _, each in held if each.severity != "info")
         unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))

@@ -8,13 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from .event import WINDOW, Condition, Event, State, explain, state_of
-from .rules import KEPT_ON_REBOOT, RECENT, flags_of
+from .kinds import KINDS
+from .rules import RECENT
 
 _TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
-_MAIN_FAULTS: Final = (
-    "duplicate", "gone", "silent", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "failsafe", "battery",
-    "reboot",
-)  # fmt: skip
 _INVALID: Final = " not valid"
 _GPS: Final = "vehicle_gps_position"
 _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
@@ -78,9 +75,9 @@ def stories_of(
     `topics`: the topics that the vehicle publishes. `at`: return only the stories at this time, or the last one before.
     """
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
-    chosen = [span for kind in _MAIN_FAULTS for span in spans if span.kind == kind]
+    chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
     if not any(span.until is None if at is None else span.holds(at) for span in chosen):
-        others = [s for s in spans if s.kind not in _MAIN_FAULTS and s.severity != "info" and not s.initial]
+        others = [s for s in spans if _is_minor_fault(s)]
         chosen += [s for s in others if s.until is None] if chosen and at is None else others
     stories: list[Story] = []
     while chosen:
@@ -118,7 +115,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
     steps: list[Event | Condition] = [*events, *(each for each in unreported if each.initial)]
     for step in sorted(steps, key=_order):
         event = step.begin if isinstance(step, Condition) else step
-        keys = [(step.kind, flag) for flag in flags_of(step.kind, event.names)]
+        keys = [(step.kind, flag) for flag in KINDS[step.kind].conditions(event.names)]
         if isinstance(step, Condition):
             active |= dict.fromkeys(keys, _span(step))
         elif step.change == "end":
@@ -126,7 +123,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
         elif step.change == "once":
             spans.append(Span(step.kind, step.severity, step.text, step.time, step, until=step.time))
             if step.kind == "reboot":
-                end([key for key in active if key[0] not in KEPT_ON_REBOOT], step)
+                end([key for key in active if not KINDS[key[0]].kept_on_reboot], step)
         elif step.kind != "duplicate" or keys[0] not in active:  # each of its services reports a duplicate
             end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
             since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
@@ -168,7 +165,7 @@ def _make_story(
     stop = math.inf if until is None else until
     after += [each for each in notable if stop <= each.time <= stop + _TOGETHER and each.change == "once"]
     lacking: list[str] = []
-    if span.kind.endswith("_invalid") or span.kind in ("dead_reckoning", "reset", "jump"):
+    if KINDS[span.kind].message == "VehicleLocalPosition" and span.severity != "info":
         known = {*topics, *([_GPS] if "sensor_gps" in topics else [])}
         lacking = [each for each in _EVIDENCE if each not in known]
     return Story(
@@ -190,8 +187,13 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
     """Return a span and all that belong to the same story: parts of the estimate that became invalid with it."""
-    parts = [each for each in spans if each.kind.endswith("_invalid") and abs(each.since - span.since) <= _TOGETHER]
-    return [span, *(each for each in parts if span.kind.endswith("_invalid") and each is not span)]
+    parts = [each for each in spans if KINDS[each.kind].validity and abs(each.since - span.since) <= _TOGETHER]
+    return [span, *(each for each in parts if KINDS[span.kind].validity and each is not span)]
+
+
+def _is_minor_fault(span: Span) -> bool:
+    kind = KINDS[span.kind]
+    return not (kind.fault or kind.stateless or span.initial or span.severity == "info")
 
 
 def _span(condition: Condition) -> Span:

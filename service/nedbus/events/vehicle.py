@@ -12,27 +12,24 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
 from .detectors import ChangeDetector, Finding, make_detector
 from .event import WINDOW, Condition, Event, State, explain, state_of
+from .kinds import KINDS, kinds_of
 from .position import PositionDetector
-from .rules import FLAPPING_CHANGES, KEPT_ON_REBOOT, MAX_BURST, MAX_SILENCE, PAUSE, RECENT, RULES, flags_of
+from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, RECENT
 from .times import to_age
 
 EKF_SELECTOR: Final = "estimator_selector_status"
 """The topic that names the EKF in use."""
 
 _EKF: Final = "estimator_status_flags"
-_EKF_KINDS: Final = frozenset(rule.kind for rule in RULES["EstimatorStatusFlags"])
 _MAX_EKFS: Final = 9  # instances; 255 stands for none
 _REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
-# Groups of topics in order of preference: the best one that arrives gives the conditions of these kinds.
+# Groups of topics in order of preference: the best one that arrives gives the conditions of its message.
 _POSITIONS: Final = (DEFAULT_TOPIC, "external_ins_local_position", "estimator_local_position")
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
-_KINDS_BY_GROUP: Final = {
-    _POSITIONS: frozenset(rule.kind for rule in RULES["VehicleLocalPosition"]),
-    _RECEIVERS: frozenset({"gps_fix_lost", "few_satellites", "jamming", "spoofing"}),
-}
+_GROUPS: Final = (_POSITIONS, _RECEIVERS)
 
 
 class Vehicle:
@@ -92,7 +89,7 @@ class Vehicle:
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
-                    self.emit(Finding(kind, "end", "info", f"{address.stream} is back"), address.topic, time)
+                    self.emit(Finding(kind, "end", f"{address.stream} is back"), address.topic, time)
         # If the message before the last one is close in time, the last one was damaged: no reboot.
         if stamp < before - _REBOOT and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
@@ -112,7 +109,7 @@ class Vehicle:
         """Record a rejected message."""
         if not self._rejected.count:
             text = f"{topic} rejected: {reason}"
-            self.emit(Finding("rejected", "begin", "watch", text, names=(topic, reason)), topic, time)
+            self.emit(Finding("rejected", "begin", text, names=(topic, reason)), topic, time)
         self._rejected.add(time, 1, topic)
 
     def settle(self, time: float) -> None:
@@ -121,16 +118,16 @@ class Vehicle:
         if lost.is_over(time) or (lost.count and time - lost.begin > MAX_BURST):
             names = tuple(sorted(lost.topics))
             text = f"{lost.count} message{'s' * (lost.count > 1)} lost ({', '.join(names)})"
-            self.emit(Finding("lost", "once", "watch", text, names, {"messages": lost.count}), "", lost.begin)
+            self.emit(Finding("lost", "once", text, names, {"messages": lost.count}), "", lost.begin)
             self._lost = _Burst()
         if dropouts.is_over(time):
             duration = dropouts.count / 1e3
             text = f"the logger recorded nothing for {to_age(duration)}"
-            self.emit(Finding("dropout", "once", "info", text, numbers={"duration": duration}), "", dropouts.begin)
+            self.emit(Finding("dropout", "once", text, numbers={"duration": duration}), "", dropouts.begin)
             self._dropouts = _Burst()
         if rejected.is_over(time):
             text = f"rejections stopped ({rejected.count} message{'s' * (rejected.count > 1)})"
-            self.emit(Finding("rejected", "end", "info", text, numbers={"messages": rejected.count}), "", rejected.end)
+            self.emit(Finding("rejected", "end", text, numbers={"messages": rejected.count}), "", rejected.end)
             self._rejected = _Burst()
         for key, events in list(self._changes.items()):
             last = events[-1]
@@ -146,8 +143,8 @@ class Vehicle:
         is_mixed, was_mixed = state == "duplicate", ("duplicate", "") in self.conditions
         if self.main is not None and is_mixed != was_mixed and state not in (None, "unknown"):
             stream = self.main.stream
-            begin = Finding("duplicate", "begin", "bad", f"several publishers of {stream}: readers receive a mixture")
-            end = Finding("duplicate", "end", "info", f"one publisher of {stream} is left")
+            begin = Finding("duplicate", "begin", f"several publishers of {stream}: readers receive a mixture")
+            end = Finding("duplicate", "end", f"one publisher of {stream} is left")
             self.emit(begin if is_mixed else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
@@ -158,14 +155,15 @@ class Vehicle:
         since, stream = known.since if known is not None else self._main_time, self.main.stream
         age = max(0.0, time - since)
         text = f"silent: no {stream} for {age:.1f} s" if silent == "silent" else f"gone: no publisher of {stream}"
-        self.emit(Finding(silent, "begin", "bad", text, numbers={"age": age}), stream, time, changed=since)
+        self.emit(Finding(silent, "begin", text, numbers={"age": age}), stream, time, changed=since)
 
     def state(self, time: float) -> State:
         """Return the current state: active and flapping conditions, and single events of the last minute."""
-        found = [each for each in self.conditions.values() if each.on_ground != "info" or self.armed is not False]
+        is_flying = self.armed is not False
+        found = [each for each in self.conditions.values() if is_flying or KINDS[each.kind].on_ground != "info"]
         kinds = {each.kind for each in found}
         for event in reversed(self.recent):
-            if event.change == "once" and time - RECENT < event.time:
+            if event.change == "once" and time - RECENT < event.time and not KINDS[event.kind].stateless:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
             elif event.change == "begin" and event.kind not in kinds and self._is_suppressed(event):
                 kinds.add(event.kind)
@@ -179,10 +177,11 @@ class Vehicle:
         `changed`: the time at which the condition began or ended, if it is earlier than `time`.
         """
         changed = time if changed is None else changed
-        severity, text, lasted = found.severity, found.text, None
-        keys = [(found.kind, flag) for flag in flags_of(found.kind, found.names)]
-        if found.on_ground is not None and self.armed is False and severity != "info":
-            severity = found.on_ground
+        kind, text, lasted = KINDS[found.kind], found.text, None
+        in_air = found.severity or ("info" if found.change == "end" else kind.severity)
+        is_on_ground = kind.on_ground is not None and self.armed is False and in_air != "info"
+        severity = (kind.on_ground if is_on_ground else None) or in_air
+        keys = [(found.kind, flag) for flag in kind.conditions(found.names)]
         if found.change == "end":
             held = [self.conditions.pop(key) for key in keys if key in self.conditions]
             if known := [each.since for each in held if not each.initial]:
@@ -195,7 +194,7 @@ class Vehicle:
             self.name, found.kind, found.change, severity, text, time, boot, topic, found.numbers, found.names, lasted
         )
         if found.change == "begin":
-            condition = Condition(found.kind, found.severity, text, changed, event, found.initial, found.on_ground)
+            condition = Condition(found.kind, in_air, text, changed, event, found.initial)
             self.conditions |= dict.fromkeys(keys, condition)
             if found.initial and len(self.initial) < _MAX_RECENT:
                 self.initial.append(condition)
@@ -214,13 +213,13 @@ class Vehicle:
         used = self._primary if address.topic == _EKF else 0  # only the first sensor and battery, and the EKF in use
         if (address.instance or 0) != used and address.topic not in _POSITIONS:
             return None
-        group = next((each for each in _KINDS_BY_GROUP if address.topic in each), ())
+        group = next((each for each in _GROUPS if address.topic in each), ())
         if group:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
                 return None
             if current is not None:
-                self._supersede(current, address, _KINDS_BY_GROUP[group])
+                self._supersede(current, address)
             self._preferred[group] = address
         if group is _POSITIONS:
             self.main = address
@@ -234,27 +233,28 @@ class Vehicle:
         if type(primary) is int and primary in range(_MAX_EKFS) and primary != self._primary:
             old, new = (Address(self.name, _EKF, each) for each in (self._primary, primary))
             self._primary = primary
-            self._supersede(old, new, _EKF_KINDS)
+            self._supersede(old, new)
             self._detectors.pop(new, None)
 
-    def _supersede(self, old: Address, new: Address, kinds: frozenset[str]) -> None:
+    def _supersede(self, old: Address, new: Address) -> None:
         """Stop using a stream, and end its conditions, when a better one arrives."""
         self._detectors[old] = None
+        kinds = kinds_of(BY_TOPIC[new.topic].name)
         for each in [each for (kind, _), each in self.conditions.items() if kind in kinds]:
             text = f"{each.text}: superseded by {new.stream}"
-            ended = Finding(each.kind, "end", "info", text, each.begin.names, initial=each.initial)
+            ended = Finding(each.kind, "end", text, each.begin.names, initial=each.initial)
             self.emit(ended, new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:
         """Reset the state, and report the reboot once, even if late messages from before it follow."""
         for detector in filter(None, self._detectors.values()):
             detector.reset()
-        self.conditions = {key: each for key, each in self.conditions.items() if key[0] in KEPT_ON_REBOOT}
+        self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
         self.armed = None
         last, self._rebooted = self._rebooted, time
         if time - last >= PAUSE and ("duplicate", "") not in self.conditions:
             text = f"rebooted: time since boot {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
-            self.emit(Finding("reboot", "once", "bad", text, numbers={"before": before / 1e6}), "", time)
+            self.emit(Finding("reboot", "once", text, numbers={"before": before / 1e6}), "", time)
 
     def _report(self, event: Event) -> None:
         recent, conditions = list(self.recent), list(self.conditions.values())
@@ -268,11 +268,10 @@ class Vehicle:
         return (event.kind, event.names) in self._suppressed or (event.kind, None) in self._suppressed
 
     def _is_flapping(self, event: Event) -> bool:
-        """Return True if a condition changes too often to report each change; `settle` reports the last one."""
-        if event.change == "once":
-            return False
+        """Return True if there are too many of such events to report each; `settle` reports the last one."""
         keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in combinations
-        for key, limit in [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]:
+        limits = [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
+        for key, limit in [(keys[1], MAX_SINGLE)] if event.change == "once" else limits:
             events = self._changes.setdefault(key, deque(maxlen=limit))
             is_fast = len(events) == limit and event.time - events[0].time < WINDOW
             events.append(event)

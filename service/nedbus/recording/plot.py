@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
-from nedbus.events import SEVERITIES, Event, Severity, spans_of
+from nedbus.events import KINDS, SEVERITIES, Event, Severity, spans_of
 from nedbus.whole_file import whole_file
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
@@ -36,12 +36,6 @@ _MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
     "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
 }  # fmt: skip
 _LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
-_QUIET: Final = {
-    "mode": "mode", "armed": "armed, landed", "disarmed": "armed, landed", "takeoff": "armed, landed",
-    "landed": "armed, landed",
-}  # fmt: skip
-"""The plotted events of severity info, each with its row."""
-
 _NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
@@ -222,13 +216,13 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
         found: dict[Event, _Mark] = {}  # conditions that began together share a mark until the last of them ends
         for span in spans_of([event for event in timed if event.vehicle == vehicle]):
             event = span.begin
-            if span.initial or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
+            if span.initial or event.boot is None or (event.severity == "info" and not KINDS[event.kind].phase):
                 continue
             offset = event.boot - start - event.time
             begin = span.since + offset
             if max(first - begin, begin - last) > last - first + _NEAR:
                 continue
-            row = _QUIET.get(event.kind, event.kind.replace("_", " "))
+            row = KINDS[event.kind].row or event.kind.replace("_", " ")
             text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
             row += f" {vehicle}" if len(vehicles) > 1 else ""
             end = max(begin, last if span.until is None else min(span.until + offset, last))

@@ -9,15 +9,12 @@ import numpy as np
 from bokeh.models import BasicTicker, ColumnDataSource, DatetimeTicker, FixedTicker, HoverTool, Range1d, TapTool
 from bokeh.plotting import figure
 
-from nedbus.events import ALL, Event, Span
+from nedbus.events import ALL, KINDS, Event, Span
 
 from .column_data import replace, table
 from .stream import COLUMNS, History
 from .style import MARKERS, Style
 
-_PHASES: Final = frozenset(
-    {"armed", "disarmed", "takeoff", "landed", "mode", "reboot", "gps_fix"}
-)  # phases of a flight
 _MAX_ROWS: Final = 7  # vehicles
 _MIN_ROWS: Final = 4  # rows of height, to keep the bars of a few vehicles thin
 _PLOTS: Final = {
@@ -31,7 +28,7 @@ _OF_TRUTH: Final = {"height", "speed"}
 
 def is_notable(event: Event) -> bool:
     """Return whether an event is shown: severity bad or watch, or a phase of a flight."""
-    return event.severity != "info" or event.kind in _PHASES
+    return event.severity != "info" or KINDS[event.kind].phase
 
 
 def move(axis: Range1d, begin: float, end: float) -> None:

@@ -11,9 +11,23 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import example, given
 
-from nedbus.events import ALL, FORGOTTEN, KEPT, KINDS, MAX_VEHICLES, RECENT, WINDOW, Account, Event
+from nedbus.events import (
+    ALL,
+    FORGOTTEN,
+    KEPT,
+    KINDS,
+    MAX_VEHICLES,
+    RECENT,
+    WINDOW,
+    Account,
+    Event,
+    Kind,
+    spans_of,
+    state_at,
+    stories_of,
+)
 from nedbus.events.account import MAX_GONE
-from nedbus.events.rules import FLAPPING_CHANGES, PAUSE, RULES
+from nedbus.events.rules import FLAPPING_CHANGES, PAUSE
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, message
 
@@ -317,7 +331,7 @@ def test_estimator_flags(flight: Flight) -> None:
     assert brief(send()) == [("innovation_rejected", "end", "info")]
     assert flight.severity == "info"
     assert brief(send(fs_bad_hdg=True, cs_baro_fault=True)) == [("estimator_fault", "begin", "watch")]
-    assert brief(send(cs_gnss_pos=True, cs_baro_hgt=True))[-1] == ("estimator_fault", "end", "info")
+    assert brief(send(cs_gnss_pos=True, cs_baro_hgt=True))[0] == ("estimator_fault", "end", "info")
     assert brief(send(cs_gnss_pos=True)) == [("not_fused", "begin", "info")]  # another height is fused
     assert brief(send()) == [("not_fused", "begin", "watch")]
 
@@ -451,7 +465,7 @@ def test_flapping_is_reported_when_it_ends(flight: Flight) -> None:
 
 def test_flapping_in_combinations_is_suppressed(flight: Flight) -> None:
     """Flags of one kind that change in ever new combinations are reported twenty times, then when they rest."""
-    names = [name for rule in RULES["FailsafeFlags"] if rule.kind == "failsafe_flag" for name in rule.flags][:8]
+    names = list(KINDS["failsafe_flag"].flags)[:8]
     flags: dict[str, Any] = dict.fromkeys(names, False)
     told = flight.send("failsafe_flags", **flags)
     for number in range(1, 256):
@@ -549,7 +563,7 @@ def test_memory_is_bounded() -> None:
     assert len(known._detectors) <= 1000
     assert len(known.topics) <= 1000
     for number in range(KEPT + 100):
-        flight.status(DISARMED, vehicle="v2", nav_state=number % 2)
+        flight.wait(0.1).status(DISARMED, vehicle="v2", nav_state=number % 2)
     new, told = flight.account.events_since(0)
     assert (len(new), told) == (KEPT, KEPT + 99)
     assert flight.account.events_since(told - 1) == ([new[-1]], told)
@@ -627,8 +641,44 @@ def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
 
 def test_every_kind_is_known() -> None:
     """Each kind that may explain another one is a kind of event itself."""
-    for kind, evidence in KINDS.items():
-        assert set(evidence) <= set(KINDS), kind
+    for name, kind in KINDS.items():
+        assert set(kind.causes) <= set(KINDS), name
+
+
+def test_kind_is_added_in_one_place(flight: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of the table is all that a flag needs to be an event, a state, a cause, and a story."""
+    row = Kind(
+        "freefall", "bad", "VehicleLandDetected", ("gps_fix_lost",), fault=True, flags={"freefall": "freefall"},
+        begin="free fall", end="caught again",
+    )  # fmt: skip
+    monkeypatch.setitem(KINDS, "freefall", row)
+    flight.send("vehicle_land_detected", landed=False, freefall=False)
+    flight.gps(fix_type=3)
+    flight.wait(1.0).gps(fix_type=0)
+    [begun] = flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=True)
+    assert (begun.kind, begun.severity, begun.text) == ("freefall", "bad", "free fall")
+    assert [each.kind for each in begun.evidence] == ["gps_fix_lost"]
+    assert flight.account.state("1", flight.now).text == "free fall"
+    flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=False)
+    [story] = [each for each in stories_of(flight.account.events) if each.what == "free fall"]
+    assert [each.kind for each in story.before] == ["gps_fix_lost"]
+
+
+def test_kind_of_a_newer_service_is_an_event() -> None:
+    """An event of a kind that is not in the table, as a newer service reports it, is shown as it is."""
+    begun = Event("1", "lightning", "begin", "watch", "struck", 1.0)
+    assert [each.text for each in spans_of([begun])] == ["struck"]
+    assert state_at(spans_of([begun]), 2.0).text == "struck"
+
+
+def test_state_is_the_current_one(flight: Flight) -> None:
+    """An active condition counts before single events of the last minute, and of those the newest."""
+    flight.send()
+    flight.wait(1.0).send(xy_reset_counter=1, delta_xy=(20.0, 0.0), x=20.0)
+    flight.wait(1.0).send(xy_reset_counter=2, delta_xy=(3.0, 0.0), x=23.0)
+    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 3.0 m")
+    flight.wait(1.0).send(xy_reset_counter=2, x=23.0, dead_reckoning=True)
+    assert flight.account.state("1", flight.now).text == "dead reckoning"
 
 
 FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning", "heading_good_for_control", "xy_global")

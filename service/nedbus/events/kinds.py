@@ -1,0 +1,190 @@
+"""The table of all kinds of events: where they come from, how bad they are, and what may explain them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal, get_args
+
+from .rules import FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, REJECTED
+
+Severity = Literal["bad", "watch", "info"]
+SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
+"""Worst first. bad: the vehicle cannot do its task; watch: may become bad; info: part of any flight."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kind:
+    """A kind of event.
+
+    `severity`: of a begin or single event; `on_ground` replaces it while the vehicle is disarmed. An end is info.
+    `message`: the PX4 message that it is detected in, "" if another.
+    `causes`: kinds that may explain it. `row`: its row in plots, by default its name.
+
+    `fault`: `nedbus why` tells its story, whatever else happens. `validity`: a quantity of the estimate is not valid.
+    `correction`: the estimate is corrected, so that begins and ends of conditions may explain it.
+    `phase`: it belongs to any flight, and is shown although it is info.
+    `stateless`: it does not count towards the state of the vehicle. `kept_on_reboot`: a reboot does not end it.
+
+    A kind with `flags` is a condition that holds while any of these fields of the message has the value `bad`; the
+    value in `flags` is a label. Flags that change in the same message become one event.
+    `begin`, `end`: event texts, with `{}` for the labels. `first`: text for the end of an initial condition.
+    `minor`: flags whose begin is info. `initial`: a flag that is bad in the first message begins a condition.
+    """
+
+    name: str
+    severity: Severity = "watch"
+    message: str = ""
+    causes: tuple[str, ...] = ()
+    on_ground: Severity | None = None
+    row: str = ""
+    fault: bool = False
+    validity: bool = False
+    correction: bool = False
+    phase: bool = False
+    stateless: bool = False
+    kept_on_reboot: bool = False
+    flags: Mapping[str, str] = field(default_factory=dict)
+    begin: str = ""
+    end: str = ""
+    first: str = ""
+    bad: bool = True
+    minor: frozenset[str] = frozenset()
+    initial: bool = False
+
+    def conditions(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the flags of an event, each of which is a condition of its own; "" for a kind without flags."""
+        return names if self.flags else ("",)
+
+
+_ESTIMATE: Final = "VehicleLocalPosition"
+_FLAGS: Final = "EstimatorStatusFlags"
+_GPS: Final = "SensorGps"
+_JAMMED: Final = ("jamming", "spoofing")
+_SENSING: Final = (
+    "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided", "innovation_rejected",
+    "estimator_fault",
+)  # fmt: skip
+_INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning")
+
+
+def _validity(name: str, flag: str, quantity: str, *causes: str) -> Kind:
+    return Kind(
+        name, "bad", _ESTIMATE, ("text", *_SENSING, *causes, "reboot"), fault=True, validity=True,
+        flags={flag: quantity}, bad=False, initial=True, begin=f"{quantity} not valid", end=f"{quantity} valid again",
+        first=f"{quantity} valid for the first time",
+    )  # fmt: skip
+
+
+def _not_global(quantity: str) -> Kind:
+    return Kind(
+        f"{quantity}_not_global", "watch", _ESTIMATE, _SENSING, on_ground="info",
+        flags={f"{quantity}_global": quantity},
+        bad=False, begin=f"{quantity} has no global reference", end=f"{quantity} has a global reference",
+    )  # fmt: skip
+
+
+_ROWS: Final = (
+    Kind("duplicate", "bad", fault=True, kept_on_reboot=True),
+    Kind("gone", "bad", causes=("link_down", "battery", "silent"), fault=True, kept_on_reboot=True),
+    Kind("silent", "bad", causes=("link_down", "battery", "overload"), fault=True, kept_on_reboot=True),
+    Kind("link_down", "bad"),
+    Kind("reboot", "bad", causes=("duplicate", "battery", "gone", "silent"), fault=True, phase=True),
+    Kind(
+        "failsafe", "bad", "VehicleStatus", ("text", *_INVALID, *_SENSING, "failsafe_flag", "gcs_lost", "battery"),
+        fault=True, flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe ends",
+    ),
+    _validity("xy_invalid", "xy_valid", "xy", "dead_reckoning"),
+    _validity("z_invalid", "z_valid", "z"),
+    _validity("v_xy_invalid", "v_xy_valid", "vxy", "dead_reckoning"),
+    _validity("v_z_invalid", "v_z_valid", "vz"),
+    Kind("battery", "bad", "BatteryStatus", ("text",), fault=True),
+    Kind(
+        "dead_reckoning", "watch", _ESTIMATE, ("text", *_SENSING), flags={"dead_reckoning": "dead reckoning"},
+        initial=True, begin="dead reckoning", end="dead reckoning ends",
+    ),
+    Kind(
+        "estimator_fault", "watch", _FLAGS, ("text",), flags=FAULTS, initial=True, begin="EKF fault: {}",
+        end="EKF fault cleared: {}",
+    ),
+    Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites")),
+    Kind("few_satellites", "watch", _GPS, _JAMMED),
+    Kind("jamming", "watch", _GPS, ("text",)),
+    Kind("spoofing", "watch", _GPS, ("text",)),
+    Kind("not_aided", "watch", _FLAGS, on_ground="info"),
+    Kind(
+        "innovation_rejected", "watch", _FLAGS, ("gps_fix_lost", "gps_fix", *_JAMMED, "estimator_fault"),
+        flags=REJECTED, begin="EKF rejects {}", end="EKF accepts {} again",
+    ),
+    Kind(
+        "not_fused", "watch", _FLAGS,
+        ("gps_fix_lost", "few_satellites", *_JAMMED, "innovation_rejected", "estimator_fault"), on_ground="info",
+        flags=FUSED, bad=False, minor=frozenset(HEIGHTS), begin="no longer fused: {}", end="fused: {}",
+    ),
+    _not_global("xy"),
+    _not_global("z"),
+    Kind("jump", "watch", _ESTIMATE, ("text", "duplicate", *_SENSING, *_INVALID), correction=True),
+    Kind(
+        "reset", "watch", _ESTIMATE, ("text", *_SENSING, *_INVALID, "origin_set", "origin_moved"), on_ground="info",
+        correction=True,
+    ),
+    Kind("origin_moved", "watch", _ESTIMATE, (*_SENSING, "reset"), on_ground="info", correction=True),
+    Kind("origin_set", "info", _ESTIMATE, _SENSING, correction=True),
+    Kind(
+        "gcs_lost", "watch", "VehicleStatus", ("text",), on_ground="info",
+        flags={"gcs_connection_lost": "ground station"},
+        begin="link to the ground station lost", end="link to the ground station restored",
+    ),
+    Kind(
+        "failsafe_flag", "watch", "FailsafeFlags", ("text", *_INVALID, *_SENSING), on_ground="info",
+        flags=FAILSAFE_FLAGS, begin="failsafe flags: {}", end="failsafe flags cleared: {}",
+    ),
+    Kind("lost", "watch", causes=("link_down", "overload")),
+    Kind("rejected", "watch", kept_on_reboot=True),
+    Kind("overload", "watch"),
+    Kind("text", "watch", "LogMessage", row="PX4", phase=True, stateless=True),
+    Kind(
+        "heading_not_good", "info", _ESTIMATE, (*_SENSING, "reset", "landed"),
+        flags={"heading_good_for_control": "heading"}, bad=False, begin="heading not good for control",
+        end="heading good for control",
+    ),
+    Kind(
+        "dist_bottom_invalid", "info", _ESTIMATE, ("not_fused", "estimator_fault"),
+        flags={"dist_bottom_valid": "distance to ground"}, bad=False, begin="distance to ground not valid",
+        end="distance to ground valid",
+    ),
+    Kind("gps_fix", "info", _GPS, ("few_satellites", *_JAMMED), phase=True),
+    Kind("mode", "info", "VehicleStatus", ("text", "failsafe", "failsafe_flag", "xy_invalid", "z_invalid"), phase=True),
+    Kind("armed", "info", "VehicleStatus", row="armed, landed", phase=True),
+    Kind(
+        "disarmed", "info", "VehicleStatus", ("text", "landed", "failsafe", "failsafe_flag", "estimator_fault"),
+        row="armed, landed", phase=True,
+    ),
+    Kind("takeoff", "info", "VehicleLandDetected", row="armed, landed", phase=True),
+    Kind("landed", "info", "VehicleLandDetected", row="armed, landed", phase=True),
+    Kind("dropout", "info"),
+)  # fmt: skip
+
+
+class _Kinds(dict[str, Kind]):
+    def __missing__(self, name: str) -> Kind:
+        return Kind(name)
+
+
+KINDS: Final = _Kinds({kind.name: kind for kind in _ROWS})
+"""All kinds of events by name, the most important condition first; a name from a newer service has a plain kind."""
+
+
+def importance(kind: str) -> int:
+    """Return the place of a kind in KINDS."""
+    return [*KINDS, kind].index(kind)
+
+
+def flagged(message: str) -> list[Kind]:
+    """Return the kinds that are flags of a message."""
+    return [kind for kind in KINDS.values() if kind.message == message and kind.flags]
+
+
+def kinds_of(message: str) -> frozenset[str]:
+    """Return the names of the kinds that are detected in a message."""
+    return frozenset(kind.name for kind in KINDS.values() if kind.message == message)
