@@ -367,18 +367,27 @@ def test_moved_recording_goes_on(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ended", ["by its duration", "by Ctrl-C"])
 def test_recording_nothing_is_said(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: str) -> None:
-    """A vehicle that is not there: stderr says after 2 s that nothing came, and at the end that no file is left."""
-    path, existed = tmp_path / "a.mcap", []
+    """A vehicle that is not there: stderr says after 2 s that nothing came, and at the end that no file is left.
+
+    The recorder begins after the notice, so that its duration cannot end before.
+    """
+    path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
+
+    def record_after_notice(recorder: Recorder, stop: threading.Event, *, duration: float | None) -> None:
+        assert noticed.wait(DEADLINE)
+        record(recorder, stop, duration=duration)
 
     def end_after_notice(subscription: Subscription) -> None:
         write_notice(subscription)
         existed.append(path.exists())
+        noticed.set()
         if ended == "by Ctrl-C":
             signal.raise_signal(signal.SIGINT)
 
+    monkeypatch.setattr(Recorder, "run", record_after_notice)
     monkeypatch.setattr("nedbus.cli.commands.recordings.write_notice", end_after_notice)
     monkeypatch.setattr("nedbus.cli.commands.recordings.SILENCE_TIMEOUT", 0.1)
-    duration = ["-d", "0.5"] if ended == "by its duration" else []
+    duration = ["-d", "0.1"] if ended == "by its duration" else []
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1
     assert existed == [True]
