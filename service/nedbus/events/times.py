@@ -7,13 +7,20 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Final
+from typing import Final, Literal
 
 from nedbus_msgs import is_unix_time
 
 from .event import Event
 
 _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?")
+
+Clock = Literal["host", "vehicle", "boot", "start"]
+CLOCKS: Final[Mapping[Clock, str]] = {
+    "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
+    "boot": "seconds since boot, no message contains UTC", "start": "seconds since the start of the recording",
+}  # fmt: skip
+"""The clocks of times. UTC and seconds since boot may differ between vehicles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,25 +43,32 @@ class Times:
         utc = event.boot + (0.0 if is_unix_time(event.boot * 1e6) else self.offsets.get(event.vehicle, math.nan))
         return utc if is_unix_time(utc * 1e6) else None
 
-    def clock(self, event: Event) -> str:
-        """Return the clock of an event: "host", "vehicle" (UTC from its messages), or "boot" (since boot)."""
-        return "host" if self.is_live else "boot" if self.utc(event) is None else "vehicle"
+    def clock(self, event: Event) -> Clock:
+        """Return the clock of an event's time."""
+        if self.is_live or self.utc(event) is not None:
+            return "host" if self.is_live else "vehicle"
+        return "start" if event.boot is None else "boot"
+
+    def unit(self, event: Event) -> str:
+        """Return what to write behind the time of an event: the name of its clock."""
+        return {"boot": "s since boot", "start": "s since the start"}.get(self.clock(event), "UTC")
 
     def text(self, event: Event) -> str:
-        """Format the time of an event, without a date."""
+        """Format the time of an event, without a date, as `find` reads it: 14:05:12.3, 123.400 or +12.300."""
         utc = self.utc(event)
         if utc is None:
-            return f"{event.time if event.boot is None else event.boot:.3f}"
+            return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
         return to_clock(utc)
 
     def find(self, text: str, near: Event) -> float:
-        """Parse 14:05:12 (UTC) or seconds since boot; return the time by the account's clock [s].
+        """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the account's time [s].
 
         `near`: an event of the same vehicle; the closest such time is returned.
 
-        Raises ValueError for other text, or if no message gives UTC or the time since boot.
+        Raises ValueError for other text, or if no message gives UTC or the time since boot, or live data has no start.
         """
-        if found := _CLOCK.fullmatch(text.strip()):
+        text = text.strip()
+        if found := _CLOCK.fullmatch(text):
             utc = self.utc(near)
             if utc is None:
                 raise ValueError("no message of this vehicle gives UTC")
@@ -68,6 +82,10 @@ class Times:
             seconds = math.nan
         if not math.isfinite(seconds):
             raise ValueError("not a time")
+        if text[0] in "+-":
+            if self.is_live:
+                raise ValueError("live data has no start to count from")
+            return seconds
         if near.boot is None and self.is_live:
             raise ValueError("no message of this vehicle gives the time since boot")
         return near.time + seconds - (near.time if near.boot is None else near.boot)

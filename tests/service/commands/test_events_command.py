@@ -45,6 +45,7 @@ WHY = """\
   missing topics that may explain it: vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags; \
 PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)
 """
+AT = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
 
 
 def write_flight(path: Path, *, fault: bool = True) -> Path:
@@ -222,7 +223,7 @@ def test_mistake_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ..
     (tmp_path / "note.txt").write_text("no log")
     (tmp_path / "not.ulg").write_text("no log")
     shown = run_command(*(str(log) if each == "LOG" else each for each in arguments))
-    text = text.replace("LOG", str(log)).replace("EXPECTED", "expected 14:05:12 (UTC), or seconds since boot")
+    text = text.replace("LOG", str(log)).replace("EXPECTED", f"expected {AT}")
     assert shown.err.startswith(text)
     assert (shown.exit_code, shown.out) == (code, "")
     assert len(shown.err.splitlines()) == 1

@@ -18,7 +18,18 @@ from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import SEVERITIES, WINDOW, AccountReport, Event, Story, Times, Vehicle, by_vehicle, stories_of
+from nedbus.events import (
+    CLOCKS,
+    SEVERITIES,
+    WINDOW,
+    AccountReport,
+    Event,
+    Story,
+    Times,
+    Vehicle,
+    by_vehicle,
+    stories_of,
+)
 from nedbus.monitoring import Observer
 from nedbus.sources import FileAccount, read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
@@ -27,6 +38,7 @@ _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
 )  # fmt: skip
 _MAX_TEXT: Final = 400  # characters of a peer's text
+_AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
 _DAY: Final = 86_400.0
 
 
@@ -95,7 +107,7 @@ def why(
     files: FilesArgument = None,
     *,
     vehicle: VehicleOption = ANY,
-    at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC) or seconds since boot")] = None,
+    at: Annotated[str | None, typer.Option(metavar="TIME", help=_AT)] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Explain the faults of vehicles, live or from a file.
@@ -156,7 +168,7 @@ def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float
     try:
         return times.find(at, events[-1])
     except ValueError as exc:
-        raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
+        raise ConfigError("--at", f"{at!r}: {exc}: expected {_AT}") from exc
 
 
 def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> Iterator[str]:
@@ -255,13 +267,8 @@ def _held_from_start(vehicle: Vehicle) -> str:
 
 
 def _write_clock(found: Sequence[Event], times: Times) -> None:
-    clocks = {times.clock(event) for event in found}
-    texts = {
-        "boot": "seconds since boot, no message contains UTC", "vehicle": "UTC, from the vehicle's messages",
-        "host": "UTC, from the clocks of the hosts",
-    }  # fmt: skip
-    if clocks:
-        write_stderr(f"times: {'; '.join(texts[each] for each in sorted(clocks))}")
+    if clocks := {times.clock(event) for event in found}:
+        write_stderr(f"times: {'; '.join(CLOCKS[each] for each in sorted(clocks))}")
 
 
 def _to_fields(event: Event, times: Times) -> dict[str, object]:
