@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Annotated, Final
 
 import zenoh
@@ -22,7 +23,17 @@ from nedbus.client.health.stream_health import Health
 from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
-from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, while_open
+from nedbus.transport import (
+    MAX_ANSWERS,
+    MAX_REPLY_BYTES,
+    AliveTokens,
+    RawSample,
+    Session,
+    ask,
+    query,
+    wait_for_answers,
+    while_open,
+)
 from nedbus_msgs import (
     ANY,
     MESSAGES,
@@ -46,7 +57,7 @@ _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rej
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
-_SCHEMA_TIMEOUT: Final = 2.0  # s for a busy publisher to reply
+_SCHEMA_TIMEOUT: Final = 3.0  # s for a busy publisher to reply, as long as readers wait for it
 _POLL: Final = 0.002  # s between polls for tokens
 
 
@@ -299,12 +310,17 @@ def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
 
 
 def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
-    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins."""
+    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
+
+    Returns once all are found: a publisher that is stopped, or behind a bad link, does not delay it.
+    """
     found: dict[Wanted, dict[str, str]] = {}
     keys = {
         schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
     }
-    for key, content in _parse(query(session, *keys, timeout=_SCHEMA_TIMEOUT, newest=False)):
+    queries = [ask(session, key, timeout=_SCHEMA_TIMEOUT) for key in keys]
+    replies = islice(wait_for_answers(queries), MAX_ANSWERS)
+    for key, content in _parse(reply.ok for reply in replies if reply.ok is not None):
         name = key.rpartition("/")[2]
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
@@ -316,6 +332,8 @@ def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -
                 which = short_hash(name, types) if types else parsed.wire
                 if len(fields) == len(parsed.fields) and (name, which) in wanted:
                     found.setdefault((name, which), fields)
+        if len(found) == len(wanted):
+            break
     return found
 
 

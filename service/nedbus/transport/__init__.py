@@ -2,7 +2,7 @@
 
 from .alive_tokens import AliveTokens, alive_keys
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
-from .queries import MAX_ANSWERS, Answers, ask, query
+from .queries import MAX_ANSWERS, Answers, ask, query, wait_for_answers
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
@@ -52,5 +52,5 @@ __all__ = [
     "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload", "is_forked", "log_refusals",
     "node_token", "open_client", "open_router", "probe_writes", "publisher_token", "px4_publishers_key_expr", "query",
     "read_router_config", "request_samples", "require_unforked", "router_endpoints", "split_endpoint",
-    "subscription_token", "translate_error", "while_open",
+    "subscription_token", "translate_error", "wait_for_answers", "while_open",
 ]  # fmt: skip

@@ -16,10 +16,13 @@ from typing import Any, Final
 import hypothesis
 import msgpack
 import pytest
+import zenoh
 from hypothesis import strategies as st
 
 import nedbus
 from nedbus import Counts
+from nedbus.client import discovery
+from nedbus.client.receiving import layout_lookup
 from nedbus.recording.mcap_writer import RecordingWriter
 from nedbus.recording.recorder import Recorder
 from nedbus.transport import Session, open_router, query
@@ -60,6 +63,15 @@ def as_dict(message: Any) -> dict[str, object]:
     return dict(message._asdict() if hasattr(message, "_asdict") else message.model_dump())
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _patient_lookups() -> Iterator[None]:
+    """Let readers wait for definitions until the deadline: a message whose lookup takes too long is invalid."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(discovery, "_SCHEMA_TIMEOUT", 2 * DEADLINE)
+        patch.setattr(layout_lookup, "_PATIENCE", DEADLINE)
+        yield
+
+
 @pytest.fixture(scope="module")
 def router() -> Iterator[str]:
     where = free_endpoint()
@@ -73,7 +85,7 @@ class Reader:
 
     def __init__(self, endpoint: str, form: str) -> None:
         self.form = form
-        self.bus = nedbus.connect(endpoint)
+        self.bus = nedbus.connect(endpoint, timeout=DEADLINE)
         self.subscription = self.bus.subscribe(TOPIC, mode="every")
         self.read: list[Sent] = []
 
@@ -107,7 +119,7 @@ class Network:
     def restart(self, firmware: str) -> None:
         if firmware in self.buses:
             self.buses[firmware].close()
-        bus = self.buses[firmware] = nedbus.connect(self.endpoint)
+        bus = self.buses[firmware] = nedbus.connect(self.endpoint, timeout=DEADLINE)
         if "1" in self.publishers:
             self.publishers["1"][1].close()
         for vehicle in (firmware, "1"):
@@ -230,6 +242,20 @@ def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, raw: Session
             return subscription.counts.invalid == 1
 
         wait_for(is_rejected, what="the message to be rejected")
+
+
+def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+    """A message is read once one publisher has described it, while another one, which is stopped, does not answer."""
+    held: list[zenoh.Query] = []
+    publisher_of(bus, "A").publish(fields_of("A", 1))
+    with (
+        answering(raw, f"nedbus/@schema/peer/{NAME}", held.append),
+        closing(Reader(endpoint, "models").bus) as reader,
+        reader.subscribe(TOPIC, mode="every") as subscription,
+    ):
+        assert as_dict(subscription.receive(DEADLINE).message) == fields_of("A", 1)
+        assert held
+        held.clear()
 
 
 def test_payload_of_another_size_is_invalid(bus: nedbus.Bus, raw: Session) -> None:
