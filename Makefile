@@ -69,6 +69,7 @@ bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck reade
 	$(BIN)/python -m benchmarks.record --seconds 60
 	$(BIN)/python -m benchmarks.readers.busy
 	$(BIN)/python -m benchmarks.readers.stuck
+	$(BIN)/python -m benchmarks.events
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 	$(BIN)/python -m benchmarks.restart
