@@ -112,14 +112,15 @@ def state_of(conditions: Iterable[Condition]) -> State:
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
     """Return the possible causes of an event: within WINDOW seconds, or still active.
 
-    Of each kind the latest, but all texts. Begins explain a begin, ends explain an end; both explain a correction of
-    the estimate.
+    Of each kind the latest, but all texts. Begins explain a begin, ends since the begin explain an end; both explain a
+    correction of the estimate.
     """
     kind, latest = KINDS[event.kind], dict[object, Event]()
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""
+    earliest = event.time - min(WINDOW, WINDOW if event.lasted is None else event.lasted)
     for each in before:
         is_bad = each.severity != "info" or event.change == "end" or kind.correction
-        is_near = event.time - WINDOW <= each.time <= event.time
+        is_near = earliest <= each.time <= event.time
         is_link = each.kind == "link_down"  # its losses are detected after its end
         is_of_change = is_link or (is_bad and each.change != excluded)
         if each is not event and each.kind in kind.causes and is_near and is_of_change:

@@ -42,12 +42,16 @@ _FAILSAFE_FLAGS: Final = (
     "angular_velocity_invalid", "attitude_invalid", "local_altitude_invalid", "local_position_invalid",
     "local_position_invalid_relaxed", "local_velocity_invalid", "global_position_invalid",
     "global_position_invalid_relaxed", "auto_mission_missing", "home_position_invalid", "manual_control_signal_lost",
-    "battery_low_remaining_time", "battery_unhealthy", "fd_critical_failure", "fd_esc_arming_failure",
-    "fd_imbalanced_prop", "fd_motor_failure", "fd_alt_loss", "geofence_breached", "mission_failure",
+    "battery_low_remaining_time", "battery_unhealthy", "geofence_breached", "mission_failure",
     "vtol_fixed_wing_system_failure", "wind_limit_exceeded", "flight_time_limit_exceeded", "position_accuracy_low",
     "navigator_failure", "parachute_unhealthy", "traffic_avoidance_unhealthy", "remote_id_unhealthy", "gnss_lost",
 )  # fmt: skip
-FAILSAFE_FLAGS: Final[Mapping[str, str]] = {name: name.replace("_", " ") for name in _FAILSAFE_FLAGS}
+FAILSAFE_FLAGS: Final[Mapping[str, str]] = {
+    **{name: name.replace("_relaxed", " by relaxed limits").replace("_", " ") for name in _FAILSAFE_FLAGS},
+    "fd_critical_failure": "attitude or altitude beyond its limit", "fd_esc_arming_failure": "ESC failed to arm",
+    "fd_imbalanced_prop": "imbalanced propeller", "fd_motor_failure": "motor failure",
+    "fd_alt_loss": "uncommanded loss of altitude",
+}  # fmt: skip
 
 RECENT: Final = 60.0
 """Seconds during which a single event counts towards the state of a vehicle."""

@@ -10,8 +10,9 @@ from typing import Final
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS
 from .rules import RECENT
+from .times import Times
 
-_TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
+TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
 _INVALID: Final = " not valid"
 POSITIONS: Final = frozenset({"vehicle_local_position", "external_ins_local_position", "estimator_local_position"})
 """Topics with the validity of the position."""
@@ -38,12 +39,14 @@ class Span(Condition):
 class Story:
     """One fault of a vehicle.
 
-    `what`: its text. `since`, `until`: by the account's clock [s]; `until` is None while it is active.
+    `spans`: its conditions, the main one first. `what`: their text.
+    `since`, `until`: by the account's clock [s]; `until` is None while it is active.
     `begin`: the event that began it, None if it already held in the first message. `end`: the event that ended it.
     `before`: the evidence, oldest first. `meanwhile`: other events until its end. `after`: events at its end.
     `lacking`: topics that could have evidence, but are not in the data.
     """
 
+    spans: tuple[Span, ...]
     what: str
     since: float
     until: float | None
@@ -56,8 +59,12 @@ class Story:
 
     @property
     def is_bad(self) -> bool:
-        """True if its severity is bad, or it already held in the first message."""
-        return self.begin is None or self.begin.severity == "bad"
+        """True if its severity is bad."""
+        return any(each.severity == "bad" for each in self.spans)
+
+    def when(self, times: Times, now: float) -> str:
+        """Return when it held, and for how long; `now` is the end of a file."""
+        return times.period(self.begin, self.end, (now if self.until is None else self.until) - self.since)
 
     @property
     def topics(self) -> list[str]:
@@ -158,21 +165,21 @@ def _make_story(
         used.update(new)
         return new
 
-    before: list[Event] = []
-    if not span.initial:
-        near = (each for each in events if span.since - WINDOW <= each.time <= span.since)
-        held = (each for each in spans if not each.initial and each.since <= span.since < (each.until or math.inf))
-        before = unused(explain(span.begin, near, held))
+    near = [each for each in events if span.since - WINDOW <= each.time <= span.since]
+    held = (s for s in spans if s.initial == span.initial and s.since <= span.since < (s.until or math.inf))
+    before = unused(explain(span.begin, [] if span.initial else near, held))
+    if not before and not span.initial:
+        before = unused(e for e in near if e.change != "end" and not (KINDS[e.kind].phase and e.severity == "info"))
     after = unused(explain(end, events)) if end else []
     notable = [each for each in events if each not in used and each.is_notable]
     stop = math.inf if until is None else until
-    after += [each for each in notable if stop <= each.time <= stop + _TOGETHER and each.change == "once"]
+    after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
     lacking: list[str] = []
     if KINDS[span.kind].message == "VehicleLocalPosition" and span.severity != "info":
         known = {*topics, *([_GPS] if "sensor_gps" in topics else [])}
         lacking = [each for each in _EVIDENCE if each not in known]
     return Story(
-        what, span.since, until, None if span.initial else span.begin, end, tuple(before),
+        tuple(group), what, span.since, until, None if span.initial else span.begin, end, tuple(before),
         tuple(each for each in notable if span.since <= each.time < stop), tuple(after), tuple(lacking),
     )  # fmt: skip
 
@@ -182,21 +189,26 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
     kept: list[Story] = []
     for story in stories:
         parts = {event for each in kept if each.is_bad for event in (*each.meanwhile, *each.after)}
-        if story.begin not in parts:
+        if story.spans[0].begin not in parts:
             kept.append(story)
     causes = {event for story in kept if story.is_bad for event in story.before}
-    return [story for story in kept if story.is_bad or story.begin not in causes]
+    return [story for story in kept if story.is_bad or story.spans[0].begin not in causes]
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
-    """Return a span and all that belong to the same story: parts of the estimate that became invalid with it."""
-    parts = [each for each in spans if KINDS[each.kind].validity and abs(each.since - span.since) <= _TOGETHER]
-    return [span, *(each for each in parts if KINDS[span.kind].validity and each is not span)]
+    """Return a span and all that belong to the same story: validity lost with it, or held throughout like it."""
+
+    def is_part(each: Span) -> bool:
+        if KINDS[span.kind].validity:
+            return KINDS[each.kind].validity and abs(each.since - span.since) <= TOGETHER
+        return span.initial and each.initial and each.severity == span.severity == "watch"
+
+    return [span, *(each for each in spans if each is not span and is_part(each))]
 
 
 def _is_minor_fault(span: Span) -> bool:
     kind = KINDS[span.kind]
-    return not (kind.fault or kind.stateless or span.initial or span.severity == "info")
+    return not (kind.fault or kind.stateless or span.severity == "info")
 
 
 def _span(condition: Condition) -> Span:

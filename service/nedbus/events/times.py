@@ -60,6 +60,16 @@ class Times:
             return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
         return to_clock(utc)
 
+    def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
+        """Format when something held, and for how long [s]; None: from the first message, or until the last one."""
+        still = f"until {'now' if self.is_live else 'the end'}"
+        if begin is None:
+            return f"from the first message on, {still} ({to_age(lasted)})"
+        if end is None and lasted == 0:
+            return f"at {self.text(begin)} {self.unit(begin)}"
+        until = f"{self.unit(begin)}, {still}" if end is None else f"to {self.text(end)} {self.unit(end)}"
+        return f"from {self.text(begin)} {until} ({to_age(lasted)})"
+
     def find(self, text: str, near: Event) -> float:
         """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the account's time [s].
 

@@ -1,36 +1,38 @@
-"""Verdict on a vehicle: one or two sentences that say whether it is usable, since when, for how long, and why not."""
+"""Verdict on a vehicle: whether it is usable, since when, for how long, and why, in one or two sentences."""
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
 
 from .event import ALL, WINDOW, Condition, Event
-from .story import POSITIONS, Story, stories_of
-from .times import Times, to_age
+from .kinds import importance
+from .story import POSITIONS, TOGETHER, Story, stories_of
+from .times import Times
 
-_LENGTH: Final = 285  # characters of a verdict: three lines of 100 columns with the name of the vehicle
-_QUOTED: Final = 80  # characters of one event in a verdict
-_TOGETHER: Final = 1.0  # s after the begin of a fault in which PX4's texts are about it
+_LENGTH: Final = 275  # characters of a verdict: three lines of 100 columns
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """The verdict on a vehicle.
 
-    `text`: for people; it names the clock of its times, and is not escaped: it may quote texts of the vehicle.
-    `usable`: False if the vehicle could not do its task, now or at the time of the fault; True if it could throughout;
-    None if the data does not tell.
-    `begin`: the event that began the worst fault, None without a fault, or if it held in the first message.
-    `since`, `until`: of that fault, by the account's clock [s]; `until` is None while it is active.
+    `text`: for people; it names the clock of its times, and may quote texts of the vehicle, so escape it.
+    `usable`: False if the vehicle could not do its task because of the fault, True if it could in spite of it; None if
+    the data does not have the validity of a position.
+    `begin`, `end`: the events that began and ended the worst fault, None if it held in the first or last message.
+    `since`, `until`: when it held, by the account's clock [s]; `until` is None while it is active.
     `cause`: its evidence in order of time. `faults`: the number of stories.
     """
 
     text: str
     usable: bool | None
     begin: Event | None = None
+    end: Event | None = None
     since: float | None = None
     until: float | None = None
     cause: tuple[Event, ...] = ()
@@ -53,71 +55,76 @@ def verdict_of(
     active after the last event. `topics`: the topics that it publishes. `end`: now, or the end of the file, by the
     account's clock [s]. `at`: the moment in question, None for all of the data.
     """
-    own = [event for event in events if event.vehicle in (vehicle, ALL)]
-    stories = stories_of(own, held, topics=topics, at=at)
-    is_known = not POSITIONS.isdisjoint(topics)
-    length = "the history of the services" if times.is_live else f"{end:.0f} s"
-    unknown = "; whether the position is valid is unknown, as no topic of the data has it"
+    events = [event for event in events if event.vehicle in (vehicle, ALL)]
+    stories = stories_of(events, held, topics=topics, at=at)
+    parts = {event for story in stories if story.is_bad for event in story.meanwhile}
+    is_now = times.is_live and at is None
+
+    def order(story: Story) -> tuple[bool, bool, bool, int, float]:
+        has_ended = is_now and story.until is not None
+        return not story.is_bad, story.begin in parts, has_ended, importance(story.spans[0].kind), -_size(story)
+
+    stories.sort(key=order)
+    known = None if POSITIONS.isdisjoint(topics) else True
     if not stories:
-        return Verdict(f"no faults in {length}{'' if is_known else unknown}", True if is_known else None)
-    worst = min(stories, key=_order)
-    usable = False if worst.is_bad else True if is_known else None
-    cause = _cause(worst)
-    head = f"usable in all {length}, but " if usable and at is None else ""
-    text = f"{head}{worst.what[: 2 * _QUOTED]} {_when(worst, times, end)}."
-    text = f"{text} {_why(worst, cause, times, _LENGTH - len(text))}".rstrip()
-    return Verdict(text, usable, worst.begin, worst.since, worst.until, cause, len(stories))
+        length = "in the history of the services" if times.is_live else f"in {end:.0f} s"
+        unknown = "" if known else "; no topic in the data has the validity of a position"
+        return Verdict(f"no faults {length}{unknown}", known)
+    worst = stories[0]
+    is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
+    usable = False if worst.is_bad and is_then else known
+    head = "" if is_then else "no fault then; the nearest: "
+    head = "position valid throughout, but " if usable and is_then else head
+    cause = _cause(worst, events)
+    text = f"{head}{_cut(worst.what)} {worst.when(times, end)}."
+    for part in (*_why(worst, cause, times), *_also(worst, cause, stories, times)):
+        if len(text) + len(part) < _LENGTH:
+            text = f"{text} {part}."
+    return Verdict(text, usable, worst.begin, worst.end, worst.since, worst.until, cause, len(stories))
 
 
-def _order(story: Story) -> tuple[bool, bool, float]:
-    """Return the sort key of a story: bad ones first, then active ones, then the longest."""
-    return not story.is_bad, story.until is not None, story.since - (story.until or story.since)
+def _cause(story: Story, events: Iterable[Event]) -> tuple[Event, ...]:
+    """Return the evidence of a fault in order of time: what preceded it, and new texts of PX4 until a second after."""
+    earlier = {each.text for each in events if each.kind == "text" and each.time < story.since - WINDOW}
+    around = [*story.before, *(e for e in story.meanwhile if e.kind == "text" and e.time <= story.since + TOGETHER)]
+    found = (each for each in around if each.kind != "text" or each.text not in earlier)
+    return tuple(sorted(found, key=lambda each: (each.time, each.kind != "text")))
 
 
-def _when(story: Story, times: Times, end: float) -> str:
-    """Return when a fault held, and for how long."""
-    lasted = to_age((end if story.until is None else story.until) - story.since)
-    still = "" if story.until is not None else " until now" if times.is_live else " until the end"
-    if story.begin is None:
-        return f"from the first message on{still} ({lasted})"
-    begin, clock = times.text(story.begin), times.unit(story.begin)
-    if story.until == story.since:
-        return f"at {begin} {clock}"
-    if story.end is None:
-        return f"from {begin} {clock}{still} ({lasted})"
-    return f"from {begin} to {times.text(story.end)} {clock} ({lasted})"
+def _why(story: Story, cause: Sequence[Event], times: Times) -> list[str]:
+    """Return sentences with the evidence of a fault, and with what is missing."""
+    texts = sorted((e for e in cause if e.kind == "text"), key=lambda each: each.numbers.get("level", 0.0))[:2]
+    shown = [each for each in cause if each in texts or each in [e for e in cause if e.kind != "text"][-3:]]
+    groups = groupby(shown, key=times.text)
+    listed = "; ".join(f"{time} {', '.join(dict.fromkeys(map(_quoted, group)))}" for time, group in groups)
+    none = [] if story.begin is None else [f"No evidence in the {WINDOW:.0f} s before"]
+    missing = [f"Not in the data: {', '.join(story.lacking)}"] if story.lacking else []
+    return [f"Evidence: {listed}"] * bool(listed) + none * (not listed) + missing
 
 
-def _cause(story: Story) -> tuple[Event, ...]:
-    """Return the evidence of a fault in order of time: what preceded it, and PX4's texts about it."""
-    texts = [each for each in story.meanwhile if each.kind == "text" and each.time <= story.since + _TOGETHER]
-    return tuple(sorted((*story.before, *texts), key=lambda each: (each.time, each.kind != "text")))
+def _also(worst: Story, cause: Iterable[Event], stories: Iterable[Story], times: Times) -> list[str]:
+    """Return a sentence for each kind of other faults, with its largest one."""
+    told = {worst.begin, *cause}
+    by_kind: dict[str, list[Story]] = {}
+    for story in stories:
+        by_kind.setdefault(story.spans[0].kind, []).append(story)
+    largest = [(max(group, key=_size), len(group)) for group in by_kind.values()]
+    return [
+        f"Also{f', {count} times,' if count > 1 else ''} {_cut(each.what, 60)} at {times.text(each.begin)}"
+        for each, count in largest
+        if each.begin is not None and each.begin not in told
+    ]
 
 
-def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> str:
-    """Return the evidence, PX4's own texts if there is not enough room for all, or what is missing."""
-    missing = f"Not in the data: {', '.join(story.lacking)}." if story.lacking else ""
-    if not cause:
-        none = "" if story.begin is None else f"No evidence in the {WINDOW:.0f} s before. "
-        return f"{none}{missing}"
-    chosen: list[Event] = []
-    text = ""
-    for each in sorted(cause, key=lambda each: each.kind != "text"):
-        wider = sorted((*chosen, each), key=cause.index)
-        longer = f"Before it: {_listed(wider, times)}."
-        if text and len(longer) > room - len(missing):
-            continue
-        chosen, text = wider, longer
-    return f"{text} {missing}".rstrip()
-
-
-def _listed(events: Iterable[Event], times: Times) -> str:
-    """Return times with their events."""
-    groups = groupby(events, key=times.text)
-    return "; ".join(f"{time} {', '.join(dict.fromkeys(map(_quoted, group)))}" for time, group in groups)
+def _size(story: Story) -> float:
+    """Return the duration of a condition, the largest number of a single event."""
+    numbers = map(abs, story.begin.numbers.values()) if story.begin and story.until == story.since else ()
+    return max(numbers, default=(story.until or math.inf) - story.since)
 
 
 def _quoted(event: Event) -> str:
-    """Return the text of an event; PX4's own in quotes."""
-    text = event.text if len(event.text) <= _QUOTED else f"{event.text[: _QUOTED - 3]}..."
-    return f'PX4: "{text}"' if event.kind == "text" else text
+    return f'PX4: "{_cut(event.text)}"' if event.kind == "text" else _cut(event.text)
+
+
+def _cut(text: str, width: int = 80) -> str:
+    return textwrap.shorten(text, width, placeholder="...")

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from nedbus.events import Times, Verdict, verdict_of
+import textwrap
+from dataclasses import replace
+from typing import Any
+
+from nedbus.events import ALL, Condition, Event, Times, Verdict, verdict_of
+from nedbus.events.detectors import Finding
 
 from .flight import ARMED, Flight
 
@@ -34,7 +39,7 @@ def test_verdict_of_a_fault_that_lasts() -> None:
     lose_gps(flight)
     found = verdict(flight)
     assert found.text == (
-        "xy and vxy not valid from 16.000 s since boot until the end (1.0 s). Before it: 11.000 GPS fix 3D to none, "
+        "xy and vxy not valid from 16.000 s since boot, until the end (1.0 s). Evidence: 11.000 GPS fix 3D to none, "
         "12 satellites to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
         "failsafe_flags."
     )
@@ -42,7 +47,7 @@ def test_verdict_of_a_fault_that_lasts() -> None:
     assert found.begin is not None
     assert found.begin.kind == "xy_invalid"
     assert [each.kind for each in found.cause] == ["gps_fix_lost", "few_satellites", "dead_reckoning"]
-    assert "until now (1.0 s)" in verdict(flight, times=LIVE).text
+    assert "UTC, until now (1.0 s)" in verdict(flight, times=LIVE).text
 
 
 def test_verdict_of_a_fault_that_ended() -> None:
@@ -51,7 +56,7 @@ def test_verdict_of_a_fault_that_ended() -> None:
     lose_gps(flight)
     flight.wait(1.0).send()
     found = verdict(flight)
-    assert found.text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot (2.0 s). Before it: ")
+    assert found.text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot (2.0 s). Evidence: ")
     assert (found.usable, found.since, found.until) == (False, flight.now - 2.0, flight.now)
 
 
@@ -63,7 +68,7 @@ def test_verdict_without_faults() -> None:
     assert (found.text, found.usable, found.faults) == ("no faults in 105 s", True, 0)
     assert verdict(flight, times=LIVE).text == "no faults in the history of the services"
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
-    assert (unknown.usable, "whether the position is valid is unknown" in unknown.text) == (None, True)
+    assert (unknown.usable, "no topic in the data has the validity of a position" in unknown.text) == (None, True)
 
 
 def test_verdict_of_a_vehicle_that_stays_usable() -> None:
@@ -76,6 +81,111 @@ def test_verdict_of_a_vehicle_that_stays_usable() -> None:
     flight.gps()
     found = verdict(flight)
     assert found.usable is True
-    assert found.text.startswith(
-        "usable in all 106 s, but GNSS jamming: indicator 100 from 11.000 to 16.000 s since boo"
+    assert found.text.startswith("position valid throughout, but GNSS jamming: indicator 100 from 11.000 to 16.000 s ")
+
+
+def text(flight: Flight, words: str, level: int = 4) -> None:
+    """Have PX4 say something now."""
+    severity: Any = "bad" if level < 3 else "watch" if level < 5 else "info"
+    said = Finding("text", "once", words, ("warning",), {"level": level}, severity)
+    flight.account.vehicles["1"].emit(said, "log_message", flight.now)
+
+
+def test_evidence_of_an_end_is_not_earlier_than_its_begin() -> None:
+    """A receiver that was back before the position became invalid does not explain that it is valid again."""
+    flight = Flight()
+    flight.gps(fix_type=0)
+    flight.fly(1)
+    flight.gps()
+    flight.wait(1.0).send(xy_valid=False)
+    flight.wait(2.0).send()
+    ended = flight.account.events_since(0)[0][-1]
+    assert (ended.kind, ended.change, ended.evidence) == ("xy_invalid", "end", ())
+    assert "GPS" not in verdict(flight).text
+
+
+def test_verdict_quotes_px4() -> None:
+    """PX4's own texts are evidence, in order of time with the rest, but not what it had said all along."""
+    flight = Flight()
+    flight.send()
+    for _ in range(3):
+        text(flight, "No manual control input", 3)
+        flight.fly(6)
+    text(flight, "No manual control input", 3)
+    flight.wait(1.0).send(dead_reckoning=True)
+    text(flight, "GNSS fix too low")
+    flight.wait(1.0).send(dead_reckoning=True, xy_valid=False)
+    flight.wait(0.2)
+    text(flight, "Failsafe activated", 2)
+    flight.wait(5.0).send(xy_valid=False)
+    assert verdict(flight).text.startswith(
+        "xy not valid from 30.000 s since boot, until the end (5.2 s). Evidence: 29.000 "
+        'PX4: "GNSS fix too low", dead reckoning; 30.200 PX4: "Failsafe activated". Not in the data: '
     )
+
+
+def test_verdict_has_evidence_of_any_kind_before_it_has_none() -> None:
+    """What happened shortly before is shown, even if it is no known cause; phases of the flight are not."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.send("failsafe_flags", fd_critical_failure=False)
+    flight.send(heading_good_for_control=True)
+    flight.wait(0.5).send(heading_good_for_control=False)
+    flight.wait(0.5).status(ARMED, nav_state=3)
+    flight.send("failsafe_flags", fd_critical_failure=True)
+    found = verdict(flight)
+    assert "failsafe flags: attitude or altitude beyond its limit" in found.text
+    assert [each.kind for each in found.cause] == ["heading_not_good"]
+
+
+def held(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
+    """Return a condition that held in the first message."""
+    begin = Event("1", kind, "begin", "watch", words, since, 10.0, names=(flag,))
+    return Condition(kind, "watch", words, since, begin, initial=True)
+
+
+def test_verdict_of_what_holds_from_begin_to_end() -> None:
+    """Conditions of a whole flight are one fault, and evidence of a position that was never valid."""
+    conditions = [
+        held("gps_fix_lost", "", "no GPS fix"), held("xy_not_global", "xy_global", "xy has no global reference", 0.1),
+    ]  # fmt: skip
+    topics = ["vehicle_local_position", "vehicle_gps_position"]
+    found = verdict_of("1", [], conditions, topics=topics, times=Times(), end=62.0)
+    assert found.text == (
+        "position valid throughout, but no GPS fix; xy has no global reference from the first message on, "
+        "until the end (62.0 s)."
+    )
+    assert (found.usable, found.faults) == (True, 1)
+    invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
+    found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
+    assert found.text.startswith("xy not valid from the first message on, until the end (62.0 s). ")
+    assert [each.kind for each in found.cause] == ["gps_fix_lost"]
+    assert (found.usable, found.faults) == (False, 1)
+
+
+def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
+    """Events of other vehicles are left out; asked about a moment, it says what held then."""
+    flight = Flight()
+    lose_gps(flight)
+    flight.wait(1.0).send()
+    flight.status(ARMED)
+    flight.gps()
+    flight.fly(60)
+    events = flight.account.events_since(0)[0]
+    other: list[Any] = [replace(each, vehicle="2") for each in events]
+    topics = ["vehicle_local_position"]
+    assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).faults == 0
+    assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).faults == 1
+    assert verdict(flight, at=flight.now - 30).text.startswith("no fault then; the nearest: ")
+    assert verdict(flight, at=flight.now - 30).usable is True
+    assert verdict(flight, at=107.0).text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot")
+
+
+def test_verdict_is_short() -> None:
+    """Long texts of PX4 are cut: a verdict has at most three lines of 100 columns."""
+    flight = Flight()
+    flight.send()
+    for number in range(40):
+        text(flight, f"{number} " + "very long " * 12)
+    flight.wait(0.1).send(xy_valid=False, v_xy_valid=False, z_valid=False, v_z_valid=False)
+    assert len(textwrap.wrap(f"1: {verdict(flight).text}", 100, subsequent_indent="   ")) <= 3

@@ -36,13 +36,19 @@ TOLD = [
     ("12.000", "", "vxy valid again after 4.0 s"),
     ("12.000", "", "dead reckoning ends after 7.0 s"),
 ]
-WHY = """\
-1: xy and vxy not valid from 8.000, for 4.0 s
+MISSING = "vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags"
+VERDICT = f"""\
+1: xy and vxy not valid from 8.000 to 12.000 s since boot (4.0 s). Evidence: 5.000 dead reckoning. \
+Not in the data: {MISSING}.
+"""
+WHY = f"""\
+{VERDICT}
+1: xy and vxy not valid from 8.000 to 12.000 s since boot (4.0 s)
   before it
     5.000  dead reckoning (3.0 s before)
   ended at 12.000 with
     12.000  dead reckoning ends after 7.0 s
-  missing topics that may explain it: vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags; \
+  missing topics that may explain it: {MISSING}; \
 PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)
 """
 AT = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
@@ -114,7 +120,7 @@ def test_events_of_a_recording_are_those_of_its_log(log: Path, tmp_path: Path) -
     """Converted to MCAP the flight tells the same."""
     assert run_command("convert", str(log), "flight.mcap").exit_code == 0
     assert lines_of(run_command("events", "flight.mcap")) == TOLD
-    assert "'nedbus record' without --topic" in run_command("why", "flight.mcap").out
+    assert "'nedbus record' without --topic" in run_command("why", "flight.mcap", "--all").out
 
 
 @pytest.mark.logs
@@ -133,26 +139,39 @@ def test_events_of_a_real_flight() -> None:
     assert "23:09:04.9  1        BAD    xy not valid  <- GPS fix 3D to none, 10 satellites to 0 (5.1 s before)" in (
         run_command("events", str(REAL)).out
     )
-    story = run_command("why", str(REAL)).out
-    assert story.startswith("1: xy and vxy not valid from 23:09:04.9, for 15.9 s\n  before it\n    23:08:59.8  GPS fix")
+    story = run_command("why", str(REAL), "--all").out
+    begin = "1: xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
+    assert story.startswith(f"{begin}. Evidence: 23:08:59.8 GPS fix 3D to none, 10 satellites to 0")
+    assert f"\n\n{begin}\n  before it\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
 
 
 def test_why_of_a_file(log: Path) -> None:
-    """Each fault with its begin, its duration, and what precedes it; and the topics that the log does not have."""
+    """The verdict; with --all each fault with what precedes it, and the topics that the log does not have."""
     shown = run_command("why", str(log))
-    assert (shown.exit_code, shown.out) == (0, WHY)
-    assert shown.err == "times: seconds since boot, no message contains UTC\n"
-    story = json.loads(run_command("why", str(log), "--json").out)
+    assert (shown.exit_code, shown.out, shown.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
+    shown = run_command("why", str(log), "--all")
+    assert (shown.exit_code, shown.out, shown.err) == (0, WHY, "")
+    told = json.loads(run_command("why", str(log), "--json").out)
+    verdict, (story,) = told["verdict"], told["faults"]
+    assert (verdict["text"], verdict["usable"]) == (VERDICT[3:-1], False)
+    assert [verdict[name]["boot"] for name in ("begin", "end")] == [8.0, 12.0]
+    assert [each["kind"] for each in verdict["cause"]] == ["dead_reckoning"]
     assert (story["what"], story["lasted"]) == ("xy and vxy not valid", pytest.approx(4.0))
     assert [each["kind"] for each in story["before"]] == ["dead_reckoning"]
     assert story["lacking"][0] == "vehicle_gps_position"
 
 
 def test_why_of_a_moment(log: Path) -> None:
-    """--at names a moment: seconds since boot here, where nothing tells UTC."""
-    assert run_command("why", str(log), "--at", "10").out == WHY
-    assert run_command("why", str(log), "--at", "6.5").out.startswith("1: dead reckoning from 5.000, for 7.0 s\n")
+    """--at names a moment, since boot or since the start of the recording, where nothing tells UTC."""
+    for moment in ("10", "+9"):
+        assert run_command("why", str(log), "--at", moment, "--all").out == WHY
+    shown = run_command("why", str(log), "--at", "6.5").out
+    assert shown.startswith(
+        "1: position valid throughout, but dead reckoning from 5.000 to 12.000 s since boot (7.0 s)."
+    )
+    shown = run_command("why", str(log), "--at", "19").out
+    assert shown.startswith("1: no fault then; the nearest: xy and vxy not valid from 8.000 to 12.000 s")
 
 
 @pytest.mark.logs
@@ -160,8 +179,9 @@ def test_why_of_a_moment(log: Path) -> None:
 def test_why_of_a_moment_in_both_clocks() -> None:
     """UTC, as the real log's messages tell it, and seconds since boot are the same moment."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
-    assert by_utc.startswith("1: GPS fix 3D to none, 10 satellites to 0 from 23:08:59.8, for 19.8 s\n")
-    assert run_command("why", str(REAL), "--at", "27.557").out == by_utc
+    assert "GPS fix 3D to none, 10 satellites to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
+    for moment in ("27.557", "+27.325"):
+        assert run_command("why", str(REAL), "--at", moment).out == by_utc
 
 
 def test_nothing_was_wrong(tmp_path: Path) -> None:
@@ -183,7 +203,7 @@ def test_what_never_was_valid_is_said(tmp_path: Path) -> None:
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = str(writer.write(tmp_path / "never.ulg"))
     assert run_command("events", log).err == "throughout the file: 1: xy not valid\n"
-    assert run_command("why", log).out.startswith("1: xy not valid from the first message on, until the end\n")
+    assert run_command("why", log).out.startswith("1: xy not valid from the first message on, until the end (4.8 s).")
 
 
 def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,21 +279,24 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
     shown = run_command("why", "-c", endpoint)
-    assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n")
+    assert (shown.exit_code, shown.err) == (0, "--all shows 1 fault in detail\n")
     assert shown.out.startswith("1: xy and vxy not valid from ")
-    assert shown.out.endswith("\n\n2: no faults in the history of the services\n")
+    assert shown.out.endswith("\n2: no faults in the history of the services\n")
     bus.publisher(VLP, vehicle="mocap1").publish(message(1))
     shown = run_command("why", "-c", endpoint, "-v", "mocap1")
     reason = "vehicle mocap1 is published, but no nedbus service keeps its history"
     hint = "follow it with 'nedbus events --vehicle mocap1'"
     assert (shown.exit_code, shown.err) == (1, f"nedbus: {reason}: {hint}\n")
     assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the history of the services\n"
-    shown = run_command("why", "-c", endpoint, "-v", "1")
-    assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n")
-    assert re.match(r"1: xy and vxy not valid from \d\d:\d\d:\d\d\.\d, for \d+ ms\n  before it\n", shown.out)
+    shown = run_command("why", "-c", endpoint, "-v", "1", "--all")
+    clock = r"\d\d:\d\d:\d\d\.\d"
+    begin = rf"1: xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
+    assert re.match(rf"{begin}\. Evidence: {clock} dead reckoning\. Not in .*\n\n{begin}\n  before it\n", shown.out)
     assert "to publish them: PX4's dds_topics.yaml" in shown.out
-    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--at", "12")  # when it ended
-    assert shown.out in since_boot.out
+    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
+    assert set(shown.out.splitlines()) <= set(since_boot.out.splitlines())
+    refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")
+    assert (refused.exit_code, "--at: '+3': live data has no start to count from" in refused.err) == (2, True)
     at = re.search(r"\d\d:\d\d:\d\d\.\d", shown.out)
     assert at
     assert run_command("why", "-c", endpoint, "-v", "1", "--at", at[0]).out.startswith("1: ")
@@ -292,7 +315,7 @@ def test_why_live_of_what_held_before(run_nedbus: Start, bus: nedbus.Bus, endpoi
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = writer.write(tmp_path / "never.ulg")
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
-    assert run_command("why", "-c", endpoint).out.startswith("1: xy not valid from the first message on, until now\n")
+    assert run_command("why", "-c", endpoint).out.startswith("1: xy not valid from the first message on, until now (")
 
 
 def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:

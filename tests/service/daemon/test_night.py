@@ -128,8 +128,12 @@ def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browse
         wait_for_event(events, *TOLD[-1])
         assert told_by(events) == TOLD
         told = json.loads(run_command("why", "-c", endpoint, "--vehicle", "alpha", "--json").out)
-        assert told["what"] == "xy and vxy not valid"
-        assert [each["kind"] for each in told["before"]] == ["gps_fix_lost", "few_satellites", "dead_reckoning"]
+        assert told["faults"][0]["what"] == "xy and vxy not valid"
+        assert [each["kind"] for each in told["verdict"]["cause"]] == [
+            "gps_fix_lost",
+            "few_satellites",
+            "dead_reckoning",
+        ]
         router.signal(signal.SIGTERM)
         router.wait()
         wait_for_event(events, *CUT[0])

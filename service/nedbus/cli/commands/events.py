@@ -27,9 +27,11 @@ from nedbus.events import (
     Story,
     Times,
     Vehicle,
+    Verdict,
     by_vehicle,
     stories_of,
-)
+    verdict_of,
+)  # fmt: skip
 from nedbus.monitoring import Observer
 from nedbus.sources import FileAccount, read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
@@ -108,24 +110,24 @@ def why(
     *,
     vehicle: VehicleOption = ANY,
     at: Annotated[str | None, typer.Option(metavar="TIME", help=_AT)] = None,
+    details: Annotated[bool, typer.Option("--all", help="Show all faults with their evidence")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Explain the faults of vehicles, live or from a file.
+    """Give the verdict on vehicles, live or from a file: usable or not, since when, for how long, and why.
 
-    Shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions that
-    were active already. Names topics that would help but are missing, with a hint. Live data is the history kept by
+    --all shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions
+    that were active already; and topics that would help but are missing, with a hint. Live data is the history kept by
     nedbus services. Exits with 0, with and without faults.
     """
     if files:
         read, found = _read(files)
-        followed = read.account.vehicles
+        followed, times, end = read.account.vehicles, read.times, read.end
         names = _choose_vehicles(_name(files), followed, vehicle)
         held = {
             name: [each for each in followed[name].conditions.values() if each.severity != "info"] for name in names
         }
-        topics, times = {name: sorted(followed[name].topics) for name in names}, read.times
-        until, advice = "until the end", _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
-        nothing = f"no faults in {read.end:.0f} s"
+        topics = {name: sorted(followed[name].topics) for name in names}
+        advice = _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
@@ -139,27 +141,26 @@ def why(
             raise NedbusError(f"no nedbus service at {where} has data of a vehicle: start one with 'nedbus serve'")
         names = _choose_vehicles("the network", reporting, vehicle)
         held = {name: list(reporting[name].vehicles[name].held) for name in names}
-        topics, times = {name: list(reporting[name].vehicles[name].topics) for name in names}, Times(is_live=True)
-        until, advice, nothing = "until now", _LIVE_ADVICE, "no faults in the history of the services"
+        topics = {name: list(reporting[name].vehicles[name].topics) for name in names}
+        times, end, advice = Times(is_live=True), max(report.now for report in reports), _LIVE_ADVICE
     texts: list[str] = []
-    shown: list[Event] = []
+    faults = 0
     for name in names:
         events = [event for event in found if event.vehicle in (name, ANY)]
         moment = _find_moment(at, times, events)
+        verdict = verdict_of(name, events, held[name], topics=topics[name], times=times, end=end, at=moment)
         stories = stories_of(events, held[name], topics=topics[name], at=moment)
         if json_output:
-            for story in stories:
-                write(json.dumps({"vehicle": name} | _story_fields(story, times)))
-        elif not stories:
-            texts.append(f"{name}: {nothing}")
-        else:
-            shown += events
-            if moment is not None and not any(each.since <= moment <= (each.until or moment) for each in stories):
-                texts.append(f"{name}: no fault at {at}; the nearest one:")
-            texts += ["\n".join(_describe(name, story, times, advice, until)) for story in stories]
+            blocks = [_story_fields(story, times) for story in stories]
+            write(json.dumps({"vehicle": name, "verdict": _verdict_fields(verdict, times), "faults": blocks}))
+            continue
+        faults += len(stories)
+        texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
+        texts += ["\n".join(_describe(name, story, times, end, advice)) for story in stories if details]
     if texts:
-        _write_clock(shown, times)
-        write("\n\n".join(texts))
+        write(("\n\n" if details else "\n").join(texts))
+    if faults and not (details or json_output):
+        write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
 
 
 def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float | None:
@@ -171,12 +172,9 @@ def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float
         raise ConfigError("--at", f"{at!r}: {exc}: expected {_AT}") from exc
 
 
-def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> Iterator[str]:
+def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
     """Yield the lines that explain a fault."""
-    since = "the first message on" if story.begin is None else times.text(story.begin)
-    lasted = until if story.until is None else f"for {to_age(story.until - story.since)}"
-    when = f"at {since}" if story.begin and story.until == story.since else f"from {since}, {lasted}"
-    yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {when}")
+    yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
     if story.before:
         yield "  before it"
         yield from (fold(f"    {times.text(each)}  ", _before(each, story.since)) for each in story.before)
@@ -302,6 +300,12 @@ def _story_fields(story: Story, times: Times) -> dict[str, object]:
         **{name: [_to_fields(event, times) for event in each] for name, each in events.items()},
         "lacking": story.lacking,
     }
+
+
+def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
+    begin, end = (None if each is None else _to_fields(each, times) for each in (verdict.begin, verdict.end))
+    cause = [_to_fields(event, times) for event in verdict.cause]
+    return {"text": verdict.text, "usable": verdict.usable, "begin": begin, "end": end, "cause": cause}
 
 
 def _choose_vehicles(where: object, names: Collection[str], vehicle: str) -> list[str]:
