@@ -48,7 +48,17 @@ class Event:
     @property
     def identity(self) -> tuple[object, ...]:
         """A key that is equal for the same event in the reports of two services."""
-        return self.kind, self.time, self.names
+        return self.kind, self.time, self.names, self.origin == "px4" and self.text
+
+    @property
+    def origin(self) -> str:
+        """Its author: "px4" of PX4's own texts, "nedbus" of events derived from messages."""
+        return "px4" if self.kind == "text" else "nedbus"
+
+    @property
+    def words(self) -> str:
+        """Its text; PX4's own in quotes."""
+        return f'PX4: "{self.text}"' if self.origin == "px4" else self.text
 
     def later(self, seconds: float) -> Event:
         """Return this event and its evidence on a clock that is ahead by `seconds`."""

@@ -94,9 +94,10 @@ def _cause(story: Story, events: Iterable[Event]) -> tuple[Event, ...]:
 def _why(story: Story, cause: Sequence[Event], times: Times) -> list[str]:
     """Return sentences with the evidence of a fault, and with what is missing."""
     texts = sorted((e for e in cause if e.kind == "text"), key=lambda each: each.numbers.get("level", 0.0))[:2]
-    shown = [each for each in cause if each in texts or each in [e for e in cause if e.kind != "text"][-3:]]
-    groups = groupby(shown, key=times.text)
-    listed = "; ".join(f"{time} {', '.join(dict.fromkeys(map(_quoted, group)))}" for time, group in groups)
+    others = [each for each in cause if each.kind != "text"][-3:]
+    shown = groupby((each for each in cause if each in texts or each in others), key=times.text)
+    groups = ((time, dict.fromkeys(_cut(each.words) for each in group)) for time, group in shown)
+    listed = "; ".join(f"{time} {', '.join(words)}" for time, words in groups)
     none = [] if story.begin is None else [f"No evidence in the {WINDOW:.0f} s before"]
     missing = [f"Not in the data: {', '.join(story.lacking)}"] if story.lacking else []
     return [f"Evidence: {listed}"] * bool(listed) + none * (not listed) + missing
@@ -120,10 +121,6 @@ def _size(story: Story) -> float:
     """Return the duration of a condition, the largest number of a single event."""
     numbers = map(abs, story.begin.numbers.values()) if story.begin and story.until == story.since else ()
     return max(numbers, default=(story.until or math.inf) - story.since)
-
-
-def _quoted(event: Event) -> str:
-    return f'PX4: "{_cut(event.text)}"' if event.kind == "text" else _cut(event.text)
 
 
 def _cut(text: str, width: int = 80) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
-from nedbus.events import ALL, Condition, Event, Times, Verdict, verdict_of
+from nedbus.events import ALL, Condition, Event, Times, Verdict, from_json, report_of, verdict_of
 from nedbus.events.detectors import Finding
 
 from .flight import ARMED, Flight
@@ -125,7 +126,7 @@ def test_verdict_quotes_px4() -> None:
 
 
 def test_verdict_has_evidence_of_any_kind_before_it_has_none() -> None:
-    """What happened shortly before is shown, even if it is no known cause; phases of the flight are not."""
+    """Events shortly before are shown, even if they are no known cause; phases of the flight are not."""
     flight = Flight()
     flight.status(ARMED)
     flight.send("failsafe_flags", fd_critical_failure=False)
@@ -189,3 +190,22 @@ def test_verdict_is_short() -> None:
         text(flight, f"{number} " + "very long " * 12)
     flight.wait(0.1).send(xy_valid=False, v_xy_valid=False, z_valid=False, v_z_valid=False)
     assert len(textwrap.wrap(f"1: {verdict(flight).text}", 100, subsequent_indent="   ")) <= 3
+
+
+def test_texts_of_one_moment_are_different_events() -> None:
+    """PX4 says several things at once; each is an event of origin px4, in quotes, and survives a report as JSON."""
+    flight = Flight()
+    flight.send()
+    for words in ("invalid setpoints", "Failsafe: blind land"):
+        text(flight, words)
+    flight.wait(0.1).send(xy_valid=False)
+    sent = report_of(flight.account, "s", "h", flight.now, within=60)
+    read = from_json(json.loads(json.dumps(asdict(sent))))
+    assert read is not None
+    assert [each.words for each in read.events if each.origin == "px4"] == [
+        'PX4: "invalid setpoints"', 'PX4: "Failsafe: blind land"',
+    ]  # fmt: skip
+    assert len({each.identity for each in read.events}) == len(read.events) == 3
+    held = list(read.vehicles["1"].held)
+    found = verdict_of("1", read.events, held, topics=read.vehicles["1"].topics, times=LIVE, end=read.now)
+    assert 'PX4: "invalid setpoints", PX4: "Failsafe: blind land"' in found.text

@@ -92,6 +92,12 @@ def test_events_by_severity(log: Path, severity: str, count: int) -> None:
     assert len(run_command("events", str(log), "--severity", severity).out.splitlines()) == count
 
 
+@pytest.mark.parametrize(("origin", "count"), [("nedbus", 6), ("px4", 0), ("*", 6)])
+def test_events_by_origin(log: Path, origin: str, count: int) -> None:
+    """PX4's own texts, or what nedbus derives; the log has none of the former."""
+    assert len(run_command("events", str(log), "--origin", origin).out.splitlines()) == count
+
+
 def test_events_as_json_and_csv(log: Path) -> None:
     """Both have every field; JSON is valid without NaN, CSV has evidence and numbers in a cell each."""
 
@@ -229,6 +235,7 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': not a time: EXPECTED\n"),
         (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle gives UTC: EXPECTED\n"),
         (("events", "LOG", "--severity", "dire"), 2, "nedbus: --severity: 'dire': expected bad or watch or info\n"),
+        (("events", "LOG", "--origin", "gcs"), 2, "nedbus: --origin: 'gcs': expected px4 or nedbus or *\n"),
         (("events", "LOG", "--within", "60"), 2, "nedbus: --within: needs live vehicles, not a file\n"),
         (("events", "LOG", "--duration", "60"), 2, "nedbus: --duration: needs live vehicles, not a file\n"),
         (("events", "LOG", "--json", "--csv"), 2, "nedbus: --csv: cannot be combined with --json: remove"),

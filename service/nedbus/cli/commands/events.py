@@ -54,26 +54,33 @@ def events(
         float | None, typer.Option(metavar="SECONDS", min=0.0, help="First show the events of the last SECONDS")
     ] = None,
     severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
+    origin: Annotated[
+        str, typer.Option(metavar="px4|nedbus", help="PX4's own texts, or events derived by nedbus")
+    ] = ANY,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     duration: DurationOption = None,
 ) -> None:
     """Show vehicle events and their evidence, live or from a file.
 
-    Events: validity, dead reckoning, resets, origin, GPS, fusion, failsafe, mode, arming, landing, battery, reboot,
-    silence, loss, rejected messages and the link. The evidence of an event are earlier events, up to ten seconds
-    before, that may explain it. Live events are shown until Ctrl-C.
+    Events: PX4's own texts; and from messages validity, dead reckoning, resets, origin, GPS, fusion, failsafe, mode,
+    arming, landing, battery, reboot, silence, loss, rejected messages and the link. The evidence of an event are
+    earlier events, up to ten seconds before, that may explain it. Live events are shown until Ctrl-C.
     """
     require_one({"--json": json_output, "--csv": csv_output})
-    if severity not in SEVERITIES:
-        raise ConfigError("--severity", f"{severity!r}: expected {' or '.join(SEVERITIES)}")
+    for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):
+        if value not in choices:
+            raise ConfigError(option, f"{value!r}: expected {' or '.join(choices)}")
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
     form = _to_json if json_output else _to_csv if csv_output else to_line
 
+    def select(found: Iterable[Event]) -> list[Event]:
+        chosen = [event for event in found if event.severity in severities and origin in (ANY, event.origin)]
+        return [event for event in chosen if vehicle in (ANY, event.vehicle) or event.vehicle == ANY]
+
     def show(found: Iterable[Event], times: Times) -> None:
-        for event in found:
-            if event.severity in severities and (ANY in (vehicle, event.vehicle) or event.vehicle == vehicle):
-                write(form(event, times))
+        for event in select(found):
+            write(form(event, times))
 
     if not files:
         if csv_output:
@@ -88,7 +95,7 @@ def events(
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(files)
     _choose_vehicles(_name(files), read.account.vehicles, vehicle)
-    found = [event for event in found if event.severity in severities and vehicle in (ANY, event.vehicle)]
+    found = select(found)
     if csv_output:
         write(csv_line(_HEAD))
     elif not json_output:
@@ -208,7 +215,7 @@ def to_line(event: Event, times: Times) -> str:
 
 
 def _shown(event: Event) -> str:
-    return to_text(event.text, _MAX_TEXT)
+    return to_text(event.words, _MAX_TEXT)
 
 
 def _before(event: Event, time: float) -> str:
