@@ -47,7 +47,7 @@ from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
 from .model.message import Message
-from .model.px4_types import BASES, FieldType, field_type
+from .model.px4_types import BASES, FieldType, decode_text, field_type
 from .model.rules import UnitQuaternion
 from .provenance import Provenance, encoding_of, identity_of, provenance_of, short_hash
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
@@ -82,7 +82,7 @@ __all__ = [
     "NedbusError", "NoOrigin", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic",
     "UnitQuaternion", "UnknownLayoutError", "Vector", "VehicleLocalPosition", "ack_key", "address_of_alive_key",
     "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of", "dds_type",
-    "decode", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
+    "decode", "decode_text", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
     "describe_flags", "encode", "encode_with", "encoding_of", "enu_to_ned", "euler_to_quaternion", "field_type",
     "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "identity_of", "is_unix_time",
     "is_vehicle_input", "json_schema_of", "layout_table_of", "message_doubts", "message_of_type_hash",

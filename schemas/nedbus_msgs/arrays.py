@@ -21,7 +21,7 @@ from .functions import DEFAULT, M, definition_of
 from .model.declaration import Layout, kept
 from .model.definition import Definition
 from .model.message import Message
-from .model.px4_types import BASES, FieldType
+from .model.px4_types import BASES, FieldType, decode_text, encode_text
 from .model.rules import passes_all, wrong_columns
 from .model.validation import Values
 
@@ -40,13 +40,13 @@ _COLUMNS_FROM: Final = 20
 
 
 def _numpy_type(kind: FieldType) -> Any:
-    return np.dtype((BASES[kind.base].code, kind.length or ()))
+    return np.dtype(f"S{kind.size}" if kind.is_text else (BASES[kind.base].code, kind.length or ()))
 
 
 class Arrays(Generic[M]):
     """Conversion of the messages of one definition to and from structured arrays.
 
-    `dtype`: the fields in the order of the model, with PX4's types.
+    `dtype`: the fields in the order of the model, with PX4's types; texts are UTF-8, such as `S127`.
     """
 
     def __init__(self, definition: Definition[M]) -> None:
@@ -72,7 +72,8 @@ class Arrays(Generic[M]):
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
         self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
-        self._arrays = [index for index, kind in enumerate(types.values()) if kind.length]
+        self._arrays = [index for index, kind in enumerate(types.values()) if kind.is_array]
+        self._texts = [index for index, kind in enumerate(types.values()) if kind.is_text]
         ruled = {name for rule in definition.rules for name in rule.fields}
         # A struct that unpacks the fields with rules from the bytes of an element, and the index of each.
         steps, places, index = [], dict[str, str](), 0
@@ -80,8 +81,8 @@ class Arrays(Generic[M]):
             if name not in ruled:
                 steps.append(f"{self.dtype[name].itemsize}x")
                 continue
-            steps.append(f"{kind.count}{BASES[kind.base].code}")
-            places[name] = f"values[{index}:{index + kind.count}]" if kind.length else f"values[{index}]"
+            steps.append(kind.form)
+            places[name] = f"values[{index}:{index + kind.count}]" if kind.is_array else f"values[{index}]"
             index += kind.count
         self._ruled = struct.Struct("=" + "".join(steps))
         self._passes_rules = passes_all(definition.rules, places.__getitem__)
@@ -136,7 +137,7 @@ class Arrays(Generic[M]):
 
     def of(self, messages: Sequence[M]) -> MessageArray:
         """Convert messages to a structured array."""
-        return np.array([tuple(message.__dict__.values()) for message in messages], self.dtype)
+        return np.array([self.to_element(tuple(message.__dict__.values())) for message in messages], self.dtype)
 
     def absent(self, count: int) -> MessageArray:
         """Return `count` messages with no field provided: NaN, false and 0."""
@@ -147,7 +148,15 @@ class Arrays(Generic[M]):
         values = list(element.item())
         for index in self._arrays:
             values[index] = tuple(values[index].tolist())
+        for index in self._texts:
+            values[index] = decode_text(values[index])
         return tuple(values)
+
+    def to_element(self, row: Values) -> Values:
+        """Return the values of all fields as an array takes them: NumPy would reject a text that is not ASCII."""
+        if not self._texts:
+            return row
+        return tuple(encode_text(value) if isinstance(value, str) else value for value in row)
 
     def to_message(self, element: np.void) -> M:
         """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
@@ -218,7 +227,7 @@ def _wire_offsets(named: Sequence[tuple[str, np.dtype[Any], int]]) -> Iterator[i
     """Yield the offset in a payload of each byte of an element."""
     for _, kind, offset in named:
         indexes = range(offset, offset + kind.itemsize)
-        yield from reversed(indexes) if sys.byteorder == "little" else indexes
+        yield from reversed(indexes) if sys.byteorder == "little" and kind.kind != "S" else indexes
 
 
 DTYPE: Final = arrays_of(DEFAULT).dtype

@@ -25,16 +25,22 @@ from nedbus_msgs import (
     RELEASES,
     DecodeError,
     Definition,
+    EncodeError,
     FieldType,
     InvalidMessageError,
     Message,
     codec_of,
+    decode_with,
     encode_with,
+    field_type,
+    hash_of,
+    hash_of_msg,
     message_of_type_hash,
     schema_of,
     upgrade_fields,
 )
 from nedbus_msgs.arrays import arrays_of
+from nedbus_msgs.ros2.types import described, type_hash
 from tests.flights.first_message import decode_cdr, encode_cdr
 from tests.flights.ulogs import UlogWriter
 from tests.peers.processes import Start
@@ -46,6 +52,7 @@ GOLDEN = DATA / "golden_messages.json"
 PAGES = Path(__file__).parents[2] / "docs" / "messages"
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 NAMES = list(MESSAGES)
+LOG_MESSAGE = "uint64 timestamp\nuint8 severity\nchar[127] text\nuint8 ORB_QUEUE_LENGTH = 4\n"
 float32s = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, -1.0, 0.5]))
 
 
@@ -89,8 +96,70 @@ def test_vectors_of_rosbags_are_decoded_and_encoded_to_the_bit() -> None:
         found.add((definition.name, layout.name))
     layouts = {(name, layout) for name, each in MESSAGES.items() for layout in each.layouts}
     assert {each for each in layouts - found if each[1] != ALL} == {
-        ("VehicleLocalPosition", "V0")
-    }  # of a node of PX4's
+        ("VehicleLocalPosition", "V0"),  # of a node of PX4's
+        ("LogMessage", "1.13"),  # whose char[127] is a uint8[127] in ROS 2, but not in rosbags
+    }
+
+
+def test_text_has_the_bytes_and_the_hash_of_ros_2() -> None:
+    """A char of a .msg file is a uint8: the hash is that of std_msgs/msg/Char as ROS 2 Jazzy generates it."""
+    char = ("std_msgs/msg/Char", [described("data", field_type("char"))])
+    assert type_hash(char) == "RIHS01_3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9"
+    layout = MESSAGES["LogMessage"].current
+    assert hash_of(layout, "px4_msgs/msg/LogMessage") == hash_of_msg("LogMessage", LOG_MESSAGE)
+    assert hash_of_msg("LogMessage", LOG_MESSAGE) == hash_of_msg("LogMessage", LOG_MESSAGE.replace("char", "uint8"))
+    fields: dict[str, object] = {"timestamp": 7, "severity": 4, "text": "12 µs"}
+    payload = encode_with(MESSAGES["LogMessage"], fields, layout)
+    assert payload == struct.pack("<4sQB127s", b"\0\1\0\0", 7, 4, "12 µs".encode())
+    assert decode_with(MESSAGES["LogMessage"], payload, layout) == fields
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"", ""),
+        (b"a\0b", "a"),
+        ("µ".encode() * 63 + b"\xc2", "µ" * 63 + "?"),
+        (b"\xff" * 127, "?" * 127),
+        (b"ok\xff", "ok?"),
+    ],
+)
+def test_bytes_of_a_text_are_never_an_error(data: bytes, text: str) -> None:
+    """A text ends at the first NUL, and bytes that are not UTF-8 are replaced, in all forms alike."""
+    definition = MESSAGES["LogMessage"]
+    codec, arrays, padded = codec_of(definition), arrays_of(definition), data.ljust(127, b"\0")
+    cdr = struct.pack("<4sQB127s", b"\0\1\0\0", 7, 4, data)
+    assert decode_with(definition, cdr, definition.current)["text"] == text
+    payload = codec.encode(definition.model(timestamp=7, severity=4))[:-127] + padded
+    message = codec.decode(payload)
+    assert message == definition.model(timestamp=7, severity=4, text=text)
+    assert codec.decode(codec.encode(message)) == message
+    decoded, valid = arrays.decode(payload)
+    assert valid.all()
+    assert arrays.to_message(decoded[0]) == message
+    assert arrays.to_message(arrays.of([message])[0]) == message
+
+
+def test_text_of_any_msgpack_is_read_and_one_that_does_not_fit_is_rejected() -> None:
+    """Other implementations need not fill it up; what has more than 127 bytes is rejected, and so is another type."""
+    definition = MESSAGES["LogMessage"]
+    codec = codec_of(definition)
+    assert codec.decode(msgpack.packb([0, 7, 4, "short"])).text == "short"
+    assert codec.decode(msgpack.packb([0, 7, 4, b"\xff"], use_bin_type=False)).text == "?"
+    for wrong in ("x" * 128, "µ" * 64, 5, None, ["x"]):
+        with pytest.raises(DecodeError, match="text"):
+            codec.decode(msgpack.packb([0, 7, 4, wrong]))
+        with pytest.raises(ValidationError):
+            definition.model(timestamp=7, text=wrong)
+        with pytest.raises(InvalidMessageError):
+            codec.encode_row((7, 4, wrong))
+    assert definition.model(timestamp=7, text=np.bytes_(b"numpy")).text == "numpy"
+    assert definition.model(timestamp=7, text="cut\0here").text == "cut"
+    with pytest.raises(ValidationError):
+        definition.model(timestamp=7, text="\ud800")
+    bypassed = definition.model.model_construct(timestamp=7, severity=4, text=5)
+    with pytest.raises(EncodeError):
+        codec.encode(bypassed)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -149,6 +218,8 @@ def test_layouts_are_told_apart_by_their_names() -> None:
 
 def values_of(kind: FieldType) -> st.SearchStrategy[object]:
     """Return a strategy for the values of a type."""
+    if kind.is_text:
+        return st.text(max_size=kind.size // 4)
     if kind.base == "bool":
         one: st.SearchStrategy[object] = st.booleans()
     elif kind.is_float:
@@ -176,7 +247,7 @@ def test_all_forms_of_all_messages_agree(case: tuple[Definition[Any], dict[str, 
     """Model, fields, rows and arrays accept the same messages, write the same bytes, and read the same values."""
     definition, fields = case
     codec, arrays = codec_of(definition), arrays_of(definition)
-    array = np.array([tuple(fields.values())] * 21, arrays.dtype)  # enough to be checked by columns
+    array = np.array([arrays.to_element(tuple(fields.values()))] * 21, arrays.dtype)  # enough to be checked by columns
     try:
         message = definition.model.model_validate(fields)
     except ValidationError:

@@ -15,7 +15,6 @@ from pydantic import ValidationError
 from nedbus_msgs.errors import DecodeError, EncodeError
 from nedbus_msgs.model.declaration import Layout, kept
 from nedbus_msgs.model.definition import Definition, require_fields
-from nedbus_msgs.model.px4_types import BASES
 from nedbus_msgs.model.validation import Validation
 
 HEAD: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
@@ -92,8 +91,8 @@ def cdr_layout(layout: Layout) -> CdrLayout:
     body, size, unpadded, not_bools = "<", 0, 0, 0
     offsets = {}
     for name, kind in layout.types.items():
-        padding = -size % kind.size
-        body += (f"{padding}x" if padding else "") + f"{kind.count}{BASES[kind.base].code}"
+        padding = -size % kind.alignment
+        body += (f"{padding}x" if padding else "") + kind.form
         offsets[name] = len(HEAD) + size + padding
         if kind.base == "bool":
             not_bools |= int.from_bytes(b"\xfe" * kind.count) << 8 * offsets[name]

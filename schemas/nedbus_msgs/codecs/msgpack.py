@@ -31,9 +31,12 @@ Newer = Mapping[int, Sequence[str]]
 def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
     """Return the tags of a type with zeros for values, the struct format of both, and the bit mask of the values.
 
-    A bool is only a tag, 0xc2 or 0xc3, whose last bit is the value.
+    A bool is only a tag, 0xc2 or 0xc3, whose last bit is the value; a text is a str 16, filled up with NUL.
     """
     base = BASES[kind.base]
+    if kind.is_text:
+        head = bytes([base.tag]) + kind.size.to_bytes(2, "big")
+        return head + bytes(kind.size), "3x" + kind.form, b"\x00" * 3 + b"\xff" * kind.size
     if kind.base == "bool":
         one = bytes([base.tag]), "?", b"\x01"
     else:
@@ -86,7 +89,8 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     name_values, template, flatten = validation.name, validation.template, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
     tags, tag_mask, packed, offsets = _forms(types, head)
-    size, pack_flat = packed.size, packed.pack
+    size, pack_flat, unpack_flat = packed.size, packed.pack, packed.unpack
+    unflatten, has_text = validation.unflatten, any(kind.is_text for kind in types.values())
     new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
 
     def pack(row: Values) -> bytes:
@@ -129,8 +133,12 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
             return None
         # The tags prove type and range of every value; only the rules are left to check.
-        row: Values = unpack(payload, use_list=False)[1:]
+        row: Values = decode_values(payload) if has_text else unpack(payload, use_list=False)[1:]
         return row if passes_rules(row) else None
+
+    def decode_values(payload: bytes) -> Values:
+        """Decode a payload with texts, which end at a NUL, and may have bytes that are not UTF-8."""
+        return unflatten(unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big")))
 
     def decode_any(payload: bytes, newer: Newer | None) -> M:
         """Decode any msgpack encoding of any known layout."""
@@ -167,7 +175,7 @@ def _forms(
     for name, kind in types.items():
         own_tags, own_code, own_values = full_width(kind)
         tags, values, code = tags + own_tags, values + own_values, code + own_code
-        tag = int(kind.base != "bool")  # bytes of the tag besides the value
+        tag = 3 * kind.is_text or int(kind.base != "bool")  # bytes of the tag besides the value
         step = tag + kind.size
         offsets += [(name, part, len(tags) - (kind.count - part) * step + tag) for part in range(kind.count)]
     mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
@@ -192,7 +200,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
     if len(payload) > PAYLOAD_LIMIT:
         raise reject(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
     try:
-        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
+        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="replace")
     except (ValueError, msgpack.UnpackException) as exc:
         raise reject(f"{len(payload)} bytes that are not one msgpack value ({exc or type(exc).__name__})") from exc
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
@@ -209,6 +217,9 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
         parts = value if isinstance(value, tuple) else (value,)
         if any(isinstance(part, tuple) for part in parts):
             raise reject(f"{name}: an array within an array")
-        if any(isinstance(part, str) for part in parts):  # the model accepts "NaN" and the like, from JSON
+        is_text = name in definition.types and definition.types[name].is_text
+        if not is_text and any(
+            isinstance(part, str) for part in parts
+        ):  # the model accepts "NaN" and the like, from JSON
             raise reject(f"{name}: text, where msgpack has numbers and bools")
     return dict(zip(names, values, strict=True))

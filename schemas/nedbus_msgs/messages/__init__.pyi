@@ -3,6 +3,7 @@ from .battery_status import BatteryStatus as BatteryStatus
 from .estimator_status_flags import EstimatorStatusFlags as EstimatorStatusFlags
 from .failsafe_flags import FailsafeFlags as FailsafeFlags
 from .home_position import HomePosition as HomePosition
+from .log_message import LogMessage as LogMessage
 from .sensor_gps import SensorGps as SensorGps
 from .timesync_status import TimesyncStatus as TimesyncStatus
 from .vehicle_attitude import VehicleAttitude as VehicleAttitude

@@ -11,7 +11,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from .declaration import Layout, Older, Topic
 from .definition import Definition, register
-from .px4_types import FieldType, Timestamp
+from .px4_types import FieldType, Timestamp, decode_text
 from .rules import Rule, violations
 
 _M = TypeVar("_M", bound="Message")
@@ -135,7 +135,9 @@ def _to_python(value: Any, kind: FieldType | None) -> object:
     """
     if type(value).__module__ == "numpy":
         value = value.tolist()
-    if kind and kind.length and isinstance(value, list | tuple):
+    if kind and kind.is_text and isinstance(value, bytes):
+        return decode_text(value)
+    if kind and kind.is_array and isinstance(value, list | tuple):
         parts = tuple(_to_python(part, FieldType(kind.base)) for part in value)
         return value if all(map(operator.is_, parts, value)) and isinstance(value, tuple) else parts
     if kind and kind.is_float and isinstance(value, str) and value in _FLOAT_NAMES:

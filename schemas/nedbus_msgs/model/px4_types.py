@@ -24,7 +24,7 @@ class Base(NamedTuple):
     code: str
     tag: int
     ros2: int
-    absent: float
+    absent: float | str
 
 
 BASES: Final[Mapping[str, Base]] = {
@@ -39,15 +39,20 @@ BASES: Final[Mapping[str, Base]] = {
     "uint64": Base("Q", 0xCF, 9, 0),
     "float32": Base("f", 0xCA, 10, NAN),
     "float64": Base("d", 0xCB, 11, NAN),
+    "char": Base("s", 0xDA, 3, ""),  # only as an array, which is a text; ROS 2 has a uint8 in its place
 }
 
 
 ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
+"""The types of single values with another name in PX4."""
 
 
 @dataclass(frozen=True)
 class FieldType:
     """A PX4 field type, such as `float32[4]`; `length` is None for a single value.
+
+    `char[127]` is a single value, a text (`str`) of at most 127 bytes of UTF-8. It ends at the first NUL, and bytes
+    that are not UTF-8 become "?".
 
     Raises ValueError for an unknown base type, and for an array with no or too many elements.
     """
@@ -56,7 +61,7 @@ class FieldType:
     length: int | None = None
 
     def __post_init__(self) -> None:
-        if self.base not in BASES:
+        if self.base not in BASES or (self.is_text and self.length is None):
             raise ValueError(f"{self.base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
         if self.length is not None and not 0 < self.length <= LONGEST_ARRAY:
             raise ValueError(f"an array of {self.length}: expected 1 to {LONGEST_ARRAY} elements")
@@ -64,15 +69,35 @@ class FieldType:
     def __str__(self) -> str:
         return self.base if self.length is None else f"{self.base}[{self.length}]"
 
+    @property
+    def is_text(self) -> bool:
+        """True for an array of characters, whose value is a str."""
+        return self.base == "char"
+
+    @cached_property
+    def is_array(self) -> bool:
+        """True for a type whose value is a tuple."""
+        return self.length is not None and not self.is_text
+
     @cached_property
     def count(self) -> int:
         """Number of values."""
-        return self.length or 1
+        return (self.length or 1) if self.is_array else 1
+
+    @cached_property
+    def form(self) -> str:
+        """The struct format of all values."""
+        return f"{self.length or 1}{BASES[self.base].code}"
 
     @cached_property
     def size(self) -> int:
-        """Size of one value in bytes, which is also its alignment in CDR."""
-        return struct.calcsize("<" + BASES[self.base].code)
+        """Size of one value in bytes."""
+        return struct.calcsize("<" + self.form) // self.count
+
+    @property
+    def alignment(self) -> int:
+        """Alignment in CDR in bytes."""
+        return 1 if self.is_text else self.size
 
     @cached_property
     def is_float(self) -> bool:
@@ -83,7 +108,7 @@ class FieldType:
     def absent(self) -> object:
         """Value of a field that is not provided: NaN, false or 0; in an array, for each element."""
         absent = BASES[self.base].absent
-        return absent if self.length is None else (absent,) * self.length
+        return (absent,) * self.count if self.is_array else absent
 
     @cached_property
     def limits(self) -> tuple[int, int]:
@@ -97,6 +122,8 @@ class FieldType:
         A shorter array is filled up with "not provided".
         """
         base = BASES[self.base]
+        if self.is_text:
+            return value if isinstance(value, str) and len(encode_text(value)) <= self.size else None
         if self.length is not None:
             if not isinstance(value, tuple) or len(value) > self.length:
                 return None
@@ -112,12 +139,15 @@ class FieldType:
     @cached_property
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
-        value = bool if self.base == "bool" else float if self.is_float else int
-        python = value if self.length is None else tuple[(value,) * self.length]  # type: ignore[misc] # one for each
+        value = str if self.is_text else bool if self.base == "bool" else float if self.is_float else int
+        python = tuple[(value,) * self.count] if self.is_array else value  # type: ignore[misc] # one for each
         return Annotated[python, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:
         """Return Pydantic's schema: integers have limits; with `from_json`, floats may be names such as "NaN"."""
+        if self.is_text:
+            text = core_schema.str_schema(max_length=self.size)
+            return core_schema.no_info_after_validator_function(self._check_text, text)
         if self.length is not None:
             return core_schema.tuple_positional_schema(
                 [FieldType(self.base).core_schema(from_json=from_json)] * self.length
@@ -134,8 +164,23 @@ class FieldType:
         from_name = core_schema.no_info_after_validator_function(float, names)
         return core_schema.json_or_python_schema(core_schema.union_schema([number, from_name]), number)
 
+    def _check_text(self, text: str) -> str:
+        if len(encode_text(text)) > self.size:
+            raise ValueError(f"it has more than {self.size} bytes in UTF-8")
+        return text
+
     def __get_pydantic_core_schema__(self, source: object, handler: object) -> CoreSchema:
         return self.core_schema(from_json=True)
+
+
+def encode_text(text: str) -> bytes:
+    """Return the UTF-8 of a text up to its first NUL; raise TypeError for another type."""
+    return str.encode(text, "utf-8", "replace").partition(b"\0")[0]
+
+
+def decode_text(data: bytes) -> str:
+    """Return the text of an array of characters; with "?", it has no more bytes than that."""
+    return data.partition(b"\0")[0].decode(errors="replace").replace("\ufffd", "?")
 
 
 @cache
@@ -144,7 +189,9 @@ def field_type(text: str) -> FieldType:
     found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
     if found is None:
         raise ValueError(f"{text!r} is not a type: expected one such as uint8 or float32[4]")
-    return FieldType(ALIASES.get(found[1], found[1]), None if found[2] is None else int(found[2]))
+    if found[2] is None:
+        return FieldType(ALIASES.get(found[1], found[1]))
+    return FieldType(found[1] if found[1] == "char" else ALIASES.get(found[1], found[1]), int(found[2]))
 
 
 def field(meaning: str) -> Any:
@@ -162,6 +209,7 @@ Uint8 = Annotated[int, field_type("uint8"), Field(default=0)]
 Uint16 = Annotated[int, field_type("uint16"), Field(default=0)]
 Uint32 = Annotated[int, field_type("uint32"), Field(default=0)]
 Uint64 = Annotated[int, field_type("uint64"), Field(default=0)]
+Char127 = Annotated[str, field_type("char[127]"), Field(default="")]
 Float64 = Annotated[float, field_type("float64"), Field(default=NAN)]
 Float32 = Annotated[float, field_type("float32"), Field(default=NAN)]
 Float32x2 = Annotated[tuple[float, float], field_type("float32[2]"), Field(default=(NAN,) * 2)]

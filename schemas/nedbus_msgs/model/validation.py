@@ -10,12 +10,12 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import itemgetter
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from pydantic import ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
-from .px4_types import BASES, FieldType
+from .px4_types import FieldType, decode_text, encode_text
 from .rules import Rule, evaluated, passes_all
 
 _FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
@@ -31,7 +31,7 @@ class Validation:
     `template`: a dict with all field names, to copy and fill, which is faster than a growing dict.
     `values_of`: return the values of all fields in order from a mapping.
     `validate`: return the values of all fields; raise pydantic.ValidationError for a wrong type.
-    `flatten`: expand the arrays of a row in place, as struct packs them; `unflatten`: the reverse.
+    `flatten`: expand the arrays of a row in place and encode its texts, as struct packs them; `unflatten`: the reverse.
     """
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
@@ -46,8 +46,8 @@ class Validation:
         # Not the model's schema: building it for all messages takes Pydantic 20 ms, in which it swallows a Ctrl-C.
         tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
         self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
-        self._struct = struct.Struct("=" + "".join(f"{kind.count}{BASES[kind.base].code}" for kind in kinds))
-        self.flatten, self.unflatten = _flat_forms([kind.length for kind in kinds])
+        self._struct = struct.Struct("=" + "".join(kind.form for kind in kinds))
+        self.flatten, self.unflatten = _flat_forms(list(kinds))
 
     def check_row(self, values: Values) -> Values | None:
         """Validate the values of all fields without rounding them; return None if the model has to decide."""
@@ -93,21 +93,26 @@ class Validation:
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the name and the reason for each number beyond the range of its float32 field."""
         for name, kind in self._types.items():
-            for number in (values[name] if kind.length else (values[name],)) if kind.base == "float32" else ():
+            for number in (values[name] if kind.is_array else (values[name],)) if kind.base == "float32" else ():
                 if math.isfinite(number) and abs(number) > _FLOAT32_MAX:
                     yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
 
 
-def _flat_forms(lengths: Sequence[int | None]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:
-    """Return functions that flatten a row and restore it, given the length of each array."""
+def _flat_forms(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:
+    """Return functions that flatten a row and restore it, given the types of its fields."""
     flat, nested, index, place = [], [], 0, 0  # first value after the last array: in the row, and in the flat tuple
-    for position, length in enumerate(lengths):
-        if length is not None:
+    for position, kind in enumerate(kinds):
+        if kind.length is not None:
             start = place + position - index
-            flat += [f"*row[{index}:{position}]", f"*row[{position}]"]
-            nested += [f"*row[{place}:{start}]", f"row[{start}:{start + length}]"]
-            index, place = position + 1, start + length
+            array, text = f"row[{start}:{start + kind.count}]", f"decode_text(row[{start}])"
+            flat += [
+                f"*row[{index}:{position}]",
+                f"encode_text(row[{position}])" if kind.is_text else f"*row[{position}]",
+            ]
+            nested += [f"*row[{place}:{start}]", text if kind.is_text else array]
+            index, place = position + 1, start + kind.count
     if not flat:
         return tuple, tuple
     functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ((flat, index), (nested, place))]
-    return cast("tuple[Any, Any]", tuple(map(evaluated, functions)))
+    flatten, unflatten = (evaluated(each, encode_text=encode_text, decode_text=decode_text) for each in functions)
+    return flatten, unflatten

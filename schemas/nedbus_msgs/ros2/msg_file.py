@@ -161,7 +161,7 @@ def _type_of(line: _Line) -> FieldType:
 
 def _rules(name: str, kind: FieldType, comment: str) -> tuple[Rule, ...]:
     found, invalid = _RANGE.search(comment), _INVALID.search(comment)
-    if found is None or kind.base == "bool":
+    if found is None or kind.base == "bool" or kind.is_text:
         return ()
     least, greatest = float(found[1] or "-inf"), float(found[2] or "inf")
     unknown = {"or_": float(invalid[1])} if invalid else {}

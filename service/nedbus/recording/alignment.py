@@ -113,7 +113,7 @@ def align(
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
         padded = np.append(messages, np.zeros(1, messages.dtype))  # row -1: no message
         for field, kind in _fields(messages):
-            padded[field][-1] = np.nan if kind.base.kind == "f" else 0
+            padded[field][-1] = np.nan if kind.base.kind == "f" else kind.base.type()
         values = padded[rows]
         if method == "linear":
             _interpolate(name, values, padded[following], weight)

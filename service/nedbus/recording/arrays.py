@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from nedbus.errors import ConfigError, DecodeError
 from nedbus.extras import needs
-from nedbus_msgs import TOPICS, Address, Definition, Message, decode_with, upgrade_with
+from nedbus_msgs import TOPICS, Address, Definition, Message, decode_text, decode_with, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .flight_files import find_format
@@ -226,7 +226,8 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
         values = messages[name]
         parts = [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
         for part, each in zip(parts, values.reshape(len(values), len(parts)).T, strict=True):
-            column = package.Series(np.ascontiguousarray(each))
+            is_text = each.dtype.kind == "S"
+            column = package.Series(list(map(decode_text, each.tolist())) if is_text else np.ascontiguousarray(each))
             if each.dtype.kind == "M":
                 zoned = column.dt.tz_localize if library == "pandas" else column.dt.replace_time_zone
                 column = zoned("UTC")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from nedbus_msgs import BASES, TOPICS, Address, Definition
+from nedbus_msgs import TOPICS, Address, Definition
 
 from .ulog_reader import UlogReader, UlogStream
 
@@ -57,7 +57,8 @@ def read_ulog(path: Path, *, topics: Collection[str] | None = TOPICS) -> UlogTop
         if types := stream.fitting.types:
             rows = [stream.decode(row.tobytes()) for row in table]
             for name, kind in types.items():
-                columns[name] = np.array([row.get(name, kind.absent) for row in rows], BASES[kind.base].code)
+                values = np.array([row.get(name, kind.absent) for row in rows], str if kind.is_text else kind.form[-1])
+                columns[name] = np.char.encode(values, "utf-8") if kind.is_text else values
                 absent[name] = np.array([name not in row for row in rows])
         found[stream.address] = UlogTopic(stream.definition, columns, absent)
     return UlogTopics(found, reader)

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import BASES, FieldType, field_type
+from nedbus_msgs import FieldType, decode_text, field_type
 
 BASIC_TYPES: Final[Mapping[str, FieldType]] = {
     **{f"{sign}int{bits}_t": field_type(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
@@ -43,27 +43,33 @@ class PayloadLayout:
     def __init__(self, fields: tuple[PayloadField, ...], size: int, padding: int) -> None:
         self.fields, self.size, self.padding = fields, size, padding
         self._bools = [name for name, kind, _ in fields if kind.base == "bool"]
+        self._texts = [name for name, kind, _ in fields if kind.is_text]
         self._places: list[tuple[str, int | slice]] = []  # of each field in the unpacked values
         form, end, count = "<", 0, 0
         for name, kind, offset in fields:
-            self._places.append((name, slice(count, count + kind.count) if kind.length else count))
-            form += f"{offset - end}x{kind.count}{_code(kind)}"
+            self._places.append((name, slice(count, count + kind.count) if kind.is_array else count))
+            form += f"{offset - end}x{_form(kind)}"
             end, count = offset + kind.count * kind.size, count + kind.count
         self._unpack = struct.Struct(form).unpack_from
 
     def decode(self, payload: bytes) -> dict[str, object]:
-        """Return the fields of a payload of at least `size` bytes: int, float, bool, or tuples of them."""
+        """Return the fields of a payload of at least `size` bytes: int, float, bool, str, or tuples of numbers."""
         values = self._unpack(payload)
         fields: dict[str, Any] = {name: values[place] for name, place in self._places}
         for name in self._bools:
             value = fields[name]
             fields[name] = _BOOLS[value] if isinstance(value, int) else tuple(map(_BOOLS.__getitem__, value))
+        for name in self._texts:
+            fields[name] = decode_text(fields[name])
         return fields
 
     @property
     def dtype(self) -> Any:
         """The argument of `numpy.dtype` for the type of a payload; a bool is a uint8."""
-        types = [("<" + _code(kind), kind.length or ()) for _, kind, _ in self.fields]
+        types = [
+            f"S{kind.size}" if kind.is_text else (f"<{_form(kind)}"[-1], kind.length or ())
+            for _, kind, _ in self.fields
+        ]
         names, _, offsets = zip(*self.fields, strict=True)
         return {"names": names, "formats": types, "offsets": offsets, "itemsize": self.size}
 
@@ -98,7 +104,8 @@ class Formats:
     def _resolve(self, name: str) -> PayloadLayout:
         fields: dict[str, PayloadField] = {}
         offset = size = 0
-        for number, (field, base, length) in enumerate(self._expand(name), 1):
+        for number, (field, c_type, length) in enumerate(self._expand(name), 1):
+            base = BASIC_TYPES[c_type]
             start, offset = offset, offset + base.size * (length or 1)
             self._left -= 1
             if self._left < 0:
@@ -109,12 +116,13 @@ class Formats:
                 flat = re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_") if "." in field else field
                 if flat in fields:
                     raise ValueError(f"two fields are called {flat}, including those of nested messages")
-                fields[flat] = PayloadField(flat, FieldType(base.base, length) if length else base, start)
+                array = "char" if c_type == "char" else base.base
+                fields[flat] = PayloadField(flat, FieldType(array, length) if length else base, start)
             size = size if field.startswith("_padding") else offset
         return PayloadLayout(tuple(fields.values()), size, offset - size)
 
-    def _expand(self, name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType, int | None]]:
-        """Yield name, base type and length of each field one by one, so that the caller can stop at its limits."""
+    def _expand(self, name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, str, int | None]]:
+        """Yield name, basic type and length of each field one by one, so that the caller can stop at its limits."""
         if level > _MAX_NESTING:
             raise ValueError(f"its messages are nested more than {_MAX_NESTING} levels deep")
         if not self._texts.get(name):
@@ -124,12 +132,12 @@ class Formats:
             if length == 0:
                 raise ValueError(f"the array {field} has no elements")
             if kind in BASIC_TYPES:
-                yield field, BASIC_TYPES[kind], length
+                yield field, kind, length
                 continue
             for index in range(length or 1):
                 yield from self._expand(kind, f"{field}." if length is None else f"{field}[{index}].", level + 1)
 
 
-def _code(kind: FieldType) -> str:
-    """Return the struct format of one value; any byte is read where a bool should be."""
-    return "B" if kind.base == "bool" else BASES[kind.base].code
+def _form(kind: FieldType) -> str:
+    """Return the struct format of a field; any byte is read where a bool should be."""
+    return kind.form.replace("?", "B")

@@ -211,4 +211,6 @@ def _to_number(value: object, digits: int | None) -> str:
     """Format a value, or the elements of an array, with `digits` significant digits; None: all digits."""
     if isinstance(value, tuple):
         return " ".join(_to_number(each, digits) for each in value)
+    if isinstance(value, str):
+        return value.replace("\n", "\\n")
     return str(value) if digits is None else f"{value:.{digits}g}"

@@ -71,12 +71,13 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     blank = bytes(codec_of(definition).size)  # invalid stand-in for payloads of other layouts, decoded separately below
     own = codec.size if codec else -1
     payloads = [payload if len(payload) == own else blank for _, payload, _, _ in arrivals]
-    messages, valid = arrays_of(definition).decode(b"".join(payloads))
+    arrays = arrays_of(definition)
+    messages, valid = arrays.decode(b"".join(payloads))
     if not valid.all():
         for index in np.flatnonzero(~valid).tolist():
             sample = decoder.decode(arrivals[index], rows=True)
             if sample is not None:
-                messages[index] = sample.message
+                messages[index] = arrays.to_element(sample.message)
                 valid[index] = True
         messages = messages[valid]
         arrivals = [arrivals[index] for index in np.flatnonzero(valid).tolist()]
