@@ -63,7 +63,7 @@ class UlogReader:
     ) -> None:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
-        self._parser = ulog.UlogParser(verify=True)
+        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.Texts()
         self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, UlogStream | None] = {}
@@ -78,6 +78,8 @@ class UlogReader:
         """Damage and skipped parts so far."""
         ends = {f"damaged: {self._places - _MAX_NAMED} further places": self._places > _MAX_NAMED}
         ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
+        ends |= {f"left out: {self._texts.omitted} texts of PX4 beyond 100 a second": self._texts.omitted > 0}
+        ends |= {self._texts.problem: bool(self._texts.problem)}
         reasons = [reason for stream in self.streams.values() for reason in stream.fitting.unfit.values()]
         return self._warnings + reasons + [text for text, holds in ends.items() if holds]
 
@@ -88,7 +90,7 @@ class UlogReader:
         """
         streams, data = self._by_id, ulog.Data
         for records in self._records():
-            for record in records:
+            for record in self._texts.merge(records):
                 if not isinstance(record, data):
                     self._note(record)
                     continue

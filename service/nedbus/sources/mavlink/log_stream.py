@@ -13,7 +13,18 @@ from nedbus.errors import AddressError, OutputError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import Damage, Data, Dropout, Fitting, Subscription, UlogError, UlogParser, address_of, definition_of
+from nedbus.ulog import (
+    Damage,
+    Data,
+    Dropout,
+    Fitting,
+    Subscription,
+    Texts,
+    UlogError,
+    UlogParser,
+    address_of,
+    definition_of,
+)
 from nedbus_msgs import DEFAULT_TOPIC, Address, Definition
 
 from .log_client import LogStatus, LogStreamClient
@@ -59,7 +70,7 @@ class LogStream:
 
     def _restart(self) -> None:
         """Forget the definitions: those of the next stream may differ."""
-        self._parser = UlogParser(verify=False)
+        self._parser, self._texts = UlogParser(verify=False), Texts()
         self._routes: dict[int, _Route | None] = {}
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
@@ -95,7 +106,7 @@ class LogStream:
             yield Rejection(f"{self._name} ULog stream", str(exc))
             return
         self._undecodable += known.undecodable - before
-        for record in records:
+        for record in self._texts.merge(records):
             if isinstance(record, Data):
                 route = self._routes.get(record.subscription.message_id)
                 if route is None or route[0] is not record.subscription:

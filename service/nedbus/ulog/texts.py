@@ -1,0 +1,152 @@
+"""PX4's own words in a log, its texts and its events, as messages of `log_message`: each statement once."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from typing import Any, Final, NamedTuple
+
+from nedbus_msgs import field_type
+
+from .event_metadata import MAX_PACKED, Event, EventMetadata
+from .layout import PayloadField, PayloadLayout
+from .records import Data, LoggedText, MultiInformation, Record, Subscription
+
+_FORM: Final = struct.Struct("<QB127s")
+_FIELDS: Final = (("timestamp", "uint64", 0), ("severity", "uint8", 8), ("text", "char[127]", 9))
+_LAYOUT: Final = PayloadLayout(tuple(PayloadField(a, field_type(b), c) for a, b, c in _FIELDS), _FORM.size, 0)
+SPOKEN: Final = Subscription(-1, 0, "log_message", _LAYOUT)
+"""The subscription of the messages that `Texts` makes."""
+
+_READ: Final = ("", "event", "vehicle_status")
+_INFO: Final = 6
+_PROTOCOL: Final = 8  # log level from which an event is not for people
+_ALL_MODES: Final = 2**32 - 1
+_WINDOW: Final = 50_000  # us between two forms of a statement; 4 ms were seen
+_MAX_A_SECOND: Final = 100  # statements; PX4 makes 20 when it boots
+_MAX_BYTES: Final = 127
+_COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+_PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
+
+
+class _Statement(NamedTuple):
+    severity: int
+    timestamp: int
+    text: str
+
+
+def to_statement(text: str) -> str:
+    """Return a text as one line of printable characters, in at most 127 bytes of UTF-8."""
+    plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in _COLOUR.sub("", text)).strip()
+    data = plain.encode()
+    return plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
+
+
+class Texts:
+    """Adds the messages of `log_message` to the records of a log or a stream.
+
+    A text that ends with a tab is sent as an event, too, which is logged before it and says more: the event is kept.
+    Failed checks are reported again with each change of any: they are messages when they are new, and information as
+    long as they do not concern the vehicle's mode.
+
+    `omitted`: statements beyond 100 a second. `problem`: why the metadata cannot be used; "" if they can.
+    """
+
+    def __init__(self) -> None:
+        self.omitted = 0
+        self.problem = ""
+        self._packed = b""
+        self._metadata: EventMetadata | None = None
+        self._said: deque[tuple[int, str]] = deque(maxlen=100)  # events without their text: time, words of a check
+        self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log a topic twice
+        self._failed: dict[str, int] = {}  # checks of the last report, and the modes that they prevent
+        self._before: dict[str, int] = {}
+        self._nav_state = -1
+        self._second = self._count = 0
+
+    def merge(self, records: Iterable[Record]) -> Iterator[Record]:
+        """Yield the records, and each message of `SPOKEN` behind the last record that it is made of."""
+        for record in records:
+            name = record.subscription.name if isinstance(record, Data) else ""
+            if name != SPOKEN.name:  # which PX4 may log besides the texts
+                yield record
+            if name not in _READ:
+                continue
+            with suppress(LookupError, TypeError, ValueError, struct.error):  # a topic of this name with other fields
+                if (found := self._read(record)) and not self._is_flood(found.timestamp):
+                    text = to_statement(found.text).encode()
+                    yield Data(SPOKEN, _FORM.pack(found.timestamp, found.severity, text))
+
+    def _read(self, record: Record) -> _Statement | None:
+        """Return what is said for the first time."""
+        if isinstance(record, LoggedText):
+            return None if self._is_said(record) else _Statement(record.level, record.timestamp, record.text)
+        if isinstance(record, MultiInformation) and record.key == "metadata_events" and isinstance(record.value, bytes):
+            self._packed = (self._packed if record.continued else b"") + record.value
+            self._packed, self._metadata, self.problem = self._packed[:MAX_PACKED], None, ""
+        elif isinstance(record, Data) and record.subscription.name == "event":
+            return self._read_event(record.subscription.decode(record.payload))
+        elif isinstance(record, Data) and record.subscription.name == "vehicle_status":
+            self._nav_state = int(record.subscription.decode(record.payload)["nav_state"])  # type: ignore[call-overload]
+        return None
+
+    def _read_event(self, fields: dict[str, Any]) -> _Statement | None:
+        timestamp, level, key = fields["timestamp"], fields["log_levels"] >> 4, (fields["id"], fields["event_sequence"])
+        if (timestamp, *key) in self._seen or (event := self._decode(fields["id"], bytes(fields["arguments"]))) is None:
+            return None
+        self._seen.append((timestamp, *key))
+        is_check = event.group in ("arming_check", "health")
+        if level >= _PROTOCOL and event.group == "arming_check":  # the begin of a report
+            self._failed, self._before = {}, self._failed
+        if level >= _PROTOCOL or not (is_check or event.group == "default"):
+            return None
+        text, severity = event.text, level
+        if is_check:
+            is_known = text in self._failed or text in self._before or len(self._failed) > _MAX_A_SECOND
+            if len(self._failed) <= _MAX_A_SECOND:
+                self._failed[text] = (event.modes or 0) * (level < _INFO)
+            if is_known:
+                return None
+            severity = level if self._concerns_mode(event) else max(level, _INFO)
+        elif event.lists_checks_of and text.endswith(":"):
+            text = " ".join(
+                [text, ", ".join(name for name, modes in self._failed.items() if modes & event.lists_checks_of)]
+            )
+        self._said.append((timestamp, _first_words(text) if is_check else ""))
+        return _Statement(severity, timestamp, text)
+
+    def _decode(self, number: int, arguments: bytes) -> Event | None:
+        if self._metadata is None and self._packed and not self.problem:
+            try:
+                self._metadata = EventMetadata(self._packed)
+            except ValueError as exc:
+                self.problem = str(exc)
+        return self._metadata.decode(number, arguments) if self._metadata else None
+
+    def _concerns_mode(self, event: Event) -> bool:
+        modes = _ALL_MODES if event.modes is None else event.modes
+        return modes == _ALL_MODES or (self._nav_state >= 0 and bool(modes >> self._nav_state & 1))
+
+    def _is_said(self, record: LoggedText) -> bool:
+        """Return whether an event has just said the same; each event counts for one text."""
+        words = {_first_words(record.text), "" if record.text.endswith("\t") else "-"}
+        for each in self._said:
+            if abs(each[0] - record.timestamp) <= _WINDOW and each[1] in words:
+                self._said.remove(each)
+                return True
+        return False
+
+    def _is_flood(self, timestamp: int) -> bool:
+        if abs(timestamp - self._second) >= 1_000_000:
+            self._second, self._count = timestamp, 0
+        self._count += 1
+        self.omitted += self._count > _MAX_A_SECOND
+        return self._count > _MAX_A_SECOND
+
+
+def _first_words(text: str) -> str:
+    """Return the first two words, without the module and what PX4 puts before a failed check."""
+    return " ".join(_PREFIX.sub("", text).casefold().split()[:2])
