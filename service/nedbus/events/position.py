@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from types import SimpleNamespace
-from typing import Any, Final, cast
+from typing import Final
 
-from nedbus_msgs import RESET_COUNTERS, MapProjection, ResetTracker
+from nedbus_msgs import RESET_COUNTERS, MapProjection, Quantity, wrap
 
 from .detectors import ChangeDetector, FieldReader, Fields, Finding, detect_flags
 from .kinds import Severity, flagged
@@ -22,14 +21,23 @@ _COMPARED: Final = (
 _CONTEXT: Final[Mapping[str, object]] = {
     **dict.fromkeys(
         (
-            "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom", "delta_z", "delta_vz",
-            "delta_heading", "delta_dist_bottom", "ref_lat", "ref_lon", "ref_alt",
+            "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "delta_z", "delta_vz",
+            "delta_heading", "ref_lat", "ref_lon", "ref_alt", "z_deriv",
         ), math.nan,
     ),
     **dict.fromkeys(("delta_xy", "delta_vxy"), (math.nan, math.nan)),
 }  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; a smaller step cannot be a jump at any velocity
 _MAX_INTERVAL: Final = 0.5  # s between two messages; longer intervals are not checked for jumps
+_SURE_INTERVAL: Final = 0.1  # s; over a longer one, motion by the rates at its ends is less certain
+# Of each quantity that may be reset: its values, the rates that may have moved each of them, and its delta.
+_STEPS: Final[Mapping[Quantity, tuple[tuple[str, ...], tuple[tuple[str, ...], ...], str]]] = {
+    "xy": (("x", "y"), (("vx",), ("vy",)), "delta_xy"),
+    "z": (("z",), (("z_deriv", "vz"),), "delta_z"),
+    "vxy": (("vx", "vy"), (("ax",), ("ay",)), "delta_vxy"),
+    "vz": (("vz",), (("az",),), "delta_vz"),
+    "heading": (("heading",), ((),), "delta_heading"),
+}
 
 Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
@@ -68,15 +76,12 @@ class PositionDetector(ChangeDetector):
     def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
         if before:
             earlier, values = _fill_missing(before), _fill_missing(after)
-            tracker = ResetTracker()
-            tracker.add(cast("Any", SimpleNamespace(**earlier)))
-            track = tracker.add(cast("Any", SimpleNamespace(**values)))
             yield from _detect_origin(earlier, values)
-            quantities = [name for name in RESET_COUNTERS if name in track.reset and name != "dist_bottom"]
+            quantities = [name for name in _STEPS if earlier[RESET_COUNTERS[name]] != values[RESET_COUNTERS[name]]]
             if quantities:
-                yield _reset(quantities, values, track)
+                yield _reset(quantities, earlier, values)
             step = None
-            if values["xy_valid"] and not track.origin_changed and "xy" not in track.reset:
+            if values["xy_valid"] and "xy" not in quantities and _origin(earlier) == _origin(values):
                 step = self._unexplained_step()
             yield from self._track_jump(step)
         yield from detect_flags(_KINDS, before, after)
@@ -103,31 +108,61 @@ class PositionDetector(ChangeDetector):
             yield Finding("jump", "once", text, numbers=numbers)
 
 
-def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
-    """Return the finding of a reset, with the size of each quantity whose delta belongs to it."""
+def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
+    """Return the finding of a reset, with the size of each quantity that the data has."""
+    found = {name: _size_of_reset(name, before, after) for name in quantities}
+    sizes = {name: size for name, size in found.items() if size is not None}
     numbers: dict[str, float] = {}
     words = []
-    explained = {name for name in quantities if name not in track.discontinued}
-    if "xy" in explained:
-        numbers |= {"north": values["x"] - track.x, "east": values["y"] - track.y}
-        size = math.hypot(numbers["north"], numbers["east"])
+    if "xy" in sizes:
+        numbers |= zip(("north", "east"), sizes["xy"], strict=True)
+        size = math.hypot(*sizes["xy"])
         words.append(f"xy by {size:.1f} m ({_signed(numbers['north'])} north, {_signed(numbers['east'])} east)")
-    if "z" in explained:
-        numbers["up"] = track.z - values["z"]
+    if "z" in sizes:
+        numbers["up"] = -sizes["z"][0]
         words.append(f"height by {_signed(numbers['up'])} m")
-    if "vxy" in explained:
-        numbers |= {"v_north": values["vx"] - track.vx, "v_east": values["vy"] - track.vy}
-        words.append(f"vxy by {math.hypot(numbers['v_north'], numbers['v_east']):.1f} m/s")
-    if "vz" in explained:
-        numbers["v_up"] = track.vz - values["vz"]
+    if "vxy" in sizes:
+        numbers |= zip(("v_north", "v_east"), sizes["vxy"], strict=True)
+        words.append(f"vxy by {math.hypot(*sizes['vxy']):.1f} m/s")
+    if "vz" in sizes:
+        numbers["v_up"] = -sizes["vz"][0]
         words.append(f"vz by {_signed(numbers['v_up'])} m/s")
-    is_small = all(abs(each) < SMALL_RESET for each in numbers.values()) and explained.issuperset(quantities)
-    if "heading" in explained:
-        numbers["heading"] = values["delta_heading"]
+    is_small = all(abs(each) < SMALL_RESET for each in numbers.values()) and len(sizes) == len(found)
+    if "heading" in sizes:
+        numbers["heading"] = sizes["heading"][0]
         words.append(f"heading by {_signed(math.degrees(numbers['heading']), 0)} deg")
-    words += [f"{name} by an unknown amount" for name in quantities if name not in explained]
+    words += [f"{name} by an unknown amount" for name in quantities if name not in sizes]
     severity: Severity | None = "info" if is_small else None
     return Finding("reset", "once", f"reset of {', '.join(words)}", tuple(quantities), numbers, severity=severity)
+
+
+def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:
+    """Return the step between two messages at a reset, None if unknown.
+
+    It is the delta if the data agrees with it, else the difference of the two samples less the motion meanwhile.
+    """
+    values, rates, delta = _STEPS[name]
+    seconds = (after["timestamp"] - before["timestamp"]) / 1e6
+    observed = [after[value] - before[value] for value in values]
+    observed = observed if name != "heading" else [*map(wrap, observed)]
+    count = (after[RESET_COUNTERS[name]] - before[RESET_COUNTERS[name]]) % 256
+    told = after[delta] if isinstance(after[delta], tuple) else (after[delta],)
+    is_told = count == 1 and all(map(math.isfinite, told))
+    if not all(map(math.isfinite, observed)):
+        return told if is_told else None
+    # Velocity changes at an unknown moment between the two, and z need not move with vz: each rate is possible.
+    motions = [
+        [rate * seconds for of in names for rate in (before[of], after[of]) if math.isfinite(rate)] or [0.0]
+        for names in rates
+    ]
+    margin = SMALL_RESET * max(1.0, seconds / _SURE_INTERVAL)
+    if is_told and all(
+        min(0.0, *motion) - margin <= step - size <= max(0.0, *motion) + margin
+        for step, size, motion in zip(observed, told, motions, strict=True)
+    ):
+        return told
+    steps = tuple(step - sum(motion[:2]) / len(motion[:2]) for step, motion in zip(observed, motions, strict=True))
+    return steps if is_told or 0 < seconds <= _MAX_INTERVAL else None
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -146,6 +181,11 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
             severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
             numbers = {"distance": distance, "up": up}
             yield Finding("origin_moved", "once", text, numbers=numbers, severity=severity)
+
+
+def _origin(fields: Fields) -> list[float | None]:
+    """Return the origin with None for NaN, which makes two missing origins equal."""
+    return [each if math.isfinite(each) else None for each in (fields["ref_lat"], fields["ref_lon"], fields["ref_alt"])]
 
 
 def _signed(value: float, digits: int = 1) -> str:

@@ -446,6 +446,28 @@ def test_jump_that_is_a_reset(flight: Flight) -> None:
     assert flight.wait(0.1).send(x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)) == []
 
 
+@pytest.mark.parametrize(
+    ("seconds", "fields", "size"),
+    [
+        (0.1, {"z": -10.0, "z_reset_counter": 1, "delta_z": -6.0}, "height by 10.0 m"),  # the delta is not in the data
+        (0.1, {"z": 0.0, "z_reset_counter": 1, "delta_z": -489.6}, "height by 0.0 m"),  # an origin is set
+        (0.1, {"z": -12.0, "vz": -20.0, "z_reset_counter": 1, "delta_z": -10.2}, "height by 10.2 m"),  # and motion
+        (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
+        (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
+        (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
+        (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
+        (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
+        (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
+    ],
+)
+def test_size_of_a_reset_is_the_step_in_the_data(
+    flight: Flight, seconds: float, fields: dict[str, Any], size: str
+) -> None:
+    """It is the delta where the two samples agree with it, else their difference without motion, if they are near."""
+    reset = next(each for each in flight.wait(seconds).send(**fields) if each.kind == "reset")
+    assert reset.text == f"reset of {size}"
+
+
 def test_flapping_is_reported_when_it_ends(flight: Flight) -> None:
     """Of more than four changes in ten seconds the last is reported after five seconds, with their number."""
     told, times = [], []

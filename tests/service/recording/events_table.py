@@ -4,7 +4,8 @@
 
 It was written from PX4's definitions of the messages, by somebody who had not seen `nedbus.events`. Each row is a
 difference between two messages of a topic that follow each other (instance 0); the first message gives none. Down is
-positive. A reset has the deltas that the message tells, and none of a position whose origin changed with it.
+positive. A reset has the deltas that the message tells, or where the two samples contradict them, the step from one to
+the other without the motion by velocity; it has none of a position whose origin changed with it.
 """
 
 from __future__ import annotations
@@ -37,6 +38,11 @@ VALID: Final = {
 JUMP_STEP: Final = 1.0  # m beyond velocity * dt, in one step
 JUMP_DT: Final = 0.5  # s, longest step, and longest pause inside one slide
 ORIGIN_MIN: Final = 0.01  # m
+DELTA_DT: Final = 0.1  # s, step up to which a delta may be off by DELTA_MARGIN
+DELTA_MARGIN: Final = 0.5  # m, m/s, rad
+RATES: Final = {
+    "x": ("vx",), "y": ("vy",), "z": ("z_deriv", "vz"), "vx": ("ax",), "vy": ("ay",), "vz": ("az",), "heading": (),
+}  # fmt: skip
 EARTH: Final = 6_371_000.0  # m
 
 Row = dict[str, Any]
@@ -199,11 +205,28 @@ def add_reset(table: Table, position: Topic, index: int, *, origin_changed: bool
         ("heading", {"heading": "delta_heading"}),
     ):
         if quantity in changed and not (origin_changed and quantity in ("xy", "z")):
-            numbers |= {name: rounded(position[field][index]) for name, field in names.items()}
+            numbers |= dict(zip(names, step_of(position, quantity, [*names.values()], index), strict=True))
     if origin_changed:
         numbers["origin"] = True
     if changed:
         table.add(position.time(index), "reset", "once", **numbers)
+
+
+def step_of(position: Topic, quantity: str, deltas: Sequence[str], index: int) -> list[float]:
+    """Return the deltas of a reset; where one is outside all that the rates allow, the steps without motion."""
+    margin = DELTA_MARGIN * max(1.0, position.step(index) / DELTA_DT)
+    told, seen, fits = [], [], True
+    values = {"xy": ("x", "y"), "vxy": ("vx", "vy")}.get(quantity, (quantity,))
+    for delta, value in zip(deltas, values, strict=True):
+        step = position[value][index] - position[value][index - 1]
+        if value == "heading":
+            step = (step + math.pi) % math.tau - math.pi
+        moved = [position[rate][each] * position.step(index) for rate in RATES[value] for each in (index - 1, index)]
+        allowed = [step, *(step - each for each in moved)]
+        fits = fits and min(allowed) - margin <= position[delta][index] <= max(allowed) + margin
+        told.append(rounded(position[delta][index]))
+        seen.append(rounded(step - (sum(moved[:2]) / 2 if moved else 0.0)))
+    return told if fits else seen
 
 
 def add_gps(table: Table, gps: Topic) -> None:

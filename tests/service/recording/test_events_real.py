@@ -233,7 +233,7 @@ def test_vehicle_that_fell() -> None:
         ("failsafe_flag", 125.482),
     ]  # fmt: skip
     assert short(told["reset", 118.838].before) == [("estimator_fault", 116.609), ("dead_reckoning", 118.838)]
-    assert told["reset", 118.838].what == "reset of height by 19.2 m, vz by 3.8 m/s"
+    assert told["reset", 118.838].what == "reset of height by 24.3 m, vz by 4.8 m/s"  # delta_z: -19.2
     lasted = told["dead_reckoning", 116.238]
     assert lasted.until is not None
     assert lasted.until - lasted.since == pytest.approx(2.6, abs=1e-3)

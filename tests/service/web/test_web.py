@@ -467,7 +467,7 @@ def flown(sky: Sky) -> Sky:
     sky.fly(30.04, WING, QUAD)
     for seconds, wing, quad in (
         (4, {"xy_valid": False}, {}), (96, {}, {}), (4, {}, {"dead_reckoning": True}), (46, {}, {}),
-        (50, {"xy_reset_counter": 1, "delta_xy": (30.0, 0.0)}, {}),
+        (50, {"x": 30.0, "xy_reset_counter": 1, "delta_xy": (30.0, 0.0)}, {}),
     ):  # fmt: skip
         for _ in range(seconds * 10):
             sky.time += 0.1
@@ -499,7 +499,7 @@ def test_tapped_event_is_shown(flown: Sky) -> None:
     assert f"time={then:.1f}" in page.address
     times = page.plotted["time"]
     assert times[0] / 1e3 < then < times[-1] / 1e3
-    flown.fly(5, WING, QUAD, xy_reset_counter=1)
+    flown.fly(5, WING, QUAD, x=30.0, xy_reset_counter=1)
     page.look()
     assert page.pinned == then
     page.say("now")

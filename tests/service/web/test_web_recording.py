@@ -32,7 +32,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
     def fields(time: float) -> dict[str, object]:
         flags = {"xy_valid": not 90 <= time < 120, "xy_reset_counter": int(time >= 150)}
-        return {"x": time, "y": math.sin(time), **flags}
+        return {"x": time, "y": math.sin(time) + 4.0 * flags["xy_reset_counter"], **flags}
 
     file = write_flight(tmp_path_factory.mktemp("web"), dict.fromkeys((VLP, TRUTH), fields), seconds=180)
     opened = Recording(file)
@@ -155,7 +155,7 @@ def test_event_is_jumped_to(recording: Recording) -> None:
     assert page.moments == (0.0, 60.0)
     marks = re.findall(r'data-with="(\d+)" title="([^"]*)" class="(\w+)"\s+style="left: ([\d.]+)%"', page.part("marks"))
     assert [(text, grade) for _, text, grade, _ in marks] == [
-        ("xy not valid", "bad"), ("reset of xy by an unknown amount", "watch"),
+        ("xy not valid", "bad"), ("reset of xy by 4.1 m (0.1 north, 4.1 east)", "watch"),
     ]  # fmt: skip
     assert float(marks[0][3]) == pytest.approx(50, abs=0.2)
     page.say("event", marks[0][0])
