@@ -129,7 +129,7 @@ def explain(event: Event, before: Iterable[Event], conditions: Iterable[Conditio
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""
     earliest = event.time - min(WINDOW, WINDOW if event.lasted is None else event.lasted)
     for each in before:
-        is_bad = each.severity != "info" or event.change == "end" or kind.correction
+        is_bad = each.severity != "info" or (each.kind != "text" and (event.change == "end" or kind.correction))
         is_near = earliest <= each.time <= event.time
         is_link = each.kind == "link_down"  # its losses are detected after its end
         is_of_change = is_link or (is_bad and each.change != excluded)
