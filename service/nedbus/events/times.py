@@ -22,6 +22,11 @@ CLOCKS: Final[Mapping[Clock, str]] = {
 }  # fmt: skip
 """The clocks of times. UTC and seconds since boot may differ between vehicles."""
 
+UNITS: Final[Mapping[Clock, str]] = {
+    "host": "UTC", "vehicle": "UTC", "boot": "s since boot", "start": "s since the start",
+}  # fmt: skip
+"""The names of the clocks behind a time."""
+
 
 @dataclass(frozen=True, slots=True)
 class Times:
@@ -38,9 +43,11 @@ class Times:
         """Return the Unix time of an event [s], None if unknown."""
         if self.is_live:
             return event.time
-        if event.boot is None:
-            return None
-        utc = event.boot + (0.0 if is_unix_time(event.boot * 1e6) else self.offsets.get(event.vehicle, math.nan))
+        return None if event.boot is None else self.utc_of_boot(event.vehicle, event.boot)
+
+    def utc_of_boot(self, vehicle: str, boot: float) -> float | None:
+        """Return the Unix time of a time since a vehicle's boot [s], which may be Unix time already."""
+        utc = boot + (0.0 if is_unix_time(boot * 1e6) else self.offsets.get(vehicle, math.nan))
         return utc if is_unix_time(utc * 1e6) else None
 
     def clock(self, event: Event) -> Clock:
@@ -51,7 +58,7 @@ class Times:
 
     def unit(self, event: Event) -> str:
         """Return what to write behind the time of an event: the name of its clock."""
-        return {"boot": "s since boot", "start": "s since the start"}.get(self.clock(event), "UTC")
+        return UNITS[self.clock(event)]
 
     def text(self, event: Event) -> str:
         """Format the time of an event, without a date, as `find` reads it: 14:05:12.3, 123.400 or +12.300."""

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
-from nedbus.events import KINDS, SEVERITIES, Event, Severity, spans_of
+from nedbus.events import KINDS, SEVERITIES, UNITS, Event, Severity, Times, spans_of, to_clock
 from nedbus.whole_file import whole_file
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
@@ -36,6 +36,9 @@ _MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
     "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
 }  # fmt: skip
 _LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
+_STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21_600)  # s between ticks
+_TICKS: Final = 6  # on a time axis
+_BOOT: Final = Times()
 _NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
@@ -74,12 +77,18 @@ class _Mark:
 
 
 def draw(
-    streams: Sequence[tuple[Address, MessageArray]], path: str | Path, *, title: str, events: Iterable[Event] = ()
+    streams: Sequence[tuple[Address, MessageArray]],
+    path: str | Path,
+    *,
+    title: str,
+    events: Iterable[Event] = (),
+    times: Times = _BOOT,
 ) -> None:
     """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
     Each stream must have at least one message.
-    Times are seconds since the first message of all streams, positions local NED in metres; altitude is -z.
+    The time axis has UTC if `times` has that of all vehicles, else seconds since boot.
+    Positions are local NED in metres; altitude is -z.
     Fields named by `missing_of` are not plotted; a note lists them.
     `events`: for the streams' vehicles, events of severity bad or watch, mode changes, arming and landing are marked.
 
@@ -89,14 +98,15 @@ def draw(
         raise ConfigError(str(path), f"not a picture format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
         with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
-            draw_figure(streams, title=title, events=events).savefig(
-                part
-            )  # a glyph missing in the font is only a warning
+            figure = draw_figure(streams, title=title, events=events, times=times)
+            figure.savefig(part)  # a glyph missing in the font is only a warning
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
 
-def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = ()) -> Figure:
+def draw_figure(
+    streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
+) -> Figure:
     """Return the figure that `draw` saves."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
     drawn = [
@@ -122,16 +132,34 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
     for name in ("track", "altitude", "speed"):
         axes[name].grid(alpha=0.3)
     axes["track"].legend(fontsize="small", loc="best")
-    times = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in marks)])
-    margin = 0.02 * (np.ptp(times) or 1.0)
+    seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in marks)])
+    margin = 0.02 * (np.ptp(seconds) or 1.0)
     for name in axes.keys() - {"track"}:
-        axes[name].set_xlim(times.min() - margin, times.max() + 3 * margin)  # room for the last label
+        axes[name].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
+    label = _label_times([axes[name] for name in axes.keys() - {"track"}], drawn, start / 1e6, times)
     figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
     figure.supxlabel(_explain_missing(drawn), fontsize="small")
-    axes["events" if by_row else "flags"].set_xlabel("time [s]")
+    for name in ("speed", "events" if by_row else "flags"):
+        axes[name].set_xlabel(label)
     if by_row:
         _draw_events(figure, axes["events"], by_row)
     return figure
+
+
+def _label_times(axes: Iterable[Any], streams: Iterable[_Stream], start: float, times: Times) -> str:
+    """Put ticks on time axes that begin at `start` [s since boot], in UTC if it is one for all; return their label."""
+    found = [times.utc_of_boot(stream.address.vehicle, start) for stream in streams]
+    utc = [each for each in found if each is not None]
+    has_utc = len(utc) == len(found) and max(utc) - min(utc) < 1.0
+    shift = utc[0] if has_utc else start
+    for each in axes:
+        low, high = (limit + shift for limit in each.get_xlim())
+        step = next((step for step in _STEPS if high - low < _TICKS * step), _STEPS[-1])
+        ticks = np.arange(np.ceil(low / step), high / step) * step
+        each.set_xticks(
+            ticks - shift, [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
+        )
+    return f"time [{UNITS['vehicle' if has_utc else 'boot']}]"
 
 
 def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
@@ -162,7 +190,7 @@ def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
         return stream.seconds, np.hypot(stream.messages["vx"], stream.messages["vy"])
 
     _draw_lines(axes, streams, "v_xy_valid", line_of, width=0.9)
-    axes.set(xlabel="time [s]", ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
+    axes.set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
 
 
 def _draw_lines(

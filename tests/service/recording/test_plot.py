@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.events import Event
+from nedbus.events import Event, Times
 from nedbus.sources import read_account
 from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
@@ -35,10 +35,12 @@ def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, Message
     return Address(vehicle, VLP), array
 
 
-def drawn(streams: Sequence[tuple[Address, MessageArray]], events: Sequence[Event] = ()) -> dict[str, Any]:
+def drawn(
+    streams: Sequence[tuple[Address, MessageArray]], events: Sequence[Event] = (), times: Times | None = None
+) -> dict[str, Any]:
     """Return the parts of a plot, by name."""
     plot = pytest.importorskip("nedbus.recording.plot", exc_type=ImportError)  # takes a second, for Matplotlib
-    figure = plot.draw_figure(streams, title="a flight", events=events)
+    figure = plot.draw_figure(streams, title="a flight", events=events, times=times or Times())
     figure.draw_without_rendering()
     return {str(axes.get_label()): axes for axes in figure.axes}
 
@@ -160,6 +162,36 @@ def test_events_are_marked_by_severity() -> None:
     others = drawn([flight_of(vehicle="8")], events)
     assert "events" not in others, "events of a vehicle that is not drawn"
     assert not marks_of(others["track"], "x")
+
+
+@pytest.mark.parametrize(
+    ("offsets", "ticks", "label"),
+    [
+        ({}, ["2", "4", "6", "8", "10"], "time [s since boot]"),
+        ({"7": 1.7e9 + 1.3}, ["22:13:24", "22:13:26", "22:13:28", "22:13:30", "22:13:32"], "time [UTC]"),
+        ({"8": 1.7e9}, ["2", "4", "6", "8", "10"], "time [s since boot]"),
+    ],
+)
+def test_time_axis_names_its_clock(offsets: dict[str, float], ticks: list[str], label: str) -> None:
+    """Ticks are round times of the clock that `why` and `events` use, UTC or seconds since boot. Messages made up."""
+    event = event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",))
+    parts = drawn([flight_of()], [event], Times(offsets=offsets))
+    assert parts["speed"].get_xlabel() == parts["events"].get_xlabel() == label
+    for name in ("altitude", "speed", "flags", "events"):
+        low, high = parts[name].get_xlim()
+        assert all(low <= place <= high for place in parts[name].get_xticks())
+        assert [text.get_text() for text in parts[name].get_xticklabels()] == ticks
+    [(place, _)] = marks_of(parts["events"], "x")
+    times = Times(offsets=offsets)
+    shown = dict(zip(parts["events"].get_xticks(), ticks, strict=True))
+    nearest = min(shown, key=lambda each: abs(each - place))
+    assert times.find(shown[nearest], event) - event.time == pytest.approx(nearest - place)
+
+
+def test_time_axis_of_different_clocks_is_since_boot() -> None:
+    """Vehicles that booted at different times share an axis only since boot. Messages made up."""
+    parts = drawn([flight_of(), flight_of(vehicle="8")], times=Times(offsets={"7": 1.7e9, "8": 1.7e9 + 30}))
+    assert parts["speed"].get_xlabel() == "time [s since boot]"
 
 
 def test_bar_ends_when_all_flags_are_over() -> None:
