@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final, cast
 
 from nedbus.recording import UlogReader, UlogStream
+from nedbus.ulog import SPOKEN
 from nedbus_msgs import ALL, DEFAULT, Address
 
 from .options import RecordedOptions
@@ -85,7 +86,7 @@ class _Clock:
             fields = stream.decode(payload)
             time = cast("int", fields["timestamp"])
             self._now = self._now or reader.start
-            if time < newest.get(stream, 0):
+            if time < newest.get(stream, 0) and stream.subscription is not SPOKEN:  # PX4 queues its texts
                 self.unordered[stream.address] += 1
             newest[stream] = time
             if held is not None:

@@ -25,7 +25,7 @@ from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient, LogStr
 from nedbus.sources.mavlink.log_reassembly import Piece
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
-from nedbus.ulog import Data, UlogParser
+from nedbus.ulog import Data, Texts, UlogParser
 from tests.flights.ulogs import write_raw_log
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
@@ -119,6 +119,7 @@ def sent_messages() -> list[tuple[str, str]]:
     recording = read_recording(SHORT)
     plain = [each.content for each in recording.entries if not isinstance(each.content, bytes)]
     records = UlogParser(verify=True).feed(b"".join(each.data for each in (*recording.header, *plain)))
+    records = list(Texts().merge(records))
     return [
         (each.subscription.name, repr(each.subscription.decode(each.payload)))
         for each in records
@@ -130,7 +131,7 @@ def test_stream_is_published_in_full() -> None:
     """All messages of all topics that a real PX4 (SITL) sent are published, in order, each with all of its fields."""
     received, sent = Received("log=1"), sent_messages()
     assert [(each.address.topic, repr(each.fields)) for each in received.stream] == sent
-    assert len({topic for topic, _ in sent}) == 19
+    assert len({topic for topic, _ in sent}) == 20
     status = received.status
     assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
     assert status.header_time is not None
