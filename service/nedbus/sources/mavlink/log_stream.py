@@ -14,6 +14,7 @@ from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.ulog import (
+    SPOKEN,
     Damage,
     Data,
     Dropout,
@@ -82,7 +83,7 @@ class LogStream:
 
     def carries(self, address: Address) -> bool:
         """Return whether messages of an address come from the stream, so that none are converted."""
-        return self.is_streaming and address in self._carried
+        return self.is_streaming and (address in self._carried or address.topic == SPOKEN.name)
 
     def add(self, piece: Piece, now: float) -> Iterator[SourceMessage | Rejection]:
         """Yield the messages that a piece completes."""

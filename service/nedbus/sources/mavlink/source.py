@@ -17,6 +17,7 @@ from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceContext, SourceMessage
 from nedbus.transport import Session
+from nedbus.ulog import SPOKEN
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
@@ -47,7 +48,7 @@ class MavlinkSource:
 
     def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
         parse_link(link)
-        known = {topic for topic, _ in CONVERSIONS.values()}
+        known = {SPOKEN.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
             raise ConfigError(f"mavlink:{link}", reason, key="topics")

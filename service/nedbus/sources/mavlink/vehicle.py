@@ -15,9 +15,11 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
+from nedbus.ulog import SPOKEN
 from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address, is_unix_time
 
 from .fields import CONVERSIONS, is_reboot, sensors_of
+from .status_texts import StatusTexts
 
 _log = logging.getLogger(__name__)
 
@@ -93,6 +95,7 @@ class Vehicle:
         self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
         self._last: dict[Address, int] = {}  # timestamps
         self._sequence: int | None = None
+        self._texts = StatusTexts()
         self._started = now
         self._arrivals: dict[int, float] = {}  # of requested messages
         self._pending = [*self._rates] * _FIRST_ROUNDS
@@ -142,6 +145,10 @@ class Vehicle:
             self._arrivals[number] = now
         is_double = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
         self._remember(kind, message, timestamp, now)
+        if kind == "STATUSTEXT":
+            self._texts.add(message, now)
+        if fields_of is None and self._newest is not None:
+            topic, timestamp, fields_of = SPOKEN.name, self._newest * 1000, lambda _: self._texts.take(now)
         if fields_of is None or topic not in self._topics or is_double or timestamp is None:
             return None
         fields = {name: value for name, value in fields_of(message).items() if value is not None}
