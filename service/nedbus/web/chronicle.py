@@ -5,7 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from nedbus.events import Account, Event, Span, State, Story, Times, spans_of, state_at, stories_of, story_of, to_clock
+from nedbus.events import (
+    Account,
+    Condition,
+    Event,
+    Span,
+    State,
+    Story,
+    Times,
+    spans_of,
+    state_at,
+    stories_of,
+    story_of,
+    to_clock,
+)
 
 PAST: Final = 600.0
 """Seconds of history on a live page."""
@@ -63,21 +76,23 @@ class Chronicle:
             parts.append(_elapsed(seconds))
         return ", ".join(parts)
 
-    def story(self, vehicle: str, now: float, at: Event | float | None) -> Story | None:
-        """Return the story of the selected event or time, or of a current or recent condition.
+    def story(self, vehicle: str, now: float, at: Event | float | None, held: Sequence[Condition]) -> Story | None:
+        """Return the story of the selected event or time; for now, that of the current state or a recent condition.
 
-        `at`: the selected event or time, None for now.
+        `at`: the selected event or time, None for now. `held`: the conditions of the current state.
         """
         self._read()
+        if at is None and held:  # the condition that gives the state its text
+            begin = held[0].begin.identity
+            at = next((event for event in self._by_vehicle.get(vehicle, ()) if event.identity == begin), None)
         stories = self._tell(vehicle, at)
         if at is not None:
             return next(iter(stories), None)
         stories = [story for story in stories if story.since <= now]
         going = [story for story in stories if story.until is None or story.until > now]
-        if going:
-            return max(going, key=lambda story: story.is_bad)
-        recent = [story for story in stories if (story.until or 0.0) > now - PAST]
-        return recent[-1] if recent else None
+        fitting = [story for story in going if held and held[0].text in story.what]
+        recent = [story for story in stories if story not in going and (story.until or 0.0) > now - PAST]
+        return next(iter([*fitting, *going, *reversed(recent)]), None)
 
     def _tell(self, vehicle: str, at: Event | float | None) -> list[Story]:
         """Return the stories of an event, a time, or all times; cached for all viewers until the next event."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from nedbus.client import (
     Health,
@@ -32,7 +32,6 @@ TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
 """Streams shown on a page, positions before others; further streams are only counted."""
 
-_FORGOTTEN: Final = 600.0  # s after which a vehicle that has gone is listed last instead of first
 _SILENT: Final = 60.0  # s without a message after which a stream makes room for another
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = 2
@@ -56,20 +55,35 @@ class Line:
         """Description of the state and flags."""
         return describe_stream(self.health, self.state)
 
+    @property
+    def silence(self) -> float | None:
+        """Age of the last message [s], None while messages arrive."""
+        return self.health.age or 0.0 if self.state.name in ("disconnected", "gone", "stale") else None
+
+
+class Fact(NamedTuple):
+    """A value from another message than the position, "" if unknown.
+
+    `age`: age of the value [s] if its stream is silent, None while messages arrive.
+    """
+
+    text: str = ""
+    age: float | None = None
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """Snapshot of one vehicle: its state and its streams.
 
-    `main`: the stream shown as its marker; `facts`: mode, armed, battery and gps from its other messages, "" if
-    unknown; `number`: determines its colour; `log`: its ULog stream over MAVLink, None without one.
+    `main`: the stream shown as its marker; `facts`: mode, armed, battery and gps; `number`: determines its colour;
+    `log`: its ULog stream over MAVLink, None without one.
     """
 
     vehicle: str
     state: State
     main: Line
     lines: tuple[Line, ...]
-    facts: Mapping[str, str]
+    facts: Mapping[str, Fact]
     number: int
     log: LogStreamStatus | None = None
 
@@ -101,8 +115,7 @@ class Row:
     def is_here(self) -> bool:
         """True while valid positions arrive."""
         last = self.main.stream.last
-        fresh = self.main.state.name not in ("disconnected", "gone", "stale")
-        if not fresh or last is None or not is_position(self.main.address):
+        if self.main.silence is not None or last is None or not is_position(self.main.address):
             return False
         return bool(last.message.xy_valid) or "xy_valid" in last.provenance.missing
 
@@ -211,41 +224,20 @@ class Fleet:
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
-        rows = [self._row(name, each, states.get(name), own, logs.get(name)) for name, each in lines.items()]
-        rows.sort(key=lambda row: (_rank(row, time), natural(row.vehicle)))
+        rows = [self._row(name, each, states.get(name), logs.get(name)) for name, each in lines.items()]
+        rows.sort(key=lambda row: (GRADES.index(row.grade), natural(row.vehicle)))
         rejected = self._rejected.total()
         self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture
 
-    def _row(
-        self, vehicle: str, lines: Sequence[Line], state: State | None, own: str, log: LogStreamStatus | None
-    ) -> Row:
+    def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, log: LogStreamStatus | None) -> Row:
         main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
         state = state or State("info", "ok", None, ())
-        if state.severity == "info" and main.state.name == "slow" and not own:  # otherwise the page itself is slow
-            state = replace(state, severity="watch", text=str(main.state))
         number = self._numbers.pop(vehicle) if vehicle in self._numbers else next(self._next_number)
         self._numbers[vehicle] = number
         if len(self._numbers) > MAX_STREAMS:
             del self._numbers[next(iter(self._numbers))]
-        return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number, log)
-
-    def _facts(self, vehicle: str) -> dict[str, str]:
-        status = self._last(vehicle, "vehicle_status")
-        battery = self._last(vehicle, "battery_status", 0)
-        gps = self._last(vehicle, "vehicle_gps_position") or self._last(vehicle, "sensor_gps", 0)
-        left = getattr(battery, "remaining", math.nan)
-        armed = status is not None and status.arming_state == _ARMED
-        return {
-            "mode": "" if status is None else MODES.get(status.nav_state, str(status.nav_state)),
-            "armed": "" if status is None else "armed" if armed else "disarmed",
-            "battery": f"{100 * left:.0f} %" if 0 <= left <= 1 else "",
-            "gps": "" if gps is None else f"{FIXES.get(gps.fix_type, gps.fix_type)} · {gps.satellites_used}",
-        }
-
-    def _last(self, vehicle: str, topic: str, instance: int | None = None) -> Any:
-        stream = self.streams.get(Address(vehicle, topic, instance))
-        return stream.last.message if stream is not None and stream.last is not None else None
+        return Row(vehicle, state, main, tuple(lines), _facts(lines), number, log)
 
     def _remove(self, address: Address) -> None:
         self.streams.pop(address, None)
@@ -261,10 +253,25 @@ class Fleet:
         return True
 
 
-def _rank(row: Row, time: float) -> int:
-    """Return the sort rank of a vehicle: 0 for bad ones, the highest for those gone long ago."""
-    is_forgotten = any(each.kind == "gone" and time - each.since > _FORGOTTEN for each in row.state.conditions[:1])
-    return len(GRADES) if is_forgotten else GRADES.index(row.grade)
+def _facts(lines: Sequence[Line]) -> dict[str, Fact]:
+    known = {(line.address.topic, line.address.instance or 0): line for line in lines}
+
+    def fact(topic: str, describe: Callable[[Any], str]) -> Fact:
+        line = known.get((topic, 0))
+        last = None if line is None else line.stream.last
+        return Fact() if line is None or last is None else Fact(describe(last.message), line.silence)
+
+    gps = "vehicle_gps_position" if ("vehicle_gps_position", 0) in known else "sensor_gps"
+    return {
+        "mode": fact("vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))),
+        "armed": fact("vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"),
+        "battery": fact("battery_status", lambda last: _percent(last.remaining)),
+        "gps": fact(gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"),
+    }
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if 0 <= share <= 1 else ""
 
 
 def natural(name: str) -> list[tuple[bool, int, str]]:

@@ -158,7 +158,7 @@ class Viewer:
         story, then = None, chosen
         if chosen is not None:
             at = self.pinned if self._event is None else self._event
-            story = self._chronicle.story(chosen.vehicle, now, at)
+            story = self._chronicle.story(chosen.vehicle, now, at, chosen.state.conditions)
             if self.pinned is not None:
                 then = replace(chosen, state=self._chronicle.state(chosen.vehicle, now))
         self._text["head"].text = panels.head(self._name, picture, clock)

@@ -283,6 +283,52 @@ def test_facts_of_a_vehicle_are_in_its_row_and_tiles(sky: Sky) -> None:
         assert f"<span>{name}</span><b>{text}</b>" in page.part("nums")
 
 
+def test_values_of_a_silent_stream_are_the_last_known(sky: Sky) -> None:
+    """A vehicle that is gone, or one stream that is silent, has no current value: the tiles say how old theirs are."""
+    status, battery = Address("wing", "vehicle_status"), Address("wing", "battery_status", 0)
+    for _ in range(50):
+        sky.fly(0.2, z=-7.0)
+        sky.add(status, nav_state=4, arming_state=2)
+        sky.add(battery, remaining=0.5)
+    page = Page(sky)
+    assert "ago" not in page.part("nums")
+    for _ in range(50):
+        sky.fly(0.2, z=-7.0)
+        sky.add(status, nav_state=4, arming_state=2)
+    page.look()
+    assert (page.listed["wing"]["mode"], page.listed["wing"]["battery"]) == ("Hold", "-")
+    assert '<b class="quiet">50 %</b> <small>10.0 s ago</small>' in page.part("nums")
+    assert "<span>armed</span><b>armed</b>" in page.part("nums")
+    sky.time += 2100
+    page.look(alive=[])
+    row = page.listed["wing"]
+    assert (row["text"], row["mode"], row["battery"], row["gps"]) == ("gone", "-", "-", "-")
+    for name, text in (("armed", "armed"), ("battery", "50 %"), ("height", "7.0 m"), ("heading", "0°")):
+        assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.part("nums")
+
+
+def test_slow_stream_is_told_with_its_numbers(sky: Sky) -> None:
+    """The numbers of a vehicle whose position arrives at less than half of its usual rate name both rates."""
+    sky.fly(20, rate=20)
+    sky.fly(3, rate=5)
+    page = Page(sky)
+    assert re.search(r'<div class="watch">slow: 5.0 Hz, usually \d+</div>', page.part("nums"))
+    assert page.grades == {"wing": "ok"}
+
+
+def test_story_is_that_of_the_state(sky: Sky) -> None:
+    """Of several conditions the story is that of the one in the badge and in the list, whichever began first."""
+    gps = Address("wing", "sensor_gps", 0)
+    for seconds, state, fields in ((5, 1, {}), (5, 3, {}), (5, 3, {"dead_reckoning": True})):
+        for _ in range(seconds):
+            sky.fly(1, **fields)
+            sky.add(gps, fix_type=3, satellites_used=14, jamming_state=state)
+    page = Page(sky)
+    (badge,) = re.findall(r'<span class="badge \w+">. (.*?)</span>', page.part("why"))
+    assert badge == page.states["wing"] == "dead reckoning"
+    assert re.search(f'<div class="why.*?<b>{badge}', page.part("why"))
+
+
 def test_marker_stays_where_the_vehicle_was(sky: Sky) -> None:
     """The marker of a vehicle that is silent or invalid is open, has the shape of its state, and stays where it was."""
     sky.fly(3, WING, QUAD, x=4.0, y=2.0)
