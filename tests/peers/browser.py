@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 import pytest
@@ -103,6 +103,13 @@ _LABELS: Final = """() => {
     return [label, x, y, x + wide, y + 11]
   }).filter(each => each[0])
 }"""
+_CELLS: Final = f"""selector => {{ {_ALL}
+  const found = all(document).filter(each => each.matches(selector))
+  return found.filter(each => each.matches("td, span") || each.shadowRoot).map(each => [
+    each.textContent, each.scrollWidth > each.clientWidth + 1 || each.scrollHeight > each.clientHeight + 1,
+    getComputedStyle(each).backgroundAttachment,
+  ])
+}}"""
 _PLACE: Final = """([x, y]) => {
   const figure = [...Bokeh.documents[0].all_models].find(each => each.type == "Figure" && each.match_aspect)
   const view = Bokeh.index.find_one(figure)
@@ -122,6 +129,14 @@ def browser() -> Iterator[Browser]:
         started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
         yield started
         started.close()
+
+
+class Cell(NamedTuple):
+    """An element: its text, whether some of it needs scrolling, and which layers of its background move with it."""
+
+    text: str
+    is_cut: bool
+    layers: str
 
 
 class Tab:
@@ -185,6 +200,10 @@ class Tab:
     def part(self, name: str) -> str:
         """Return the text of a part of the page, as a person sees it."""
         return self.page.locator(f"div.{name} .bk-clearfix").first.inner_text()
+
+    def cells(self, selector: str) -> list[Cell]:
+        """Return the elements that a selector matches, of parts of the page, table cells and spans."""
+        return [Cell(*each) for each in self.page.evaluate(_CELLS, selector)]
 
     def misplaced(self) -> list[str]:
         """Return what is wrong with the places of all parts: empty, beyond the page, or on each other."""

@@ -28,7 +28,7 @@ MIN_SIDE: Final = 20.0
 _MIN_ZOOM: Final = 0.01  # m; smallest visible range taken from the browser
 _MARGIN: Final = 0.08  # margin on each side, as a fraction of the extent
 _FOLLOWED_SIDE: Final = 60.0  # m; side of the map while following a vehicle
-_LETTER, _HEIGHT = 6.5, 15.0  # pixels; width of a character and height of a label
+_LETTER, _HEIGHT, _MARK = 6.5, 12.0, 5.0  # pixels; width of a character, height of a label, radius of a marker
 _MAX_EVENTS: Final = 60  # latest events marked on the map
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 
@@ -118,30 +118,28 @@ class Map:
     def _labels(
         self, placed: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]
     ) -> dict[str, tuple[str, bool]]:
-        """Return labels without overlap by vehicle, the most severe first, and whether each is left of its marker."""
+        """Return the names that have room, the most severe vehicles first, and whether each is left of its marker."""
         (west, east), (south, north) = frame
         width, height = self.size
         scale, right = max((east - west) / width, (north - south) / height), east  # m per pixel
         start, end = (getattr(self.figure.x_range, side) for side in ("start", "end"))
         if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
             scale, right = (end - start) / width, end
-        taken = [  # keep labels off these markers
-            (each.vehicle, at.east / scale - _HEIGHT / 2, at.north / scale, _HEIGHT)
-            for each, at in placed
-            if each.grade == "bad" or each is row
-        ]
+        places = [(each, at.east / scale, at.north / scale) for each, at in placed]
+        severe = {each.vehicle for each, _ in placed if each.grade == "bad" or each is row}  # may cover other markers
+        taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
         labels: dict[str, tuple[str, bool]] = {}
-        for each, place in sorted(placed, key=lambda known: known[0] is not row):
-            text = each.vehicle if each.grade == "ok" else f"{each.vehicle} {each.brief}"
-            x, y, size = place.east / scale, place.north / scale, len(text) * _LETTER + 14
+        for each, x, y in sorted(places, key=lambda known: known[0] is not row):
+            name, low, size = each.vehicle, y + _MARK, len(each.vehicle) * _LETTER + 2 * _MARK
             is_left = x + size > right / scale  # it would extend beyond the map
-            x -= size * is_left
+            begin, end = (x - size, x) if is_left else (x, x + size)
             if each is row or all(
-                abs(y - top) > _HEIGHT or x + size < left or left + wide < x or owner == each.vehicle
-                for owner, left, top, wide in taken
+                end < left or wide < begin or low + _HEIGHT <= bottom or top <= low
+                for owner, left, wide, bottom, top in taken
+                if owner != name and (owner in ("", *severe) or name not in severe)
             ):
-                taken.append(("", x, y, size))
-                labels[each.vehicle] = text, is_left
+                taken.append(("", begin, end, low, low + _HEIGHT))
+                labels[name] = name, is_left
         return labels
 
     def _mark(self, row: Row, place: Place, label: str, is_left: bool) -> dict[str, Any]:

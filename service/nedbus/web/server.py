@@ -53,6 +53,7 @@ _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
 _MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, of which all but the newest are about to expire
 _MAX_CONNECTIONS: Final = 512  # or half of the open files that the process may have
 _REQUEST_TIMEOUT: Final = 10.0  # s for a client to send a request, and between two requests
+_PING: Final = 15.0  # s between pings of a WebSocket, which is closed unless the answer arrives before the next one
 _UNUSED_LIFETIME: Final = 15_000  # ms; a page is kept this long without its browser, for example during a short sleep
 
 
@@ -176,7 +177,8 @@ class WebServer:
             raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
         tornado = BokehTornado(
             {"/": Application(FunctionHandler(open_or_refuse))},
-            extra_websocket_origins=["*"], auth_provider=_Names(where), keep_alive_milliseconds=5000,
+            extra_websocket_origins=["*"], auth_provider=_Names(where),
+            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's own job drops sessions amid a message
             unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
             websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
             extra_patterns=[(path, _Text, {"make": make, "where": where}) for path, make in pages.items()],

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from bokeh.models import BasicTicker, ColumnDataSource, DatetimeTicker, FixedTicker, HoverTool, Range1d, TapTool
+from bokeh.models.annotations import Title
 from bokeh.plotting import figure
 
 from nedbus.events import ALL, KINDS, Event, Span
 
 from .column_data import replace, table
 from .stream import COLUMNS, History
-from .style import MARKERS, Style
+from .style import MARKERS, SHAPES, Style
 
-_MAX_ROWS: Final = 7  # vehicles
+_MAX_ROWS: Final = 7  # vehicles, or one fewer and the number of the others
 _MIN_ROWS: Final = 4  # rows of height, to keep the bars of a few vehicles thin
 _PLOTS: Final = {
     "height above own origin [m]": ("height",),
     "horizontal speed [m/s]": ("speed",),
     "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
 }
+_LEGEND: Final = (
+    f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} phase of flight  ▬ while it lasts  ┊ now"
+)
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _OF_TRUTH: Final = {"height", "speed"}
 
@@ -47,7 +51,10 @@ class Timeline:
         self._style = style
         self._ticker = FixedTicker()
         self.range = Range1d()
-        self.figure = _time_figure(self.range, clock, y_range=Range1d(), height=100, css_classes=["time"])
+        self.figure = _time_figure(
+            self.range, clock, y_range=Range1d(), height=100, css_classes=["time"],
+            title=Title(text=_LEGEND, text_color=style.quiet, text_font_size="11px"),
+        )  # fmt: skip
         self.figure.yaxis.ticker = self._ticker
         self.figure.ygrid.grid_line_color = None
         self.figure.hbar(
@@ -74,8 +81,14 @@ class Timeline:
             if span.severity == severity and span.until != span.since and (span.until is None or span.until > begin)
         ]
         affected = {event.vehicle for event in events if event.severity != "info"} | {name for name, _ in held}
-        names = [name for index, name in enumerate(vehicles) if name and (index == 0 or name in affected)]
-        names = [*([ALL] if ALL in affected else []), *names][:_MAX_ROWS]
+        first = [name for name in vehicles[:1] if name]  # the selected one
+        names = [
+            *([ALL] if ALL in affected else []),
+            *first,
+            *sorted(vehicles[1:], key=lambda name: name not in affected),
+        ]
+        hidden = len(names) - _MAX_ROWS + 1 if len(names) > _MAX_ROWS else 0
+        names = names[: len(names) - hidden]
         rows = {name: len(names) - index for index, name in enumerate(names)}
         colours = self._style.grades
         self.shown = [event for event in events if event.vehicle in rows]
@@ -92,12 +105,12 @@ class Timeline:
         ]  # fmt: skip
         replace(self._spans, bars)
         replace(self._now, [{"time": now * 1e3}])
-        self._ticker.ticks = list(rows.values())
-        self.figure.yaxis.major_label_overrides = {
-            row: "link, page" if name == ALL else name[:14] for name, row in rows.items()
-        }
+        labels: dict[Any, Any] = {row: "link, page" if name == ALL else name[:14] for name, row in rows.items()}
+        labels |= {0: f"+{hidden} more"} if hidden else {}
+        self._ticker.ticks = list(labels)
+        self.figure.yaxis.major_label_overrides = labels
         room = max(_MIN_ROWS - len(names), 0) / 2
-        self.figure.y_range.update(start=0.4 - room, end=len(names) + 0.6 + room)
+        self.figure.y_range.update(start=0.4 - room - bool(hidden), end=len(names) + 0.6 + room)
 
 
 class Plots:
@@ -111,9 +124,9 @@ class Plots:
         self._shown: dict[ColumnDataSource, tuple[History | None, int]] = {}
         self._style, self._clock = style, clock
 
-    def draw(self) -> list[figure]:
-        """Return new plots; call this after the map is shown, as they take as long as the rest of the page."""
-        return [self._draw(title, names) for title, names in _PLOTS.items()]
+    def draw(self) -> Iterator[figure]:
+        """Yield new plots, each of which takes as long as the map."""
+        return (self._draw(title, names) for title, names in _PLOTS.items())
 
     def update(self, chosen: History | None, truth: History | None) -> None:
         """Send the new points of the selected stream and its ground truth."""

@@ -64,6 +64,7 @@ class Viewer:
         self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0})
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
+        self._undrawn = self._plots.draw()
         self._map = Map(self._style, background)
         self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
         self._panels = self._style.open_panels(chronicle.moment)
@@ -73,7 +74,7 @@ class Viewer:
         self._search = TextInput(
             placeholder="search vehicle  /", sizing_mode="stretch_width", css_classes=["find"], stylesheets=sheets
         )
-        self._grid = column(sizing_mode="stretch_both", css_classes=["plots"])
+        self._grid = column(sizing_mode="stretch_both", css_classes=["plots"], visible=False)
         # Hidden inputs as channels to the browser: number of the update, last update drawn, click or key, URL.
         self._update_number, self._drawn, self._message, self._url = (TextInput(visible=False) for _ in range(4))
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
@@ -102,12 +103,13 @@ class Viewer:
         if drawn.isdecimal() and self._sent - int(drawn) >= _MAX_AHEAD:
             return
         self._sent += 1
-        if self._drawn.value and not self._grid.children:  # plots come later, so that map and list appear sooner
-            self._grid.children = [*self._plots.draw()]
+        if self._drawn.value and (plot := next(self._undrawn, None)):  # one by one, after map and list
+            self._grid.children = [*self._grid.children, plot]
         picture = self._fleet.picture
         if not self._is_choice and picture.rows:  # the most severe, until one is selected
             self.chosen = picture.rows[0].vehicle
         chosen = picture.row(self.chosen)
+        self._grid.visible = bool(self._grid.children) and chosen is not None and is_position(chosen.main.address)
         self._map.update(picture, self._whole, chosen)
         if self._ticks % _TEXT_TICKS == 0:
             self._go_to_requested()
@@ -195,6 +197,9 @@ class Viewer:
         else:
             first = max(begin, now - _MINUTE)
             move(self._plots.range, first, first + _MINUTE)
+        if self._player is None:  # the timeline of live vehicles begins with the first event
+            first = next((event.time for event in self._chronicle.events if event.time > begin), now)
+            begin = max(begin, min(first, now - _MINUTE) - 1.0)
         events = self._events_of_chosen()
         self._plots.mark(events, self._chronicle.spans.get(vehicle, ()), end)
         order = [vehicle, *(each.vehicle for each in picture.rows if each.vehicle != vehicle)]
@@ -203,7 +208,7 @@ class Viewer:
             move(self._timeline.range, begin, max(end, begin + 1.0))
         if self._player is not None:
             self._text["marks"].text = self._panels.strip(self._timeline.shown, self._player.recording.length)
-        since = begin if is_long_trail else now - _MINUTE
+        since = 0.0 if is_long_trail else now - _MINUTE
         self._map.mark([event for event in events if since < event.time <= now + 1.0], chosen, self._whole)
 
     def _events_of_chosen(self) -> list[Event]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import re
 import signal
 import socket
@@ -11,11 +13,14 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import product
+from typing import Any, cast
 
 import pytest
 import websockets
 from bokeh.client import pull_session
-from bokeh.models.widgets import Div
+from bokeh.document import Document
+from bokeh.models.widgets import Div, TextInput
+from tornado.ioloop import PeriodicCallback
 from websockets.sync.client import ClientConnection, connect
 
 from nedbus.monitoring import Page
@@ -198,6 +203,57 @@ def test_socket_without_a_token_leaves_no_traceback(
     offered = [websockets.Subprotocol(each) for each in protocols]
     with pytest.raises(websockets.InvalidStatus, match="403"):
         connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(url), subprotocols=offered or None)
+    assert not caplog.records
+
+
+def test_tab_that_closes_amid_a_message_leaves_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A tab may close while its message waits for the document, which an update has on a busy host."""
+    ran: list[None] = []
+    is_free, is_waiting = threading.Event(), threading.Event()
+
+    class Fast(PeriodicCallback):
+        """A job of Bokeh's server, a hundred times a second."""
+
+        def __init__(self, job: Callable[[], Any], _: float) -> None:
+            def run() -> Any:
+                ran.append(None)
+                return job()
+
+            super().__init__(run, 10)
+
+    async def update() -> None:
+        is_waiting.set()
+        while not is_free.is_set():
+            await asyncio.sleep(0.01)
+
+    said = TextInput()
+
+    def open_page(document: Document) -> None:
+        document.add_root(said)
+        document.add_periodic_callback(cast("Any", update), 50)  # Bokeh awaits it
+
+    def serve(stop: threading.Event, tell: Callable[[str], object]) -> None:
+        server = WebServer(Where("127.0.0.1", 0), open_page, {})
+        tell(server.url)
+        server.run(stop)
+
+    monkeypatch.setattr("bokeh.server.tornado.PeriodicCallback", Fast)
+    changed = {"kind": "ModelChanged", "model": {"id": said.id}, "attr": "value", "new": "x"}
+    with in_thread(serve) as url:
+        with open_socket(url, url) as connection:
+            connection.recv(timeout=DEADLINE)
+            assert is_waiting.wait(DEADLINE)
+            for part in ({"msgid": "1", "msgtype": "PATCH-DOC"}, {}, {"events": [changed]}):
+                connection.send(json.dumps(part))
+            connection.socket.shutdown(socket.SHUT_RDWR)
+        before = len(ran)
+        wait_for(lambda: len(ran) > before + 50, what="the jobs of the server")
+        is_free.set()
+        wait_for(lambda: said.value == "x", what="the message")
+        before = len(ran)
+        wait_for(lambda: len(ran) > before + 20, what="the end of the connection")
     assert not caplog.records
 
 
