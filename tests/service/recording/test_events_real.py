@@ -25,6 +25,7 @@ from tests.service.recording.events_table import Row
 from . import events_table
 
 TABLE: Final = json.loads(events_table.TABLE.read_text())
+TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
 NAMES: Final = [name for name in TABLE if name != "from"]
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
 FLAPPING: Final = 4, 10.0, 5.0  # changes within so many seconds that are told; then the last, after so many without one
@@ -34,7 +35,7 @@ pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"n
 
 
 def path_of(name: str) -> Path:
-    return next(LOGS.parent.glob(f"*/{name}.ulg"))
+    return next(LOGS.parent.rglob(f"{name}.ulg"))
 
 
 @cache
@@ -241,3 +242,23 @@ def test_vehicle_that_fell() -> None:
     assert lasted.until is not None
     assert lasted.until - lasted.since == pytest.approx(2.6, abs=1e-3)
     assert all(each.lacking == () for each in told.values())
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_texts_are_those_of_px4(name: str) -> None:
+    """Each statement of a table made by hand with pyulog is an event, once, with its time and words, and no other.
+
+    Of a statement in two forms, either one is told. A failed check that PX4 reports again, as another check has
+    changed, is told when it is new.
+    """
+    told = [(each.boot or 0.0, each.text) for each in told_in(name) if each.kind == "text"]
+    checks: set[str] = set()
+    for time, _, _, group, has_twin, text in TABLES[name]["texts"]:
+        near = [each for each in told if abs(each[0] - time) < 0.002]
+        same = [each for each in near if text.strip() in each[1] or each[1].rpartition("] ")[2] in text]
+        if same:
+            told.remove(same[0])
+        else:
+            assert text in checks or has_twin, (time, text)
+        checks |= {text} if group == "arming_check" else set()
+    assert told == []
