@@ -122,8 +122,8 @@ def state_of(conditions: Iterable[Condition]) -> State:
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
     """Return the possible causes of an event: within WINDOW seconds, or still active.
 
-    Of each kind the latest, but all texts. Begins explain a begin, ends since the begin explain an end; both explain a
-    correction of the estimate.
+    Of each kind the latest. Begins and PX4's texts, which are all returned, explain a begin; ends since the begin
+    explain an end; all explain a correction of the estimate.
     """
     kind, latest = KINDS[event.kind], dict[object, Event]()
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""
@@ -132,7 +132,8 @@ def explain(event: Event, before: Iterable[Event], conditions: Iterable[Conditio
         is_bad = each.severity != "info" or (each.kind != "text" and (event.change == "end" or kind.correction))
         is_near = earliest <= each.time <= event.time
         is_link = each.kind == "link_down"  # its losses are detected after its end
-        is_of_change = is_link or (is_bad and each.change != excluded)
+        change = "begin" if each.kind == "text" else each.change
+        is_of_change = is_link or (is_bad and change != excluded)
         if each is not event and each.kind in kind.causes and is_near and is_of_change:
             latest[each.text if each.kind == "text" else each.kind] = each
     for condition in conditions:

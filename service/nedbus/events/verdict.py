@@ -77,42 +77,55 @@ def verdict_of(
     head = "position valid throughout, but " if usable and is_then else head
     cause = _cause(worst, events)
     text = f"{head}{_cut(worst.what)} {worst.when(times, end)}."
-    for part in (*_why(worst, cause, times), *_also(worst, cause, stories, times)):
-        if len(text) + len(part) < _LENGTH:
-            text = f"{text} {part}."
+    text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, _LENGTH - len(text) - 15))])
+    also = ""
+    for part in _also(worst, cause, stories, times):
+        longer = f"{also}; {part}" if also else f" Also {part}"
+        also = longer if len(text) + len(longer) < _LENGTH else also
+    text += f"{also}." * bool(also)
     return Verdict(text, usable, worst.begin, worst.end, worst.since, worst.until, cause, len(stories))
 
 
 def _cause(story: Story, events: Iterable[Event]) -> tuple[Event, ...]:
     """Return the evidence of a fault in order of time: what preceded it, and new texts of PX4 until a second after."""
-    earlier = {each.text for each in events if each.kind == "text" and each.time < story.since - WINDOW}
-    around = [*story.before, *(e for e in story.meanwhile if e.kind == "text" and e.time <= story.since + TOGETHER)]
-    found = (each for each in around if each.kind != "text" or each.text not in earlier)
-    return tuple(sorted(found, key=lambda each: (each.time, each.kind != "text")))
+    texts = [event for event in events if event.kind == "text"]
+    earlier = {each.text for each in texts if each.time < story.since - WINDOW}
+    near = (e for e in texts if e.severity != "info" and -WINDOW <= e.time - story.since <= TOGETHER)
+    found = [each for each in near if each.text not in earlier] + [e for e in story.before if e.kind != "text"]
+    return tuple(sorted(found, key=lambda each: each.time))
 
 
-def _why(story: Story, cause: Sequence[Event], times: Times) -> list[str]:
-    """Return sentences with the evidence of a fault, and with what is missing."""
-    texts = sorted((e for e in cause if e.kind == "text"), key=lambda each: each.numbers.get("level", 0.0))[:2]
-    others = [each for each in cause if each.kind != "text"][-3:]
-    shown = groupby((each for each in cause if each in texts or each in others), key=times.text)
-    groups = ((time, dict.fromkeys(_cut(each.words) for each in group)) for time, group in shown)
-    listed = "; ".join(f"{time} {', '.join(words)}" for time, words in groups)
-    none = [] if story.begin is None else [f"No evidence in the {WINDOW:.0f} s before"]
+def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[str]:
+    """Return sentences with the evidence of a fault that fits into `room` characters, and with what is missing."""
     missing = [f"Not in the data: {', '.join(story.lacking)}"] if story.lacking else []
-    return [f"Evidence: {listed}"] * bool(listed) + none * (not listed) + missing
+    texts: list[Event] = []
+    for each in sorted((e for e in cause if e.kind == "text"), key=lambda each: each.numbers.get("level", 0.0)):
+        if not any(each.text in other.text or other.text in each.text for other in texts):
+            texts.append(each)
+    ranked = [*texts[:1], *[each for each in cause if each.kind != "text"][-3:], *texts[1:2]]
+    while ranked:
+        groups = groupby(sorted(ranked, key=cause.index), key=times.text)
+        words = ((time, dict.fromkeys(_cut(each.words) for each in group)) for time, group in groups)
+        listed = "; ".join(f"{time} {', '.join(group)}" for time, group in words)
+        if len(listed) + len("".join(missing)) < room:
+            return [f"Evidence: {listed}", *missing]
+        ranked.pop()
+    return [*([f"No evidence in the {WINDOW:.0f} s before"] if story.begin and not cause else []), *missing]
 
 
 def _also(worst: Story, cause: Iterable[Event], stories: Iterable[Story], times: Times) -> list[str]:
-    """Return a sentence for each kind of other faults, with its largest one."""
+    """Return the largest other fault of each kind, those near in time first."""
     told = {worst.begin, *cause}
     by_kind: dict[str, list[Story]] = {}
     for story in stories:
         by_kind.setdefault(story.spans[0].kind, []).append(story)
-    largest = [(max(group, key=_size), len(group)) for group in by_kind.values()]
+    largest = sorted(
+        (max(group, key=_size) for group in by_kind.values()), key=lambda each: abs(each.since - worst.since)
+    )
+    counts = {kind: f" (one of {len(group)})" * (len(group) > 1) for kind, group in by_kind.items()}
     return [
-        f"Also{f', {count} times,' if count > 1 else ''} {_cut(each.what, 60)} at {times.text(each.begin)}"
-        for each, count in largest
+        f"{times.text(each.begin)} {_cut(each.what, 60)}{counts[each.spans[0].kind]}"
+        for each in largest
         if each.begin is not None and each.begin not in told
     ]
 

@@ -93,7 +93,7 @@ def text(flight: Flight, words: str, level: int = 4) -> None:
 
 
 def test_evidence_of_an_end_is_not_earlier_than_its_begin() -> None:
-    """A receiver that was back before the position became invalid does not explain that it is valid again."""
+    """A receiver that was back before the position became invalid does not explain its end, nor does a text of PX4."""
     flight = Flight()
     flight.gps(fix_type=0)
     flight.fly(1)
@@ -103,6 +103,10 @@ def test_evidence_of_an_end_is_not_earlier_than_its_begin() -> None:
     ended = flight.account.events_since(0)[0][-1]
     assert (ended.kind, ended.change, ended.evidence) == ("xy_invalid", "end", ())
     assert "GPS" not in verdict(flight).text
+    flight.wait(1.0).send(xy_valid=False)
+    text(flight, "Failsafe activated")
+    flight.wait(2.0).send()
+    assert flight.account.events_since(0)[0][-1].evidence == ()
 
 
 def test_verdict_quotes_px4() -> None:
@@ -121,7 +125,7 @@ def test_verdict_quotes_px4() -> None:
     flight.wait(5.0).send(xy_valid=False)
     assert verdict(flight).text.startswith(
         "xy not valid from 30.000 s since boot, until the end (5.2 s). Evidence: 29.000 "
-        'PX4: "GNSS fix too low", dead reckoning; 30.200 PX4: "Failsafe activated". Not in the data: '
+        'PX4: "GNSS fix too low", dead reckoning; 30.200 PX4: "Failsafe activated". Not in the data: vehicle_gps_'
     )
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import Final
 import pytest
 from pyulog import ULog
 
-from nedbus.events import Event, Story, stories_of
+from nedbus.events import Event, Story, Verdict, stories_of, verdict_of
 from nedbus.sources import read_account
 from nedbus.sources.account import FileAccount
 from tests.flights.ulogs import LOGS
@@ -262,3 +264,54 @@ def test_texts_are_those_of_px4(name: str) -> None:
             assert text in checks or has_twin, (time, text)
         checks |= {text} if group == "arming_check" else set()
     assert told == []
+
+
+def verdict(path: Path) -> Verdict:
+    """Return the verdict on the vehicle of a log."""
+    read = account_of(path.stem) if path.stem in NAMES else read_account(path)
+    events, (followed,) = read.account.events_since(0)[0], read.account.vehicles.values()
+    held = [each for each in followed.conditions.values() if each.severity != "info"]
+    return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "end", "cause", "quoted"),
+    [
+        (
+            "twelve_messages", 32.444, 48.324,
+            [("gps_fix_lost", 27.392), ("dead_reckoning", 28.444)], "Offboard requires local position",
+        ),
+        ("gps_loss", 27.908, 30.036, [("dead_reckoning", 23.908)], "invalid setpoints"),
+    ],
+)  # fmt: skip
+def test_verdict_names_cause_and_times(
+    name: str, begin: float, end: float, cause: list[tuple[str, float]], quoted: str
+) -> None:
+    """It says what, from when to when, and the causes in order of time, as the table by hand does."""
+    found = verdict(path_of(name))
+    assert found.begin is not None
+    assert found.end is not None
+    assert (found.usable, found.begin.boot, found.end.boot) == (False, begin, end)
+    assert [each for each in short(found.cause) if each in cause] == cause
+    times = account_of(name).times
+    moments = [times.text(each) for each in (found.begin, found.end, *found.cause) if (each.kind, each.boot) in cause]
+    assert all(moment in found.text for moment in moments)
+    assert f"({end - begin:.1f} s)" in found.text
+    assert quoted in found.text
+    assert ("Not in the data: vehicle_gps_position" in found.text) == (name == "gps_loss")
+
+
+def test_verdict_of_a_crash_quotes_px4() -> None:
+    """PX4's own words are the first evidence; the evidence of the table is named, and no field is. Table by hand."""
+    text = verdict(path_of("nxp_v0_ekf_failure")).text
+    assert 'PX4: "Attitude failure detected"' in text
+    assert "fd critical" not in text
+
+
+@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+def test_verdict_has_three_lines(path: Path) -> None:
+    """A verdict has at most three lines; of a healthy flight it is that there are no faults, and nothing else."""
+    text = verdict(path).text
+    assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3
+    is_healthy = path.stem in ("sitl_1.15_events", "ulog_stream_flight1", "ulog_stream_lossy1")
+    assert not is_healthy or re.fullmatch(r"no faults in \d+ s", text)
