@@ -248,3 +248,32 @@ def test_no_measured_clearance_is_no_distance(vehicle: Vehicle, clearance: float
     vehicle.handle(dialect.MAVLink_altitude_message(10**6, 1, 2, 3, 4, NAN, clearance), 100.0)
     fields = estimate(vehicle, 1000, 100.0)
     assert (fields["dist_bottom_valid"], "dist_bottom" in fields) == (is_valid, is_valid)
+
+
+def chunk(text: bytes, number: int, sequence: int = 0, severity: int = 4) -> Any:
+    return dialect.MAVLink_statustext_message(severity, text, number, sequence)
+
+
+def texts_of(messages: list[tuple[float, Any]]) -> list[tuple[object, ...]]:
+    """Return timestamp, severity and text of what a vehicle says in messages at these times."""
+    vehicle, later = new_vehicle("log_message"), [(99.0, dialect.MAVLink_timesync_message(0, 0))] * 3
+    found = [vehicle.handle(message, now) for now, message in [(0.0, position(1000)), *messages, *later]]
+    said = [each for each in found if isinstance(each, SourceMessage)]
+    assert {each.address.stream for each in said} == {"log_message"}
+    return [tuple(each.fields.values()) for each in said]
+
+
+def test_chunks_of_a_status_text_are_joined() -> None:
+    """In order, by id; what is lost between them, or behind the last one, is marked; controls are left out."""
+    first, second = b"a" * 49 + b"\xc2", b"\xb5" + b"b" * 49
+    assert texts_of([(0.0, chunk(b"Takeoff\x1b[31m detected\t", 0))]) == [(1_000_000, 4, "Takeoff detected")]
+    whole = [(0.0, chunk(first, 1)), (0.1, chunk(second, 1, 1)), (0.2, chunk(b"end", 1, 2))]
+    assert texts_of(whole) == [(1_000_000, 4, f"{'a' * 49}\u00b5{'b' * 49}end")]
+    [(_, _, gap)] = texts_of([whole[0], whole[2]])
+    assert str(gap).endswith("...end")
+    assert texts_of([whole[1], (0.3, chunk(b"next", 2, 0, 9))]) == [
+        (1_000_000, 4, f"...?{'b' * 49}"), (1_000_000, 7, "next")
+    ]  # fmt: skip
+    assert [text for *_, text in texts_of([(0.0, chunk(b"c" * 50, 3))])] == ["c" * 50 + "..."]
+    flood = [(0.0, chunk(b"d" * 50, 4, number % 256)) for number in range(10_000)]
+    assert len(texts_of(flood)) < 50

@@ -6,6 +6,7 @@ from collections import deque
 from typing import Any, Final, NamedTuple
 
 from nedbus.ulog import to_statement
+from nedbus_msgs import decode_text
 
 _TIMEOUT: Final = 2.0  # s for the rest of a text, which is published without it then
 _CHUNK: Final = 50  # bytes; a shorter one is the last
@@ -51,6 +52,6 @@ class StatusTexts:
 
     def _finish(self, end: str = "") -> None:
         if self._open:
-            text = to_statement(self._open.data.decode(errors="replace") + end)
+            text = to_statement(decode_text(self._open.data) + end)
             self._waiting.append({"severity": self._open.severity, "text": text})
         self._open = None

@@ -1,0 +1,244 @@
+"""PX4's own words in logs: equal to pyulog and its decoder of events on real logs; hostile texts and metadata."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from pyulog import ULog
+from pyulog.px4_events import PX4Events
+
+import nedbus
+from nedbus.ulog import SPOKEN, Data, Texts, UlogParser, to_statement
+from tests.flights.ulogs import LOGS, UlogWriter
+
+REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
+ARMED: Final = {"arguments": [{"name": "by", "type": "by_t"}], "message": "Armed by {1}", "name": "armed"}
+LIMIT: Final = {
+    "arguments": [{"name": "a", "type": "float"}, {"name": "b", "type": "px4::bits_t"}],
+    "message": 'At {1:.1m/s} \\{<profile name="dev">{2}</profile><profile name="x">no</profile><a href="x">b</a>\\}',
+    "name": "limit",
+}
+CHECK: Final = {
+    "arguments": [{"name": "modes", "type": "navigation_mode_group_t"}, {"name": "index", "type": "uint8_t"}],
+    "message": "No offboard signal", "name": "check",
+}  # fmt: skip
+FAILSAFE: Final = {
+    "arguments": [{"name": "mode", "type": "uint32_t"}], "message": "Failsafe warning:", "name": "failsafe",
+    "type": "append_health_and_arming_messages",
+}  # fmt: skip
+SUMMARY: Final = {"message": "summary", "name": "summary", "type": "summary"}
+METADATA: Final = {
+    "version": 2,
+    "components": {
+        "1": {
+            "namespace": "px4",
+            "enums": {
+                "by_t": {"type": "uint8_t", "entries": {"2": {"description": "RC switch", "name": "rc"}}},
+                "bits_t": {
+                    "type": "uint8_t", "is_bitfield": True, "separator": ", ",
+                    "entries": {"1": {"description": "one", "name": "a"}, "4": {"description": "four", "name": "b"}},
+                },
+                "navigation_mode_group_t": {"type": "uint32_t", "is_bitfield": True, "entries": {}},
+            },
+            "navigation_mode_groups": {"groups": {"14": [393216]}},
+            "event_groups": {
+                "default": {"events": {"1": ARMED, "2": LIMIT, "3": FAILSAFE}},
+                "arming_check": {"events": {"10": CHECK, "11": SUMMARY}},
+            },
+        }
+    },
+}  # fmt: skip
+FORMAT = b"event:uint64_t timestamp;uint32_t id;uint16_t event_sequence;uint8_t[25] arguments;uint8_t log_levels;"
+
+
+class Log(UlogWriter):
+    """A log with PX4's texts and events."""
+
+    def __init__(self, metadata: bytes | Mapping[str, Any] = METADATA) -> None:
+        super().__init__()
+        packed = metadata if isinstance(metadata, bytes) else lzma.compress(json.dumps(metadata).encode())
+        for at in range(0, len(packed), 60_000):
+            key = f"uint8_t[{len(packed[at : at + 60_000])}] metadata_events".encode()
+            self.put("M", bytes([at > 0, len(key)]) + key + packed[at : at + 60_000])
+        self.put("F", FORMAT)
+        self.put("F", b"vehicle_status:uint64_t timestamp;uint8_t nav_state;")
+        for number, topic in enumerate((b"event", b"event", b"vehicle_status")):
+            self.put("A", struct.pack("<BH", 0, number) + topic)
+        self.sequence = 0
+
+    def text(self, timestamp: int, text: bytes, level: int = 6) -> None:
+        """Add a logged text."""
+        self.put("L", b"%d" % level + struct.pack("<Q", timestamp) + text)
+
+    def event(
+        self, timestamp: int, number: int, arguments: bytes = b"", level: int = 6, *, twice: bool = False
+    ) -> None:
+        """Add an event."""
+        self.sequence += 1
+        body = struct.pack("<QIH25sB", timestamp, 1 << 24 | number, self.sequence, arguments, level << 4 | 1)
+        for message_id in range(1 + twice):
+            self.put("D", struct.pack("<H", message_id) + body)
+
+    def mode(self, nav_state: int) -> None:
+        """Add a vehicle_status."""
+        self.put("D", struct.pack("<HQB", 2, 0, nav_state))
+
+    def said(self, texts: Texts | None = None) -> list[tuple[int, int, str]]:
+        """Return timestamp, severity and text of each message."""
+        return said_in(bytes(self.data), texts)
+
+
+def said_in(data: bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:
+    parser = UlogParser(verify=True)
+    records = (texts or Texts()).merge([*parser.feed(data), *parser.close()])
+    found = [SPOKEN.decode(each.payload) for each in records if isinstance(each, Data) and each.subscription is SPOKEN]
+    return [tuple(fields.values()) for fields in found]  # type: ignore[misc]
+
+
+@pytest.mark.logs
+@pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
+def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
+    """As pyulog has them: each text that is not sent as an event, and each event; all else are checks that failed."""
+    log = ULog(str(path))
+    logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
+    has_metadata = "metadata_events" in log.msg_info_multiple_dict
+    events = {(int(time), text) for time, _, text in (PX4Events().get_logged_events(log) if has_metadata else ())}
+    left = said_in(path.read_bytes())
+    for time, text in events:
+        [one] = [each for each in left if each[0] == time and each[2].startswith(text)]
+        left.remove(one)
+    unpaired = 0
+    for each in logged:
+        statement = (each.timestamp, int(chr(each.log_level)), to_statement(each.message))
+        if statement in left:
+            left.remove(statement)
+        else:
+            assert has_metadata
+            assert each.message.endswith("\t") or "Preflight" in each.message, each.message
+            unpaired += "Preflight" not in each.message
+    assert unpaired <= len(events)
+    assert {text for *_, text in left} <= CHECKS
+    assert len(left) <= 20
+
+
+CHECKS = {
+    "No heading reference", "No offboard signal", "Navigation error: No valid position estimate", "GPS fix too low",
+    "Navigation error: No valid global position estimate", "No valid mission available", "No manual control input",
+    "No connection to the ground control station", "Offboard requires local position", "Home position not set",
+    "No valid attitude estimate", "Attitude failure detected", "Horizontal position unstable",
+    "No valid global position estimate", "No valid local position estimate",
+}  # fmt: skip
+
+
+def test_statement_in_two_forms_is_said_once() -> None:
+    """A text with a tab at its end is the event before it; one without is a statement of its own."""
+    log = Log()
+    log.event(5_000_000, 1, b"\2", twice=True)
+    log.text(5_000_400, b"[commander] Armed by RC switch\t")
+    log.text(5_000_500, b"[commander] \x1b[32mReady!\x1b[0m")
+    log.text(6_000_000, b"[commander] Armed by RC switch\t")  # no event: it is another statement
+    assert log.said() == [
+        (5_000_000, 6, "Armed by RC switch"), (5_000_500, 6, "[commander] Ready!"),
+        (6_000_000, 6, "[commander] Armed by RC switch"),
+    ]  # fmt: skip
+
+
+def test_arguments_are_filled_in() -> None:
+    """Numbers with digits and unit, names of enumerations and bits, profiles, links and escapes."""
+    log = Log()
+    log.event(1, 2, struct.pack("<fB", 2.25, 5))
+    log.event(2, 2, struct.pack("<fB", float("nan"), 8))
+    log.event(3, 1, b"\7")
+    log.event(4, 99)
+    assert [text for *_, text in log.said()] == [
+        "At 2.2 m/s {one, fourb}", "At nan m/s {(unknown: 8)b}", "Armed by (unknown: 7)"
+    ]  # fmt: skip
+
+
+def test_failed_check_is_said_when_it_is_new() -> None:
+    """PX4 reports all of them again with each change; one that does not concern the mode is information."""
+    log = Log()
+    check = struct.pack("<IB", 1 << 14, 0)
+    for time, mode in enumerate((4, 4, 14)):
+        log.mode(mode)
+        log.event(time, 11, level=8)
+        if time != 1:
+            log.event(time, 10, check, level=3)
+            log.text(time, b"[health_and_arming_checks] Preflight Fail: no offboard signal", 4)
+    log.event(3, 11, level=8)
+    log.event(3, 10, check, level=3)
+    log.event(4, 3, struct.pack("<I", 393216), level=4)
+    log.event(5, 3, struct.pack("<I", 1), level=4)
+    assert log.said() == [
+        (0, 6, "No offboard signal"), (2, 3, "No offboard signal"), (4, 4, "Failsafe warning: No offboard signal"),
+        (5, 4, "Failsafe warning:"),
+    ]  # fmt: skip
+
+
+def changed(change: Callable[[dict[str, Any]], object]) -> bytes:
+    """Return the metadata after a change."""
+    copy = json.loads(json.dumps(METADATA))
+    change(copy["components"]["1"])
+    return lzma.compress(json.dumps(copy).encode())
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        b"", b"not xz", lzma.compress(b"{"), lzma.compress(b"[" * 100_000), lzma.compress(b'{"components": []}'),
+        lzma.compress(bytes(2**27), preset=1), lzma.compress(json.dumps(METADATA).encode())[:-9],
+        lzma.compress(b'{"components": {"1": ' + b"[" * 900 + b"]" * 900 + b"}}"),
+        changed(lambda px4: px4["event_groups"]["default"]["events"]["1"].update(message=5)),
+        changed(lambda px4: px4["event_groups"]["default"]["events"]["1"].update(arguments=[{"type": "uint64_t"}] * 4)),
+        changed(lambda px4: px4["event_groups"]["default"]["events"]["1"].update(arguments="long")),
+        changed(lambda px4: px4["enums"]["by_t"].update(entries=7)),
+        changed(lambda px4: px4["enums"]["by_t"].update(type="by_t")),
+        changed(lambda px4: px4.update(event_groups=[])),
+    ],
+    ids=map(str, range(14)),
+)  # fmt: skip
+def test_metadata_that_are_damaged_or_hostile_only_cost_the_events(metadata: bytes) -> None:
+    """Too large or deep, incomplete, of other types, with arguments beyond the 25 bytes: the texts remain."""
+    log = Log(metadata)
+    log.event(1, 1, b"\2")
+    log.text(2, b"still here")
+    assert log.said() == [(2, 6, "still here")]
+
+
+def test_texts_are_one_printable_line_and_bounded_in_number() -> None:
+    """Controls, escapes of terminals and bidirectional marks go; 10,000 texts a second are counted, not published."""
+    hostile = "a\nb\r\x1b[2Jc\x00\x07\x9b31m\u202ed\u2028e" + "\x1b]0;title\x07" + "µ" * 200
+    text = to_statement(hostile)
+    assert text.startswith("a b cd31m"[:5])
+    assert text.isprintable()
+    assert len(text.encode()) <= 127
+    assert text.endswith("...")
+    log, texts = Log(), Texts()
+    for number in range(10_000):
+        log.text(50_000_000 + 100 * number, b"%d" % number)
+    log.text(52_000_000, b"later")
+    assert len(said := log.said(texts)) == 101
+    assert said[-1] == (52_000_000, 6, "later")
+    assert texts.omitted == 9_900
+
+
+def test_other_fields_under_px4s_names_are_ignored(tmp_path: Path) -> None:
+    """A topic `event` of another type costs nothing else; a logged log_message does not double the texts."""
+    log = UlogWriter()
+    log.put("F", b"event:float timestamp;")
+    log.put("F", b"log_message:uint64_t timestamp;uint8_t severity;char[127] text;")
+    for number, topic in enumerate((b"event", b"log_message")):
+        log.put("A", struct.pack("<BH", 0, number) + topic)
+    log.put("D", struct.pack("<Hf", 0, 1.0))
+    log.put("D", struct.pack("<HQB127s", 1, 5, 4, b"[ekf2] said\t"))
+    log.put("L", b"4" + struct.pack("<Q", 5) + b"[ekf2] said\t")
+    messages = nedbus.read(log.write(tmp_path / "a.ulg"), "log_message")
+    assert messages.tolist() == [(5, 4, b"[ekf2] said")]
+    frame = nedbus.read(tmp_path / "a.ulg", "log_message", dataframe="pandas")
+    assert frame["text"].tolist() == ["[ekf2] said"]
