@@ -22,6 +22,9 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from nedbus.errors import OutputError
 from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
+from nedbus_msgs.messages.log_message import LogMessage
+
+from .ros2_log import DEFINITION, TYPE, encode_log
 
 _CHUNK: Final = 2**23  # bytes; a flush every second makes smaller chunks
 _MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
@@ -29,6 +32,8 @@ _MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have any timestamp
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
 )
+
+_ROS2: Final = "offered_qos_profiles"  # metadata by which tools of ROS 2 recognize their bags
 
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
 
@@ -38,6 +43,7 @@ class RecordingWriter:
 
     Each address, definition and provenance has its own channel, in the message's current layout. If no PX4 layout has
     all fields of the message, a PX4 layout with exactly the fields provided by the source is preferred.
+    Texts of PX4 are there again as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
     A flipped bit costs one chunk, of up to `chunk_size` bytes before compression. `boot_utc`: Unix time of the
     vehicle's boot [us], for `utc_of` of a recording whose messages do not give it.
 
@@ -60,6 +66,7 @@ class RecordingWriter:
             raise
         self._schemas: dict[tuple[Definition[Any], str], int] = {}  # by definition and layout
         self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
+        self._log_schema, self._log_channels = 0, dict[str, int]()  # by vehicle
 
     def write(
         self,
@@ -106,12 +113,24 @@ class RecordingWriter:
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
             size, data = encoded[layout]
             yield logged, channel, data[index * size : (index + 1) * size], published, max(0, number) % 2**32
+            self.messages += 1
+            if definition is LogMessage.DEFINITION:
+                text = arrays_of(definition).to_message(messages[index])
+                copy = encode_log(stream[0].vehicle, text, time_ns=logged)
+                yield logged, self._log_channel(stream[0].vehicle), copy, published, 0
+
+    def _log_channel(self, vehicle: str) -> int:
+        """Return the channel of the copies of a vehicle's texts, which readers of nedbus leave out."""
+        if vehicle not in self._log_channels:
+            self._log_schema = self._log_schema or self._writer.register_schema(TYPE, "ros2msg", DEFINITION.encode())
+            found = self._writer.register_channel(f"/{vehicle}/log", "cdr", self._log_schema, {_ROS2: ""})
+            self._log_channels[vehicle] = found
+        return self._log_channels[vehicle]
 
     def _add(self, encoded: Iterable[_Encoded]) -> None:
         with _writing(self.path):
             for logged, channel, data, published, number in encoded:
                 self._writer.add_message(channel, logged, data, published, number)
-                self.messages += 1
 
     def flush(self) -> None:
         """Sync all messages written so far to disk."""
@@ -145,8 +164,7 @@ class RecordingWriter:
             text = definition_text(definition, layout).encode()
             schema = self._writer.register_schema(ros2_type(definition), "ros2msg", text)
             self._schemas[definition, layout.name] = schema
-        # ROS 2 tools recognize their bags by the first key.
-        metadata = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
+        metadata = {_ROS2: "", "vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:
             metadata["instance"] = str(address.instance)
         if provenance.source is not None:

@@ -28,6 +28,7 @@ from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import to_array
+from nedbus_msgs.messages.log_message import LogMessage
 from tests.flights.first_message import LAYOUTS, ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
@@ -492,3 +493,27 @@ def test_private_records_are_skipped(tmp_path: Path) -> None:
         reader.check()
         assert (reader.damaged, sum(reader.counts.values())) == (False, 10_000)
         assert not [warning for warning in reader.warnings if "skipped" in warning]
+
+
+def test_texts_are_read_back_exactly_and_shown_by_tools_of_ros_2(tmp_path: Path) -> None:
+    """A recording has log_message, and the same as Log of ROS 2 for Foxglove, which is not read as a message."""
+    path, texts = tmp_path / "a.mcap", ["Takeoff detected", "12 \u00b5s", ""]
+    written = [LogMessage(timestamp=number, severity=2 * number, text=text) for number, text in enumerate(texts)]
+    with RecordingWriter(path) as writer:
+        writer.write_messages(
+            (each, Address("7", "log_message"), Provenance("mavlink", frozenset()), 10**18 + number)
+            for number, each in enumerate(written)
+        )
+        assert writer.messages == 3
+    assert nedbus.read(path, "log_message").tobytes() == to_array(written).tobytes()
+    assert nedbus.addresses_of(path) == [Address("7", "log_message")]
+    store, found = get_typestore(Stores.ROS2_JAZZY), []
+    with path.open("rb") as file:
+        for schema, channel, each in make_reader(file).iter_messages(topics=["/7/log"]):
+            assert schema is not None
+            assert (schema.name, schema.encoding) == ("rcl_interfaces/msg/Log", "ros2msg")
+            assert channel.message_encoding == "cdr"
+            log: Any = store.deserialize_cdr(each.data, schema.name)
+            assert bytes(store.serialize_cdr(log, schema.name)) == each.data
+            found.append((log.stamp.sec, log.stamp.nanosec, log.level, log.name, log.msg))
+    assert found == [(10**9, 0, 50, "7", texts[0]), (10**9, 1, 50, "7", texts[1]), (10**9, 2, 30, "7", "")]
