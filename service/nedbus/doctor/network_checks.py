@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from nedbus.client import LogStreamStatus, SourceStatus
-from nedbus.events import merge_vehicles, since_text, to_age
+from nedbus.events import by_vehicle, since_text, to_age
 from nedbus_msgs import Address, get_topic
 
 from .finding import Finding, State, brief, list_names
@@ -160,7 +160,8 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
 
 def _check_states(seen: Observation) -> Iterator[Finding]:
     """Yield the vehicles that services report with severity bad or watch."""
-    for name, (now, told) in sorted(merge_vehicles(seen.accounts).items()):
+    for name, report in sorted(by_vehicle(seen.accounts).items()):
+        now, told = report.now, report.vehicles[name]
         if seen.vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
             continue
         state: State = "wrong" if told.severity == "bad" else "warning"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,9 +10,7 @@ from .event import ALL
 from .report import AccountReport, VehicleReport, by_vehicle
 from .times import since_text, to_age, to_clock
 
-VALID: Final[Mapping[str, str]] = {
-    "xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid",
-}  # fmt: skip
+VALID: Final[Mapping[str, str]] = {"xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid"}
 """Quantities whose validity a health check can require, with their flags in VehicleLocalPosition."""
 
 _MAX_RECENT: Final = 20  # for recent events
@@ -41,7 +39,7 @@ def faults_of(
     `heard`: vehicles that are heard although no service reports them. `only`: check the services of this host alone.
     """
     checked = [report for report in reports if only is None or report.host == only]
-    vehicles = merge_vehicles(checked)
+    vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
     missing = [name for name in expected.expect if name not in vehicles and name not in heard]
     faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
     flying = sorted({name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent} | set(heard))
@@ -52,11 +50,6 @@ def faults_of(
         if not expected.expect or name in expected.expect:
             faults += [f"vehicle {name}: {fault}" for fault in _faults_of_vehicle(name, vehicle, now, expected)]
     return list(dict.fromkeys([*faults, *_recent_faults(checked, expected)]))
-
-
-def merge_vehicles(reports: Iterable[AccountReport]) -> dict[str, tuple[float, VehicleReport]]:
-    """Return the report of each vehicle with its time, preferably from a service that hears the vehicle."""
-    return {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(reports).items()}
 
 
 def unknown_text(quantities: Sequence[str]) -> str:

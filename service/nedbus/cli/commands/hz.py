@@ -91,8 +91,7 @@ def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
 
 
 def _to_fields(address: Address, health: Health, state: StreamState) -> dict[str, Any]:
-    head = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
-    return {"time": clock.utc(), **head, "state": state.name, "reason": state.reason, **asdict(health)}
+    return {"time": clock.utc(), **asdict(address), "state": state.name, "reason": state.reason, **asdict(health)}
 
 
 def _to_csv(fields: dict[str, Any]) -> str:

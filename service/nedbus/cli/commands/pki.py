@@ -68,11 +68,10 @@ def enroll(
     It contains certificate, key, nedbus.toml, compose.yml and README.txt.
     """
     output = output or Path(certificate_name(vehicle))
-    _write_paths(
-        certificates.make_bundle(
-            folder, vehicle, output, routers=router, sources=source or (), target=target, days=days
-        )
+    made = certificates.make_bundle(
+        folder, vehicle, output, routers=router, sources=source or (), target=target, days=days
     )
+    _write_paths(made)
     write_stderr(f"{output} contains the only key of the vehicle: move it there, see its README.txt")
 
 
@@ -154,12 +153,10 @@ def rules(
         raise ConfigError(str(file), f"its access rules do not name vehicle {unknown[0]!r}")
     wanted = {*before, *given} if add else set(before) - given if remove else given
     certificates.write_access_rules(file, wanted, prefix=prefix)
-    changes = [f"+ {name}" for name in sorted(wanted - {*before})] + [
-        f"- {name}" for name in sorted({*before} - wanted)
-    ]
-    for line in changes:
-        write(line)
-    changed = "restart the router to apply them" if changes else "no change"
+    for sign, names in (("+", wanted - {*before}), ("-", {*before} - wanted)):
+        for name in sorted(names):
+            write(f"{sign} {name}")
+    changed = "no change" if wanted == {*before} else "restart the router to apply them"
     write_stderr(f"{file} names {counted(len(wanted), 'vehicle')}: {changed}")
 
 

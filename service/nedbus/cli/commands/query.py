@@ -15,15 +15,7 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import (
-    Bus,
-    SourceStatus,
-    StreamStatus,
-    describe_stream,
-    health_of_last,
-    stream_state,
-    to_age,
-)
+from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
     ANY,
@@ -70,8 +62,7 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         is_stored = sample is not None and sample.stored
         if json_output:
             name, reason = (state.name, state.reason) if state else (None, "no answer")
-            chunks = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
-            write(json.dumps({**chunks, "age": age, "state": name, "reason": reason, "stored": is_stored}))
+            write(json.dumps({**asdict(address), "age": age, "state": name, "reason": reason, "stored": is_stored}))
         text = describe_stream(health, state) if health and state else "no answer"
         rows.append([str(address), "-" if age is None else to_age(age), f"stored, {text}" if is_stored else text])
     if rows and not json_output:
@@ -101,20 +92,17 @@ def get(
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
         write(to_json(sample, fields) if json_output else to_fields(sample, fields))
-    if not samples:
-        expression = selection.key_expr(prefix=bus.prefix)
-        write_stderr(f"nothing is published on {expression}: 'nedbus list' shows the published streams")
-    elif all(sample.stored for sample in samples):
-        write_stderr("no publisher answers: these messages are from a storage")
     if all(sample.stored for sample in samples):
+        expression = selection.key_expr(prefix=bus.prefix)
+        nothing = f"nothing is published on {expression}: 'nedbus list' shows the published streams"
+        write_stderr("no publisher answers: these messages are from a storage" if samples else nothing)
         raise typer.Exit(1)
 
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     """Show the services of the network, their sources and streams."""
-    services = bus.services()
-    vehicles = bus.vehicles()
+    services, vehicles = bus.services(), bus.vehicles()
     if json_output:
         for service in services:
             write(json.dumps(asdict(service)))

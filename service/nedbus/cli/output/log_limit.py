@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from nedbus.log_event import EVENTS, About
@@ -32,9 +32,7 @@ class _TokenBucket:
     filled: float
     tokens: float = BURST
     left_out: int = 0
-    report: Mapping[str, object] = field(
-        default_factory=dict
-    )  # not the record itself, which may keep a traceback alive
+    first: Mapping[str, object] | None = None  # not the record itself, which may keep a traceback alive
 
     def fill(self, now: float) -> bool:
         """Add the tokens earned since the last call; return True if a line may be logged."""
@@ -42,17 +40,21 @@ class _TokenBucket:
         self.filled = now
         return self.tokens >= 1
 
-    def leave_out(self, record: logging.LogRecord) -> None:
+    def take(self, record: logging.LogRecord, now: float) -> bool:
+        """Return True if a record may be logged, else count it."""
+        if self.fill(now):
+            self.tokens -= 1
+            return True
         if not self.left_out:
             text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
-            self.report = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
+            self.first = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
         self.left_out += 1
+        return False
 
     def take_report(self, event: str | None) -> logging.LogRecord:
         count, self.left_out = self.left_out, 0
-        return logging.makeLogRecord(
-            {**self.report, "args": (count,), "about": About("left-out", count=count, of=event)}
-        )
+        about = About("left-out", count=count, of=event)
+        return logging.makeLogRecord({**(self.first or {}), "args": (count,), "about": about})
 
 
 class RateLimit(logging.Filter):
@@ -83,12 +85,7 @@ class RateLimit(logging.Filter):
         with self._lock:
             if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
                 kind = "", None, ""  # all others
-            bucket = self._buckets.setdefault(kind, _TokenBucket(now))
-            if not bucket.fill(now):
-                bucket.leave_out(record)
-                return False
-            bucket.tokens -= 1
-            return True
+            return self._buckets.setdefault(kind, _TokenBucket(now)).take(record, now)
 
     def flush(self) -> None:
         """Report all suppressed lines."""

@@ -26,8 +26,6 @@ _HINT: Final = """In a second terminal:
   {nedbus} echo{where}  messages as they arrive, one per line
   {nedbus} hz{where}    rate, jitter, latency, loss
   {nedbus} get{where}   all fields of the last message"""
-_TLS_HINT: Final = "Readers at {endpoint} need their own certificate, see docs/security.md"
-_ENCRYPTED: Final = ("tls/", "quic/")
 
 
 class ProgressLog:
@@ -52,11 +50,8 @@ class ProgressLog:
             if not is_log_structured() and not self._daemon.until_done:
                 write_stderr(what_to_type(self._daemon.endpoints))
         elapsed = time.monotonic() - self._reported
-        if elapsed >= _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
-            self._report(elapsed)
-
-    def _report(self, elapsed: float) -> None:
-        """Log the progress of each source."""
+        if elapsed < _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
+            return
         self._reported += elapsed
         self._reports += 1
         for status in self._daemon.sources:
@@ -89,14 +84,10 @@ def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
 
 def what_to_type(endpoints: Sequence[str]) -> str:
     """Return commands to try in a second terminal; a hint if all endpoints require a client certificate."""
-    plain = [each for each in endpoints if not each.startswith(_ENCRYPTED)]
+    plain = [each for each in endpoints if not each.startswith(("tls/", "quic/"))]
     if not plain:
-        return _TLS_HINT.format(endpoint=endpoints[0])
+        return f"Readers at {endpoints[0]} need their own certificate, see docs/security.md"
     here = [dial_endpoint(each) for each in plain]
-    return _HINT.format(nedbus=_program(), where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")
-
-
-def _program() -> str:
-    """Return the command to run nedbus: the path of this one if PATH has no nedbus."""
-    path = sys.argv[0]
-    return path if Path(path).name == "nedbus" and shutil.which("nedbus") is None else "nedbus"
+    is_on_path = Path(sys.argv[0]).name != "nedbus" or shutil.which("nedbus") is not None
+    program = "nedbus" if is_on_path else sys.argv[0]
+    return _HINT.format(nedbus=program, where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any, Final
 
 from nedbus.client import Sample, to_age
@@ -141,9 +142,7 @@ def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
 def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format a sample as one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
     head = {
-        "vehicle": sample.vehicle,
-        "topic": sample.topic,
-        "instance": sample.address.instance,
+        **asdict(sample.address),
         "received": sample.received,
         "sent": sample.sent,
         "lost": sample.lost,
@@ -184,7 +183,7 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
     """
     address, message = sample.address, sample.message
     row: list[tuple[str, object]] = [
-        ("vehicle", address.vehicle), ("topic", address.topic), ("instance", address.instance),
+        *asdict(address).items(),
         ("utc", sample.stamp and sample.stamp.get_time().isoformat()), ("sent", sample.sent),
         ("timestamp", message.timestamp),
     ]  # fmt: skip
