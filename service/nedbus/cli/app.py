@@ -9,10 +9,9 @@ import typer
 from nedbus import __version__
 
 from .commands.bridges import export, foxglove, ros2, web
-from .commands.doctor import check, doctor
+from .commands.checks import check, doctor, health
 from .commands.echo import echo
 from .commands.events import events, why
-from .commands.health import health
 from .commands.hz import hz
 from .commands.pki import pki
 from .commands.query import get, info, list_, schema

@@ -6,7 +6,7 @@ a detector, too, which yields its findings (`detectors.py` or `position.py`).
 
 from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
 from .event import ALL, WINDOW, Condition, Event, State
-from .faults import VALID, Expectation, faults_of, unknown_text
+from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
@@ -20,5 +20,5 @@ __all__ = [
     "MODES", "RECENT", "SEVERITIES", "UNITS", "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event",
     "Expectation", "Kind", "Severity", "Span", "State", "Story", "Times", "Vehicle", "VehicleReport", "Verdict",
     "by_vehicle", "faults_of", "from_json", "joined", "report_of", "since_text", "spans_of",
-    "state_at", "stories_of", "story_of", "to_age", "to_clock", "unknown_text", "verdict_of",
+    "state_at", "stories_of", "story_of", "to_age", "to_clock", "verdict_of",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,18 +31,13 @@ class Expectation:
     well: bool = False
 
 
-def faults_of(
-    reports: Sequence[AccountReport], expected: Expectation, *, heard: Collection[str] = (), only: str | None = None
-) -> list[str]:
-    """Return the faults that fail a health check, one line each.
-
-    `heard`: vehicles that are heard although no service reports them. `only`: check the services of this host alone.
-    """
+def faults_of(reports: Sequence[AccountReport], expected: Expectation, *, only: str | None = None) -> list[str]:
+    """Return the faults that fail a health check, one line each; `only`: check the services of this host alone."""
     checked = [report for report in reports if only is None or report.host == only]
     vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
-    missing = [name for name in expected.expect if name not in vehicles and name not in heard]
+    missing = [name for name in expected.expect if name not in vehicles]
     faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
-    flying = sorted({name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent} | set(heard))
+    flying = sorted(name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent)
     if len(flying) < (expected.vehicles or 0):
         names = f": {', '.join(flying[:20])}" if flying else ""
         faults.append(f"{len(flying)} of {expected.vehicles} vehicles are heard{names}")
@@ -52,25 +47,21 @@ def faults_of(
     return list(dict.fromkeys([*faults, *_recent_faults(checked, expected)]))
 
 
-def unknown_text(quantities: Sequence[str]) -> str:
-    """Return the fault of a vehicle that does not send whether these quantities are valid."""
-    return f"the validity of {', '.join(quantities)} is unknown, as the vehicle does not send it"
-
-
 def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: Expectation) -> Iterator[str]:
     invalid = [each for each in expected.valid if VALID[each] in vehicle.flags]
+    unknown = [each for each in expected.valid if VALID[each] in vehicle.unknown]
     if vehicle.is_silent:
         if name in expected.expect or not vehicle.is_forgotten(now):
             yield f"{vehicle.text}{since_text(vehicle.since, now)}"
     elif invalid:
-        since = min(vehicle.flags[VALID[each]] for each in invalid)
+        since = min(filter(None, (vehicle.flags[VALID[each]] for each in invalid)), default=None)
         yield f"{', '.join(invalid)} not valid{since_text(since, now)}"
     elif expected.well and vehicle.severity == "bad":
         yield f"{vehicle.text}{since_text(vehicle.since, now)}"
     elif expected.valid and not vehicle.has_position:
         yield "publishes no position"
-    elif unknown := [each for each in expected.valid if VALID[each] in vehicle.unknown]:
-        yield unknown_text(unknown)
+    if unknown and not vehicle.is_silent:
+        yield f"the validity of {', '.join(unknown)} is unknown, as the vehicle does not send it"
 
 
 def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:

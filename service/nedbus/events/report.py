@@ -24,7 +24,7 @@ _MAX_TOPICS: Final = 30  # per vehicle
 class VehicleReport:
     """The state of one vehicle: severity ("info" if all is well), text, begin, and the kinds of its conditions.
 
-    `flags`: validity flags of its position that are false, each with the time since when. `topics`: published topics.
+    `flags`: validity flags of its position that are false, each with its begin if known. `topics`: published topics.
     `has_position`: True if it publishes a position. `held`: active conditions whose begin is not among the events.
     `unknown`: flags that its position does not provide.
     """
@@ -33,7 +33,7 @@ class VehicleReport:
     text: str
     since: Seconds | None = None
     kinds: tuple[str, ...] = ()
-    flags: Mapping[str, Seconds] = field(default_factory=dict)
+    flags: Mapping[str, Seconds | None] = field(default_factory=dict)
     topics: tuple[str, ...] = ()
     has_position: bool = False
     held: tuple[Condition, ...] = ()

@@ -33,6 +33,7 @@ from tests.flights.messages import VLP
 from .flight import ARMED, Flight
 
 NOTHING = Expectation()
+SCRIPT = AccountReport("", "h", 0.0, {"7": VehicleReport("info", "ok", has_position=True)})
 
 
 def report(flight: Flight, *, service: str = "s", host: str = "h", within: float = 1e9) -> AccountReport:
@@ -217,10 +218,10 @@ def test_expected_vehicles() -> None:
     """Missing vehicles are named, the others counted; a vehicle published by a script counts as heard."""
     one = report(flying())
     assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
-    assert faults_of([one], Expectation(("1", "7")), heard=["7"]) == []
-    assert faults_of([one], Expectation(vehicles=3), heard=["7"]) == ["2 of 3 vehicles are heard: 1, 7"]
+    assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
+    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["2 of 3 vehicles are heard: 1, 7"]
     assert faults_of([], Expectation(vehicles=1)) == ["0 of 1 vehicles are heard"]
-    assert faults_of([one], Expectation(("7",), valid=("xy",)), heard=["7"]) == []  # vehicle 1 is not judged
+    assert faults_of([one, SCRIPT], Expectation(("7",), valid=("xy",))) == []  # vehicle 1 is not judged
 
 
 def test_other_hosts_are_not_judged() -> None:
@@ -258,7 +259,7 @@ def test_what_happened_lately() -> None:
     flight.wait(1.0).send()
     lines = faults_of([report(flight)], Expectation(within=60.0))
     assert lines == ["vehicle 1: xy not valid, at 00:01:42.0 UTC, 1.0 s ago"]
-    assert faults_of([report(flight)], Expectation(("2",), within=60.0), heard=["2"]) == []
+    assert faults_of([report(flight), SCRIPT], Expectation(("7",), within=60.0)) == []
     flight.fly(60)
     assert faults_of([report(flight)], Expectation(within=60.0)) == []
     flight.link = "no link to x"

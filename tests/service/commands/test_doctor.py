@@ -48,7 +48,7 @@ def _listen_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for a shorter time than a person would: `look` says how long."""
     monkeypatch.setattr("nedbus.doctor.observation._MIN_LISTEN", 0.1)
     monkeypatch.setattr("nedbus.doctor.prober._ALERT_TIMEOUT", 0.1)
-    monkeypatch.setattr("nedbus.cli.commands.doctor.examine", partial(examine, listen=0.5))
+    monkeypatch.setattr("nedbus.cli.commands.checks.examine", partial(examine, listen=0.5))
 
 
 def look(*endpoints: str, tls: Mapping[str, Path] | None = None, listen: float = 0.1, **options: Any) -> list[Finding]:

@@ -26,7 +26,7 @@ from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, Uplinks, log_refusals, open_router, router_endpoints
 
 from .bridges import serve_pages
-from .doctor import report_mistakes
+from .checks import report_mistakes
 
 _log = logging.getLogger("nedbus")
 _KINDS = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())

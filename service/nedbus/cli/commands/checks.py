@@ -1,19 +1,26 @@
-"""The command health, for health checks and watchdogs."""
+"""Commands that check: health for watchdogs, doctor for a running system, check for configuration files."""
 
 from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
+from nedbus import __version__
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
+from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, SourceStatus, to_age
+from nedbus.doctor import Finding, check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import VALID, Expectation, faults_of, unknown_text
+from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
+from nedbus.settings import Settings
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
 _HOST: Final = socket.gethostname()
@@ -138,8 +145,8 @@ class _Check:
         for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
             if not expected.expect or name in expected.expect:
                 yield f"vehicle {name} has several publishers: stop one, or give it another vehicle"
-        heard = {sample.vehicle for sample in others}
-        for fault in faults_of(self._reports, expected, heard=heard, only=_HOST if self._is_local else None):
+        reports = [*self._reports, _report_of(others)]
+        for fault in faults_of(reports, expected, only=_HOST if self._is_local else None):
             if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
                 yield fault
         if expected.valid or expected.within is not None:
@@ -148,14 +155,19 @@ class _Check:
                 if service.service not in remembering:
                     name = to_text(service.service, 64)
                     yield f"service {name} keeps no history of its vehicles: update nedbus there"
-        for sample in others:
-            if sample.topic == DEFAULT_TOPIC and (not expected.expect or sample.vehicle in expected.expect):
-                unknown = [each for each in expected.valid if VALID[each] in sample.missing]
-                known = [each for each in expected.valid if each not in unknown]
-                if invalid := [each for each in known if not getattr(sample.message, VALID[each])]:
-                    yield f"vehicle {sample.vehicle}: {', '.join(invalid)} not valid"
-                if unknown:
-                    yield f"vehicle {sample.vehicle}: {unknown_text(unknown)}"
+
+
+def _report_of(samples: Iterable[Sample[Message]]) -> AccountReport:
+    """Return the account of vehicles from their last messages alone."""
+    vehicles: dict[str, VehicleReport] = {}
+    for sample in samples:
+        if sample.topic == DEFAULT_TOPIC:
+            unknown = tuple(sample.missing.intersection(VALID.values()))
+            invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
+            report = VehicleReport("info", "ok", flags=dict.fromkeys(invalid), has_position=True, unknown=unknown)
+            vehicles[sample.vehicle] = report
+        vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
+    return AccountReport("", _HOST, 0.0, vehicles)
 
 
 def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:
@@ -167,3 +179,78 @@ def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:
             if age is not None and stream.address in source.addresses:
                 ages[vehicle] = min(age, ages.get(vehicle, age))
     return ages
+
+
+@command
+def doctor(
+    read_settings: Callable[[], Settings],
+    *,
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", "-v", help="Examine only this vehicle; also test the write permission")
+    ] = None,
+    mavlink: Annotated[
+        str | None, typer.Option(metavar="LINK", help="Also listen to a MAVLink link, such as udpin:0.0.0.0:14550")
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Diagnose why no messages arrive.
+
+    Checks router, certificates, permissions, clocks, vehicles and MAVLink; lists the worst findings last.
+    Takes a few seconds and changes nothing. Exits with 1 if a finding is wrong, else 0.
+    """
+    if vehicle is not None:
+        check_vehicle(vehicle)
+    findings = examine(read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink)
+    state = worst_state(findings)
+    if json_output:
+        write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
+    else:
+        write(_to_report(findings))
+    if state == "wrong":
+        raise typer.Exit(1)
+
+
+def _to_report(findings: Sequence[Finding]) -> str:
+    """Format findings as lines, followed by the number of findings in each state."""
+    lines = []
+    for each in findings:
+        name = f"{each.check} {each.subject}".rstrip(" :")
+        lines.append(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
+        if each.advice:
+            lines.append(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
+    counts = Counter(each.state for each in findings)
+    return "\n".join([*lines, "", ", ".join(f"{count} {state}" for state, count in counts.items())])
+
+
+@command
+def check(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="CONFIG...",
+            help="Settings (.toml) or router files (.json5); default: the settings of serve",
+            show_default=False,
+        ),
+    ] = None,
+    *,
+    offline: Annotated[bool, typer.Option("--offline", help="Check only the text of the files")] = False,
+) -> None:
+    """Check settings and router files.
+
+    Reports every mistake with file, line and column. Exits with 2 if there is one.
+    """
+    mistakes = [] if files else check_service(offline=offline)
+    for file in files or ():
+        is_toml = file.suffix == ".toml"
+        mistakes += check_service(file, offline=offline) if is_toml else check_router_file(file, offline=offline)
+    report_mistakes(mistakes)
+
+
+def report_mistakes(mistakes: Iterable[ConfigError]) -> None:
+    """Write each mistake to stderr once; exit with 2 if there is one."""
+    lines = dict.fromkeys(map(str, mistakes))
+    for line in lines:
+        write_stderr(f"nedbus: {line}")
+    if lines:
+        raise typer.Exit(2)
+    write("no mistakes found")
