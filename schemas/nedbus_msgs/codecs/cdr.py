@@ -91,7 +91,7 @@ def cdr_layout(layout: Layout) -> CdrLayout:
     body, size, unpadded, not_bools = "<", 0, 0, 0
     offsets = {}
     for name, kind in layout.types.items():
-        padding = -size % kind.alignment
+        padding = 0 if kind.is_text else -size % kind.size
         body += (f"{padding}x" if padding else "") + kind.form
         offsets[name] = len(HEAD) + size + padding
         if kind.base == "bool":

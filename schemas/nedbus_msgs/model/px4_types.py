@@ -94,11 +94,6 @@ class FieldType:
         """Size of one value in bytes."""
         return struct.calcsize("<" + self.form) // self.count
 
-    @property
-    def alignment(self) -> int:
-        """Alignment in CDR in bytes."""
-        return 1 if self.is_text else self.size
-
     @cached_property
     def is_float(self) -> bool:
         """True for float types, whose values may be NaN."""

@@ -66,8 +66,10 @@ class EventMetadata:
             values, shown = self._read(types, component["namespace"], arguments)
             masks = [value for name, value in zip(types, values, strict=True) if "navigation_mode_group_t" in name]
             modes = masks[0] if masks and group in _CHECKS else None
-            lists_checks = event.get("type") == "append_health_and_arming_messages"
-            listed = self._bit_of(component, values[0]) if lists_checks else 0
+            listed = 0
+            if event.get("type") == "append_health_and_arming_messages":
+                of_modes = component["navigation_mode_groups"]["groups"].items()
+                listed = next((1 << int(bit) % 32 for bit, custom in of_modes if values[0] in custom), 0)
             return Event(group, _fill(event["message"][:_MAX_TEXT], shown), modes, listed)
         except (StopIteration, *_DAMAGED):
             return None
@@ -87,16 +89,7 @@ class EventMetadata:
 
     def _enum(self, name: str) -> Mapping[str, Any]:
         space, _, base = name.rpartition("::")
-        return next(
-            each["enums"][base]
-            for each in self._components.values()
-            if each["namespace"] == space and base in each["enums"]
-        )
-
-    @staticmethod
-    def _bit_of(component: Mapping[str, Any], custom_mode: int) -> int:
-        groups = component["navigation_mode_groups"]["groups"].items()
-        return next((1 << int(group) % 32 for group, modes in groups if custom_mode in modes), 0)
+        return next(part["enums"][base] for part in self._components.values() if part["namespace"] == space)
 
 
 def _describe(enum: Mapping[str, Any], value: int) -> str:
@@ -113,12 +106,10 @@ def _fill(template: str, values: Sequence[Any]) -> str:
     def replaced(found: re.Match[str]) -> str:
         if found["escaped"] or found["tag"]:
             shows = {"profile": found["value"] == "dev", "a": True, "param": True}  # other profiles are of end users
-            content = _fill(found["content"], values) if shows.get(found["tag"]) else ""
-            return found["escaped"] or content
-        index = int(found["number"]) - 1
-        if not 0 <= index < len(values):
+            return found["escaped"] or (_fill(found["content"], values) if shows.get(found["tag"]) else "")
+        if not 0 < int(found["number"]) <= len(values):
             return found[0]
-        value = values[index]
+        value = values[int(found["number"]) - 1]
         text = f"{value:.{found['digits']}f}" if found["digits"] and not isinstance(value, str) else str(value)
         return f"{text} {found['unit'].removesuffix('_v')}" if found["unit"] else text
 

@@ -7,7 +7,7 @@ import struct
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from nedbus_msgs import field_type
 
@@ -30,12 +30,6 @@ _MAX_A_SECOND: Final = 100  # statements; PX4 makes 20 when it boots
 _MAX_BYTES: Final = 127
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
-
-
-class _Statement(NamedTuple):
-    severity: int
-    timestamp: int
-    text: str
 
 
 def to_statement(text: str) -> str:
@@ -62,8 +56,8 @@ class Texts:
         self._metadata: EventMetadata | None = None
         self._said: deque[tuple[int, str]] = deque(maxlen=100)  # events without their text: time, words of a check
         self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log a topic twice
-        self._failed: dict[str, int] = {}  # checks of the last report, and the modes that they prevent
-        self._before: dict[str, int] = {}
+        self._failed: dict[str, tuple[int, int]] = {}  # level, and modes that they prevent, of the last report's
+        self._before: dict[str, tuple[int, int]] = {}
         self._nav_state = -1
         self._second = self._count = 0
 
@@ -77,13 +71,12 @@ class Texts:
                 continue
             with suppress(LookupError, TypeError, ValueError, struct.error):  # a topic of this name with other fields
                 if (found := self._read(record)) and not self._is_flood(found.timestamp):
-                    text = to_statement(found.text).encode()
-                    yield Data(SPOKEN, _FORM.pack(found.timestamp, found.severity, text))
+                    yield Data(SPOKEN, _FORM.pack(found.timestamp, found.level, to_statement(found.text).encode()))
 
-    def _read(self, record: Record) -> _Statement | None:
+    def _read(self, record: Record) -> LoggedText | None:
         """Return what is said for the first time."""
         if isinstance(record, LoggedText):
-            return None if self._is_said(record) else _Statement(record.level, record.timestamp, record.text)
+            return None if self._is_said(record) else record
         if isinstance(record, MultiInformation) and record.key == "metadata_events" and isinstance(record.value, bytes):
             self._packed = (self._packed if record.continued else b"") + record.value
             self._packed, self._metadata, self.problem = self._packed[:MAX_PACKED], None, ""
@@ -93,7 +86,7 @@ class Texts:
             self._nav_state = int(record.subscription.decode(record.payload)["nav_state"])  # type: ignore[call-overload]
         return None
 
-    def _read_event(self, fields: dict[str, Any]) -> _Statement | None:
+    def _read_event(self, fields: dict[str, Any]) -> LoggedText | None:
         timestamp, level, key = fields["timestamp"], fields["log_levels"] >> 4, (fields["id"], fields["event_sequence"])
         if (timestamp, *key) in self._seen or (event := self._decode(fields["id"], bytes(fields["arguments"]))) is None:
             return None
@@ -103,20 +96,20 @@ class Texts:
             self._failed, self._before = {}, self._failed
         if level >= _PROTOCOL or not (is_check or event.group == "default"):
             return None
-        text, severity = event.text, level
+        text = event.text
         if is_check:
-            is_known = text in self._failed or text in self._before or len(self._failed) > _MAX_A_SECOND
-            if len(self._failed) <= _MAX_A_SECOND:
-                self._failed[text] = (event.modes or 0) * (level < _INFO)
-            if is_known:
+            modes = _ALL_MODES if event.modes is None else event.modes
+            concerns_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
+            shown, known = level if concerns_mode else max(level, _INFO), self._failed.get(text, self._before.get(text))
+            if len(self._failed) < _MAX_A_SECOND:
+                self._failed[text] = shown, modes if level < _INFO else 0
+            if known and known[0] <= shown:
                 return None
-            severity = level if self._concerns_mode(event) else max(level, _INFO)
+            level = shown
         elif event.lists_checks_of and text.endswith(":"):
-            text = " ".join(
-                [text, ", ".join(name for name, modes in self._failed.items() if modes & event.lists_checks_of)]
-            )
+            text += " " + ", ".join(name for name, (_, modes) in self._failed.items() if modes & event.lists_checks_of)
         self._said.append((timestamp, _first_words(text) if is_check else ""))
-        return _Statement(severity, timestamp, text)
+        return LoggedText(level, timestamp, text)
 
     def _decode(self, number: int, arguments: bytes) -> Event | None:
         if self._metadata is None and self._packed and not self.problem:
@@ -125,10 +118,6 @@ class Texts:
             except ValueError as exc:
                 self.problem = str(exc)
         return self._metadata.decode(number, arguments) if self._metadata else None
-
-    def _concerns_mode(self, event: Event) -> bool:
-        modes = _ALL_MODES if event.modes is None else event.modes
-        return modes == _ALL_MODES or (self._nav_state >= 0 and bool(modes >> self._nav_state & 1))
 
     def _is_said(self, record: LoggedText) -> bool:
         """Return whether an event has just said the same; each event counts for one text."""

@@ -272,7 +272,7 @@ def test_chunks_of_a_status_text_are_joined() -> None:
     [(_, _, gap)] = texts_of([whole[0], whole[2]])
     assert str(gap).endswith("...end")
     assert texts_of([whole[1], (0.3, chunk(b"next", 2, 0, 9))]) == [
-        (1_000_000, 4, f"...?{'b' * 49}"), (1_000_000, 7, "next")
+        (1_000_000, 4, f"...?{'b' * 49}..."), (1_000_000, 7, "next")
     ]  # fmt: skip
     assert [text for *_, text in texts_of([(0.0, chunk(b"c" * 50, 3))])] == ["c" * 50 + "..."]
     flood = [(0.0, chunk(b"d" * 50, 4, number % 256)) for number in range(10_000)]

@@ -8,24 +8,12 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from nedbus import ulog
 from nedbus.client import LogStreamStatus
 from nedbus.errors import AddressError, OutputError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import (
-    SPOKEN,
-    Damage,
-    Data,
-    Dropout,
-    Fitting,
-    Subscription,
-    Texts,
-    UlogError,
-    UlogParser,
-    address_of,
-    definition_of,
-)
 from nedbus_msgs import DEFAULT_TOPIC, Address, Definition
 
 from .log_client import LogStatus, LogStreamClient
@@ -42,7 +30,7 @@ _PIECE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
 
-_Route = tuple[Subscription, Address, Definition[Any], Fitting]
+_Route = tuple[ulog.Subscription, Address, Definition[Any], ulog.Fitting]
 
 
 class LogStream:
@@ -71,7 +59,7 @@ class LogStream:
 
     def _restart(self) -> None:
         """Forget the definitions: those of the next stream may differ."""
-        self._parser, self._texts = UlogParser(verify=False), Texts()
+        self._parser, self._texts = ulog.UlogParser(verify=False), ulog.Texts()
         self._routes: dict[int, _Route | None] = {}
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
@@ -83,7 +71,7 @@ class LogStream:
 
     def carries(self, address: Address) -> bool:
         """Return whether messages of an address come from the stream, so that none are converted."""
-        return self.is_streaming and (address in self._carried or address.topic == SPOKEN.name)
+        return self.is_streaming and (address in self._carried or address.topic == ulog.SPOKEN.name)
 
     def add(self, piece: Piece, now: float) -> Iterator[SourceMessage | Rejection]:
         """Yield the messages that a piece completes."""
@@ -103,12 +91,12 @@ class LogStream:
         known, before = self._parser, self._parser.undecodable
         try:
             records = known.feed(piece.data)
-        except UlogError as exc:
+        except ulog.UlogError as exc:
             yield Rejection(f"{self._name} ULog stream", str(exc))
             return
         self._undecodable += known.undecodable - before
         for record in self._texts.merge(records):
-            if isinstance(record, Data):
+            if isinstance(record, ulog.Data):
                 route = self._routes.get(record.subscription.message_id)
                 if route is None or route[0] is not record.subscription:
                     route = yield from self._find_route(record.subscription)
@@ -119,9 +107,9 @@ class LogStream:
                     for name, reason in [*route[3].unfit.items()][told:]:
                         yield Rejection(f"{self._name} {name}", reason, count=0)
                     yield self._message(fields, route[1], route[2], now)
-            elif isinstance(record, Dropout):
+            elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
-            elif isinstance(record, Damage) and record.reason not in self._damages and len(self._damages) < 100:
+            elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
 
@@ -169,13 +157,13 @@ class LogStream:
             self._file.close()
             self._file = None
 
-    def _find_route(self, subscription: Subscription) -> Generator[Rejection, None, _Route | None]:
+    def _find_route(self, subscription: ulog.Subscription) -> Generator[Rejection, None, _Route | None]:
         """Find address and definition of a subscription; None if it is not selected, or cannot be published."""
         route: _Route | None = None
         if self._topics is None or subscription.name in self._topics:
             try:
-                address, definition = address_of(self._name, subscription), definition_of(subscription)
-                route = subscription, address, definition, Fitting(definition, subscription)
+                address, definition = ulog.address_of(self._name, subscription), ulog.definition_of(subscription)
+                route = subscription, address, definition, ulog.Fitting(definition, subscription)
             except (AddressError, ValueError) as exc:
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
         self._routes[subscription.message_id] = route
