@@ -9,7 +9,7 @@ class LogMessage(Message):
 
     From a log it is what PX4 printed, and what it sent as an event, in the words of the log's own metadata; over
     MAVLink, a STATUSTEXT. A statement that PX4 makes in several forms is published once.
-    Text is cut after 127 bytes of UTF-8.
+    Text is cut after 127 bytes of UTF-8. Statements come in bursts: subscribe in mode "every" to get each of them.
     """
 
     TOPICS = (Topic("log_message", 0.0, "the vehicle, when it has something to say", on_change=True),)

@@ -78,7 +78,7 @@ class UlogReader:
         """Damage and skipped parts so far."""
         ends = {f"damaged: {self._places - _MAX_NAMED} further places": self._places > _MAX_NAMED}
         ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
-        ends |= {f"left out: {self._texts.omitted} texts of PX4 beyond 100 a second": self._texts.omitted > 0}
+        ends |= {f"left out: {self._texts.limit.omitted} texts beyond 100 a second": self._texts.limit.omitted > 0}
         ends |= {self._texts.problem: bool(self._texts.problem)}
         reasons = [reason for stream in self.streams.values() for reason in stream.fitting.unfit.values()]
         return self._warnings + reasons + [text for text, holds in ends.items() if holds]

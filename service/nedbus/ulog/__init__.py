@@ -21,11 +21,11 @@ from .records import (
     Unsubscription,
     Value,
 )
-from .texts import SPOKEN, Texts, to_statement
+from .texts import SPOKEN, TextLimit, Texts, to_statement
 
 __all__ = [
     "SPOKEN", "Damage", "Data", "Dropout", "Fitting", "Format", "Header", "Information", "LoggedText",
     "MultiInformation", "Parameter", "ParameterDefault", "PayloadField", "PayloadLayout", "Record", "Subscription",
-    "Sync", "Texts", "UlogError", "UlogParser", "Unsubscription", "Value", "address_of", "definition_of",
+    "Sync", "TextLimit", "Texts", "UlogError", "UlogParser", "Unsubscription", "Value", "address_of", "definition_of",
     "to_statement",
 ]  # fmt: skip

@@ -39,6 +39,21 @@ def to_statement(text: str) -> str:
     return plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
 
 
+class TextLimit:
+    """Admits 100 statements a second; `omitted`: those beyond."""
+
+    def __init__(self) -> None:
+        self.omitted = self._begin = self._count = 0
+
+    def admits(self, time: int) -> bool:
+        """Return whether a statement of this time [us] is one of the first in its second."""
+        if abs(time - self._begin) >= 1_000_000:
+            self._begin, self._count = time, 0
+        self._count += 1
+        self.omitted += self._count > _MAX_A_SECOND
+        return self._count <= _MAX_A_SECOND
+
+
 class Texts:
     """Adds the messages of `log_message` to the records of a log or a stream.
 
@@ -46,11 +61,11 @@ class Texts:
     Failed checks are reported again with each change of any: they are messages when they are new, and information as
     long as they do not concern the vehicle's mode.
 
-    `omitted`: statements beyond 100 a second. `problem`: why the metadata cannot be used; "" if they can.
+    `problem`: why the metadata cannot be used; "" if they can.
     """
 
     def __init__(self) -> None:
-        self.omitted = 0
+        self.limit = TextLimit()
         self.problem = ""
         self._packed = b""
         self._metadata: EventMetadata | None = None
@@ -59,7 +74,6 @@ class Texts:
         self._failed: dict[str, tuple[int, int]] = {}  # level, and modes that they prevent, of the last report's
         self._before: dict[str, tuple[int, int]] = {}
         self._nav_state = -1
-        self._second = self._count = 0
 
     def merge(self, records: Iterable[Record]) -> Iterator[Record]:
         """Yield the records, and each message of `SPOKEN` behind the last record that it is made of."""
@@ -70,7 +84,7 @@ class Texts:
             if name not in _READ:
                 continue
             with suppress(LookupError, TypeError, ValueError, struct.error):  # a topic of this name with other fields
-                if (found := self._read(record)) and not self._is_flood(found.timestamp):
+                if (found := self._read(record)) and self.limit.admits(found.timestamp):
                     yield Data(SPOKEN, _FORM.pack(found.timestamp, found.level, to_statement(found.text).encode()))
 
     def _read(self, record: Record) -> LoggedText | None:
@@ -127,13 +141,6 @@ class Texts:
                 self._said.remove(each)
                 return True
         return False
-
-    def _is_flood(self, timestamp: int) -> bool:
-        if abs(timestamp - self._second) >= 1_000_000:
-            self._second, self._count = timestamp, 0
-        self._count += 1
-        self.omitted += self._count > _MAX_A_SECOND
-        return self._count > _MAX_A_SECOND
 
 
 def _first_words(text: str) -> str:

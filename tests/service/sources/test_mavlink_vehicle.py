@@ -275,5 +275,12 @@ def test_chunks_of_a_status_text_are_joined() -> None:
         (1_000_000, 4, f"...?{'b' * 49}..."), (1_000_000, 7, "next")
     ]  # fmt: skip
     assert [text for *_, text in texts_of([(0.0, chunk(b"c" * 50, 3))])] == ["c" * 50 + "..."]
-    flood = [(0.0, chunk(b"d" * 50, 4, number % 256)) for number in range(10_000)]
-    assert len(texts_of(flood)) < 50
+
+
+def test_flood_of_status_texts_is_counted() -> None:
+    """Of 10,000 texts in a second, 100 are published, and the others rejected."""
+    vehicle = new_vehicle("log_message")
+    vehicle.handle(position(1000), 0.0)
+    found = [vehicle.handle(chunk(b"flood", 0), 50.0 + number / 11_000) for number in range(10_000)]
+    assert sum(isinstance(each, SourceMessage) for each in found) == 100
+    assert sum(isinstance(each, Rejection) for each in found) == 9_900

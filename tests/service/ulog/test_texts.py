@@ -225,7 +225,7 @@ def test_texts_are_one_printable_line_and_bounded_in_number() -> None:
     log.text(52_000_000, b"later")
     assert len(said := log.said(texts)) == 101
     assert said[-1] == (52_000_000, 6, "later")
-    assert texts.omitted == 9_900
+    assert texts.limit.omitted == 9_900
 
 
 def test_other_fields_under_px4s_names_are_ignored(tmp_path: Path) -> None:

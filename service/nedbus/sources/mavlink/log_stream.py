@@ -88,7 +88,7 @@ class LogStream:
         self._received += len(piece.data)
         self._window_bytes += len(piece.data)
         self._save(piece.data)
-        known, before = self._parser, self._parser.undecodable
+        known, before, omitted = self._parser, self._parser.undecodable, self._texts.limit.omitted
         try:
             records = known.feed(piece.data)
         except ulog.UlogError as exc:
@@ -112,6 +112,8 @@ class LogStream:
             elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
+        count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.SPOKEN.name}"
+        yield from [Rejection(where, "more than 100 texts a second", count=count)] * (count > 0)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
         """Take the answer to a TIMESYNC request that was sent at `sent`; the shortest round trip is the best one."""

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import SPOKEN
+from nedbus.ulog import SPOKEN, TextLimit
 from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address, is_unix_time
 
 from .fields import CONVERSIONS, is_reboot, sensors_of
@@ -87,6 +87,7 @@ class Vehicle:
         self._last_message = 0.0
         self.lost = 0
         self._rebooted = False
+        self._text_limit = TextLimit()
         self._reported: set[int] = set()  # requested messages that were logged as missing
         self._reset(0.0)
 
@@ -145,7 +146,10 @@ class Vehicle:
             self._arrivals[number] = now
         is_double = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
         self._remember(kind, message, timestamp, now)
-        if kind == "STATUSTEXT":
+        if kind == "STATUSTEXT" and SPOKEN.name in self._topics:
+            if not self._text_limit.admits(round(now * 1e6)):
+                address = Address(self._name, SPOKEN.name)
+                return Rejection(str(address), "more than 100 texts a second", address)
             self._texts.add(message, now)
         if fields_of is None and self._newest is not None:
             topic, timestamp, fields_of = SPOKEN.name, self._newest * 1000, lambda _: self._texts.take(now)
