@@ -66,11 +66,6 @@ class Story:
         """Return when it held, and for how long; `now` is the end of a file."""
         return times.period(self.begin, self.end, (now if self.until is None else self.until) - self.since)
 
-    @property
-    def topics(self) -> list[str]:
-        """The topics of all its events, sorted."""
-        return sorted({each.topic for each in (*self.before, *self.meanwhile, *self.after) if each.topic})
-
 
 def stories_of(
     events: Sequence[Event],
@@ -87,7 +82,7 @@ def stories_of(
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
     chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
     if not any(span.until is None if at is None else span.holds(at) for span in chosen):
-        others = [s for s in spans if _is_minor_fault(s)]
+        others = [s for s in spans if s not in chosen and s.severity != "info" and not KINDS[s.kind].stateless]
         chosen += [s for s in others if s.until is None] if chosen and at is None else others
     stories: list[Story] = []
     while chosen:
@@ -204,11 +199,6 @@ def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
         return span.initial and each.initial and each.severity == span.severity == "watch"
 
     return [span, *(each for each in spans if each is not span and is_part(each))]
-
-
-def _is_minor_fault(span: Span) -> bool:
-    kind = KINDS[span.kind]
-    return not (kind.fault or kind.stateless or span.severity == "info")
 
 
 def _span(condition: Condition) -> Span:

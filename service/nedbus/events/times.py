@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Final, Literal
+from typing import Final
 
 from nedbus_msgs import is_unix_time
 
@@ -15,17 +15,11 @@ from .event import Event
 
 _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?")
 
-Clock = Literal["host", "vehicle", "boot", "start"]
-CLOCKS: Final[Mapping[Clock, str]] = {
+CLOCKS: Final[Mapping[str, str]] = {
     "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
     "boot": "seconds since boot, no message contains UTC", "start": "seconds since the start of the recording",
 }  # fmt: skip
 """The clocks of times. UTC and seconds since boot may differ between vehicles."""
-
-UNITS: Final[Mapping[Clock, str]] = {
-    "host": "UTC", "vehicle": "UTC", "boot": "s since boot", "start": "s since the start",
-}  # fmt: skip
-"""The names of the clocks behind a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,15 +44,15 @@ class Times:
         utc = boot + (0.0 if is_unix_time(boot * 1e6) else self.offsets.get(vehicle, math.nan))
         return utc if is_unix_time(utc * 1e6) else None
 
-    def clock(self, event: Event) -> Clock:
-        """Return the clock of an event's time."""
+    def clock(self, event: Event) -> str:
+        """Return the clock of an event's time, a key of CLOCKS."""
         if self.is_live or self.utc(event) is not None:
             return "host" if self.is_live else "vehicle"
         return "start" if event.boot is None else "boot"
 
     def unit(self, event: Event) -> str:
-        """Return what to write behind the time of an event: the name of its clock."""
-        return UNITS[self.clock(event)]
+        """Return the unit of the time of an event: "UTC", "s since boot" or "s since the start of the recording"."""
+        return unit_of(self.clock(event))
 
     def text(self, event: Event) -> str:
         """Format the time of an event, without a date, as `find` reads it: 14:05:12.3, 123.400 or +12.300."""
@@ -106,6 +100,11 @@ class Times:
         if near.boot is None and self.is_live:
             raise ValueError("no message of this vehicle gives the time since boot")
         return near.time + seconds - (near.time if near.boot is None else near.boot)
+
+
+def unit_of(clock: str) -> str:
+    """Return the unit of the times of a clock."""
+    return CLOCKS[clock].partition(",")[0].replace("seconds", "s")
 
 
 def to_clock(utc: float) -> str:

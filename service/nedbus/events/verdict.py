@@ -25,18 +25,15 @@ class Verdict:
     `usable`: False if the vehicle could not do its task because of the fault, True if it could in spite of it; None if
     the data does not have the validity of a position.
     `begin`, `end`: the events that began and ended the worst fault, None if it held in the first or last message.
-    `since`, `until`: when it held, by the account's clock [s]; `until` is None while it is active.
-    `cause`: its evidence in order of time. `faults`: the number of stories.
+    `cause`: its evidence in order of time. `stories`: all faults in order of time.
     """
 
     text: str
     usable: bool | None
     begin: Event | None = None
     end: Event | None = None
-    since: float | None = None
-    until: float | None = None
     cause: tuple[Event, ...] = ()
-    faults: int = 0
+    stories: tuple[Story, ...] = ()
 
 
 def verdict_of(
@@ -64,13 +61,12 @@ def verdict_of(
         has_ended = is_now and story.until is not None
         return not story.is_bad, story.begin in parts, has_ended, importance(story.spans[0].kind), -_size(story)
 
-    stories.sort(key=order)
     known = None if POSITIONS.isdisjoint(topics) else True
     if not stories:
         length = "in the history of the services" if times.is_live else f"in {end:.0f} s"
         unknown = "" if known else "; no topic in the data has the validity of a position"
         return Verdict(f"no faults {length}{unknown}", known)
-    worst = stories[0]
+    worst = min(stories, key=order)
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and is_then else known
     head = "" if is_then else "no fault then; the nearest: "
@@ -83,7 +79,7 @@ def verdict_of(
         longer = f"{also}; {part}" if also else f" Also {part}"
         also = longer if len(text) + len(longer) < _LENGTH else also
     text += f"{also}." * bool(also)
-    return Verdict(text, usable, worst.begin, worst.end, worst.since, worst.until, cause, len(stories))
+    return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 
 
 def _cause(story: Story, events: Iterable[Event]) -> tuple[Event, ...]:

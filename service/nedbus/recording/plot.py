@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
-from nedbus.events import KINDS, SEVERITIES, UNITS, Event, Severity, Times, spans_of, to_clock
+from nedbus.events import KINDS, SEVERITIES, Event, Severity, Times, spans_of, to_clock, unit_of
 from nedbus.whole_file import whole_file
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
@@ -159,7 +159,7 @@ def _label_times(axes: Iterable[Any], streams: Iterable[_Stream], start: float, 
         each.set_xticks(
             ticks - shift, [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
         )
-    return f"time [{UNITS['vehicle' if has_utc else 'boot']}]"
+    return f"time [{unit_of('vehicle' if has_utc else 'boot')}]"
 
 
 def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:

@@ -188,7 +188,11 @@ def test_clock_that_is_not_known() -> None:
 def test_time_since_the_start() -> None:
     """An event before any time since boot is labelled since the start of the recording, as `find` reads it."""
     told = event_at(40.0)
-    assert (Times().clock(told), Times().text(told), Times().unit(told)) == ("start", "+40.000", "s since the start")
+    assert (Times().clock(told), Times().text(told), Times().unit(told)) == (
+        "start",
+        "+40.000",
+        "s since the start of the recording",
+    )
     assert Times().find(Times().text(told), told) == 40.0
 
 

@@ -44,7 +44,7 @@ def test_verdict_of_a_fault_that_lasts() -> None:
         "12 satellites to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
         "failsafe_flags."
     )
-    assert (found.usable, found.until, found.faults) == (False, None, 1)
+    assert (found.usable, found.end, len(found.stories)) == (False, None, 1)
     assert found.begin is not None
     assert found.begin.kind == "xy_invalid"
     assert [each.kind for each in found.cause] == ["gps_fix_lost", "few_satellites", "dead_reckoning"]
@@ -58,7 +58,9 @@ def test_verdict_of_a_fault_that_ended() -> None:
     flight.wait(1.0).send()
     found = verdict(flight)
     assert found.text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot (2.0 s). Evidence: ")
-    assert (found.usable, found.since, found.until) == (False, flight.now - 2.0, flight.now)
+    assert found.begin is not None
+    assert found.end is not None
+    assert (found.usable, found.begin.time, found.end.time) == (False, flight.now - 2.0, flight.now)
 
 
 def test_verdict_without_faults() -> None:
@@ -66,7 +68,7 @@ def test_verdict_without_faults() -> None:
     flight = Flight()
     flight.fly(5)
     found = verdict(flight)
-    assert (found.text, found.usable, found.faults) == ("no faults in 105 s", True, 0)
+    assert (found.text, found.usable, found.stories) == ("no faults in 105 s", True, ())
     assert verdict(flight, times=LIVE).text == "no faults in the history of the services"
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
     assert (unknown.usable, "no topic in the data has the validity of a position" in unknown.text) == (None, True)
@@ -160,12 +162,12 @@ def test_verdict_of_what_holds_from_begin_to_end() -> None:
         "position valid throughout, but no GPS fix; xy has no global reference from the first message on, "
         "until the end (62.0 s)."
     )
-    assert (found.usable, found.faults) == (True, 1)
+    assert (found.usable, len(found.stories)) == (True, 1)
     invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
     assert found.text.startswith("xy not valid from the first message on, until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
-    assert (found.usable, found.faults) == (False, 1)
+    assert (found.usable, len(found.stories)) == (False, 1)
 
 
 def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
@@ -179,8 +181,8 @@ def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
     events = flight.account.events_since(0)[0]
     other: list[Any] = [replace(each, vehicle="2") for each in events]
     topics = ["vehicle_local_position"]
-    assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).faults == 0
-    assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).faults == 1
+    assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).stories == ()
+    assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).stories
     assert verdict(flight, at=flight.now - 30).text.startswith("no fault then; the nearest: ")
     assert verdict(flight, at=flight.now - 30).usable is True
     assert verdict(flight, at=107.0).text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.events import Event, Times
+from nedbus.events import KINDS, Event, Times
 from nedbus.sources import read_account
 from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
@@ -251,7 +251,7 @@ def test_texts_of_real_flights_do_not_overlap(path: Path) -> None:
             assert end <= begin
     titles = [parts[name].title.get_window_extent() for name in ("track", "altitude")]
     assert titles[0].x1 < titles[1].x0
-    bad = {event.kind.replace("_", " ") for event in events if event.severity != "info"}
+    bad = {KINDS[event.kind].row or event.kind.replace("_", " ") for event in events if event.severity != "info"}
     assert bad <= set(rows_of(axes))
 
 

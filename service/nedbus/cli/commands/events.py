@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -29,7 +30,7 @@ from nedbus.events import (
     Vehicle,
     Verdict,
     by_vehicle,
-    stories_of,
+    report_of,
     verdict_of,
 )  # fmt: skip
 from nedbus.monitoring import Observer
@@ -128,45 +129,34 @@ def why(
     """
     if files:
         read, found = _read(files)
-        followed, times, end = read.account.vehicles, read.times, read.end
-        names = _choose_vehicles(_name(files), followed, vehicle)
-        held = {
-            name: [each for each in followed[name].conditions.values() if each.severity != "info"] for name in names
-        }
-        topics = {name: sorted(followed[name].topics) for name in names}
-        advice = _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
+        reports, times = [report_of(read.account, "", "", read.end, within=math.inf)], read.times
+        where, advice = _name(files), _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
             published = bus.vehicles()
-            where = " or ".join(bus.routers)
-        reporting, found = by_vehicle(reports), _merge(reports)
-        if vehicle in published and vehicle not in reporting:
-            hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
-            raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
-        if not reporting:
-            raise NedbusError(f"no nedbus service at {where} has data of a vehicle: start one with 'nedbus serve'")
-        names = _choose_vehicles("the network", reporting, vehicle)
-        held = {name: list(reporting[name].vehicles[name].held) for name in names}
-        topics = {name: list(reporting[name].vehicles[name].topics) for name in names}
-        times, end, advice = Times(is_live=True), max(report.now for report in reports), _LIVE_ADVICE
-    texts: list[str] = []
-    faults = 0
-    for name in names:
+            routers = " or ".join(bus.routers)
+        found, times, where, advice = _merge(reports), Times(is_live=True), "the network", _LIVE_ADVICE
+    reporting, faults, texts = by_vehicle(reports), 0, list[str]()
+    if not files and vehicle in published and vehicle not in reporting:
+        hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
+        raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
+    if not files and not reporting:
+        raise NedbusError(f"no nedbus service at {routers} has data of a vehicle: start one with 'nedbus serve'")
+    for name in _choose_vehicles(where, reporting, vehicle):
         events = [event for event in found if event.vehicle in (name, ANY)]
+        known, end = reporting[name].vehicles[name], reporting[name].now
         moment = _find_moment(at, times, events)
-        verdict = verdict_of(name, events, held[name], topics=topics[name], times=times, end=end, at=moment)
-        stories = stories_of(events, held[name], topics=topics[name], at=moment)
+        verdict = verdict_of(name, events, known.held, topics=known.topics, times=times, end=end, at=moment)
         if json_output:
-            blocks = [_story_fields(story, times) for story in stories]
-            write(json.dumps({"vehicle": name, "verdict": _verdict_fields(verdict, times), "faults": blocks}))
+            write(json.dumps({"vehicle": name} | _verdict_fields(verdict, times)))
             continue
-        faults += len(stories)
+        faults += len(verdict.stories)
         texts.append(fold(f"{name}: ", to_text(verdict.text, _MAX_TEXT)))
-        texts += ["\n".join(_describe(name, story, times, end, advice)) for story in stories if details]
+        texts += ["\n".join(_describe(name, story, times, end, advice)) for story in verdict.stories if details]
     if texts:
         write(("\n\n" if details else "\n").join(texts))
-    if faults and not (details or json_output):
+    if faults and not details:
         write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
 
 
@@ -298,21 +288,21 @@ def _to_csv(event: Event, times: Times) -> str:
     return csv_line([fields[name] for name in _HEAD])
 
 
-def _story_fields(story: Story, times: Times) -> dict[str, object]:
-    events = {name: getattr(story, name) for name in ("before", "meanwhile", "after")}
-    return {
-        "what": story.what,
-        "begin": None if story.begin is None else _to_fields(story.begin, times),
-        "lasted": None if story.until is None else story.until - story.since,
-        **{name: [_to_fields(event, times) for event in each] for name, each in events.items()},
-        "lacking": story.lacking,
-    }
-
-
 def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
-    begin, end = (None if each is None else _to_fields(each, times) for each in (verdict.begin, verdict.end))
-    cause = [_to_fields(event, times) for event in verdict.cause]
-    return {"text": verdict.text, "usable": verdict.usable, "begin": begin, "end": end, "cause": cause}
+    def fields(events: Iterable[Event | None]) -> list[dict[str, object] | None]:
+        return [None if event is None else _to_fields(event, times) for event in events]
+
+    faults = [
+        {
+            "what": each.what, "begin": fields([each.begin])[0], "end": fields([each.end])[0],
+            "lasted": None if each.until is None else each.until - each.since, "before": fields(each.before),
+            "meanwhile": fields(each.meanwhile), "after": fields(each.after), "lacking": each.lacking,
+        }
+        for each in verdict.stories
+    ]  # fmt: skip
+    begin, end = fields([verdict.begin, verdict.end])
+    told = {"text": verdict.text, "usable": verdict.usable, "begin": begin, "end": end, "cause": fields(verdict.cause)}
+    return {"verdict": told, "faults": faults}
 
 
 def _choose_vehicles(where: object, names: Collection[str], vehicle: str) -> list[str]:
