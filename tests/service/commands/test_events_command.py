@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import re
+import struct
 import time
 from pathlib import Path
 from typing import Any
@@ -336,6 +337,27 @@ def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, end
     ]
     assert {each["clock"] for each in told} == {"host"}
     assert [each["kind"] for each in told[1]["evidence"]] == ["dead_reckoning"]
+
+
+def test_texts_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+    """PX4's own texts are told to those who ask later, as they are by a file."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for tenth in range(10, 60):
+        if tenth == 40:
+            for words in (b"[ekf2] reset", b"[failsafe] Failsafe activated"):
+                writer.put("L", b"4" + struct.pack("<Q", tenth * 100_000) + words)
+        writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": tenth < 41}))
+    log = writer.write(tmp_path / "texts.ulg")
+    start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
+    follower = run_nedbus("events", "-c", endpoint, "--within", "600", "--origin", "px4")
+    wait_for(lambda: len(follower.out.splitlines()) == 2, what="the texts")
+    for shown in (follower.out, run_command("events", str(log), "--origin", "px4").out):
+        first, second = shown.splitlines()
+        assert first.endswith('1        WATCH  PX4: "[ekf2] reset"')
+        assert second.endswith('PX4: "[failsafe] Failsafe activated"')
+    for shown in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
+        assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in shown
 
 
 def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
