@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from nedbus.errors import OutputError
 from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
-from nedbus_msgs.messages.log_message import LogMessage
+from nedbus_msgs.messages import LogMessage
 
 from .ros2_log import DEFINITION, TYPE, encode_log
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-from nedbus_msgs.messages.log_message import LogMessage
+from nedbus_msgs.messages import LogMessage
 
 TYPE: Final = "rcl_interfaces/msg/Log"
 DEFINITION: Final = f"""builtin_interfaces/Time stamp
