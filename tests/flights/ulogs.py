@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.first_message import FIELD_TYPES, LAYOUTS, downgrade
 
@@ -17,6 +18,15 @@ _CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": 
 
 def _type(name: str, field_types: Mapping[str, str]) -> str:
     return field_types.get(name, "float32").removesuffix("[2]")
+
+
+def said_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:
+    """Return timestamp, severity and text of each of PX4's statements in a log."""
+    parser = UlogParser(verify=True)
+    records = [*parser.feed(log if isinstance(log, bytes) else log.read_bytes()), *parser.close()]
+    messages = (texts or Texts()).merge(records)
+    found = [SPOKEN.decode(each.payload) for each in messages if isinstance(each, Data) and each.subscription is SPOKEN]
+    return [tuple(fields.values()) for fields in found]  # type: ignore[misc] # three values
 
 
 class UlogWriter:

@@ -9,18 +9,22 @@ from typing import Any, Final
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
+from pyulog import ULog
 
 from nedbus.sources import SourceMessage
-from nedbus.sources.mavlink.vehicle import STREAMS, Vehicle
+from nedbus.sources.mavlink.reader import new_parser
+from nedbus.sources.mavlink.vehicle import STREAMS as REQUESTED
+from nedbus.sources.mavlink.vehicle import Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import BY_TOPIC, upgrade_with
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
+from tests.peers.px4_log_stream import STREAMS, datagrams
 
 from .test_px4_real import PX4, read_datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
-TOPICS: Final = {topic for _, _, topics in STREAMS.values() for topic in topics.split()} - {VLP}
+TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
 UNTIMED: Final = 2.0  # s: what has no time of its own is in the log at most so long before, by its own rate there
 OF_STATUS: Final = 1.2  # s: ESTIMATOR_STATUS comes once a second
 RESOLUTION: Final = {
@@ -119,3 +123,23 @@ def test_utc_is_that_of_the_vehicles_clock() -> None:
                 origins.append(int(str(said.fields["time_utc_usec"])) - int(str(said.fields["timestamp"])))
     assert len(origins) == 378
     assert max(origins) - min(origins) < 2_000_000  # simulated time, and the host's clock
+
+
+@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
+def test_status_texts_are_in_the_log() -> None:
+    """Each STATUSTEXT of a flight is a text of the vehicle's own log, without its module, or an event with a tab."""
+    vehicle, parser = Vehicle("1", MavlinkOptions(topics=("log_message",))), new_parser()
+    texts = [
+        (each.fields["timestamp"], str(each.fields["text"]))
+        for when, from_vehicle, frame in datagrams(STREAMS / "ulog_stream_flight1.bin.gz")
+        if from_vehicle
+        for message in parser.parse_buffer(frame) or []
+        if isinstance(each := vehicle.handle(message, when), SourceMessage)
+    ]
+    log = ULog(str(STREAMS / "ulog_stream_flight1.ulg"))
+    logged = {each.message.partition("] ")[2].strip() for each in log.logged_messages}
+    assert [text for _, text in texts if text not in logged] == []
+    assert [text for _, text in texts][1:4] == [
+        "Preflight Fail: no heading reference", "Mission rejected: empty", "Armed by external command"
+    ]  # fmt: skip
+    assert len(texts) == 10

@@ -14,8 +14,8 @@ from pyulog import ULog
 from pyulog.px4_events import PX4Events
 
 import nedbus
-from nedbus.ulog import SPOKEN, Data, Texts, UlogParser, to_statement
-from tests.flights.ulogs import LOGS, UlogWriter
+from nedbus.ulog import Texts, to_statement
+from tests.flights.ulogs import LOGS, UlogWriter, said_in
 
 REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
 ARMED: Final = {"arguments": [{"name": "by", "type": "by_t"}], "message": "Armed by {1}", "name": "armed"}
@@ -94,13 +94,6 @@ class Log(UlogWriter):
         return said_in(bytes(self.data), texts)
 
 
-def said_in(data: bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:
-    parser = UlogParser(verify=True)
-    records = (texts or Texts()).merge([*parser.feed(data), *parser.close()])
-    found = [SPOKEN.decode(each.payload) for each in records if isinstance(each, Data) and each.subscription is SPOKEN]
-    return [tuple(fields.values()) for fields in found]  # type: ignore[misc]
-
-
 @pytest.mark.logs
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
 def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
@@ -109,7 +102,7 @@ def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
     logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
     events = {(int(time), text) for time, _, text in (PX4Events().get_logged_events(log) if has_metadata else ())}
-    left = said_in(path.read_bytes())
+    left = said_in(path)
     for time, text in events:
         [one] = [each for each in left if each[0] == time and each[2].startswith(text)]
         left.remove(one)

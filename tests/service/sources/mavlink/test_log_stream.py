@@ -25,8 +25,8 @@ from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient, LogStr
 from nedbus.sources.mavlink.log_reassembly import Piece
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
-from nedbus.ulog import Data, Texts, UlogParser
-from tests.flights.ulogs import write_raw_log
+from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
+from tests.flights.ulogs import said_in, write_raw_log
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
 from tests.waits import DEADLINE
@@ -88,8 +88,9 @@ class Received:
                     self.reasons.add(item.reason)
                     if is_end:
                         break
-        self.stream = [each for each in self.messages if each.source]
-        self.converted = [each for each in self.messages if not each.source]
+        data = [each for each in self.messages if each.address.topic != SPOKEN.name]
+        self.stream = [each for each in data if each.source]
+        self.converted = [each for each in data if not each.source]
 
 
 def logged_messages(path: Path) -> dict[tuple[str, int], set[str]]:
@@ -130,7 +131,7 @@ def sent_messages() -> list[tuple[str, str]]:
 def test_stream_is_published_in_full() -> None:
     """All messages of all topics that a real PX4 (SITL) sent are published, in order, each with all of its fields."""
     received, sent = Received("log=1"), sent_messages()
-    assert [(each.address.topic, repr(each.fields)) for each in received.stream] == sent
+    assert [(each.address.topic, repr(each.fields)) for each in received.messages if each.source] == sent
     assert len({topic for topic, _ in sent}) == 20
     status = received.status
     assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
@@ -160,6 +161,19 @@ def test_stream_of_px4_equals_its_own_log(tmp_path: Path) -> None:
     assert not log.file_corruption
     assert sum(len(each.data["timestamp"]) for each in log.data_list) == MESSAGES
     assert log.dropouts == []
+
+
+@recorded_flight
+def test_px4s_words_in_a_stream_are_those_of_its_own_log() -> None:
+    """Texts and events are log_message, each once, as in the log; STATUSTEXT only before the stream."""
+    received = Received("log=1&topics=log_message", FLIGHT)
+    words = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
+    assert {each.source for each in words} == {"mavlink-ulog"}
+    logged = said_in(STREAMS / "ulog_stream_flight1.ulg")
+    assert [tuple(each.fields.values()) for each in words] == [
+        each for each in logged if 7_000_000 < each[0] <= cast("int", words[-1].fields["timestamp"])
+    ]
+    assert len(words) == 10
 
 
 @recorded_flight
@@ -261,7 +275,8 @@ def test_hostile_vehicle_harms_no_other() -> None:
 
         received = Received("log=armed", attack=attack)
     ours = [each for each in received.stream if each.address.vehicle == "1"]
-    assert len(ours) == len(received.stream) == len(sent_messages()), received.reasons
+    sent_data = [topic for topic, _ in sent_messages() if topic != SPOKEN.name]
+    assert len(ours) == len(received.stream) == len(sent_data), received.reasons
     reasons = {(each.where, each.reason) for each in received.rejections}
     assert sent[str(START)]
     assert any("not requested" in reason for _, reason in reasons)
