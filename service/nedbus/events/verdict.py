@@ -42,6 +42,7 @@ def verdict_of(
     held: Iterable[Condition] = (),
     *,
     topics: Collection[str],
+    unknown: Collection[str] = (),
     times: Times,
     end: float,
     at: float | None = None,
@@ -49,8 +50,8 @@ def verdict_of(
     """Return the verdict on a vehicle.
 
     `events`: those of this vehicle and of ALL, in order of time; others are left out. `held`: conditions that are
-    active after the last event. `topics`: the topics that it publishes. `end`: now, or the end of the file, by the
-    account's clock [s]. `at`: the moment in question, None for all of the data.
+    active after the last event. `topics`: the topics that it publishes. `unknown`: flags that its position does not
+    provide. `end`: now, or the end of the file, by the account's clock [s]. `at`: the moment in question, None for all.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     stories = stories_of(events, held, topics=topics, at=at)
@@ -61,11 +62,11 @@ def verdict_of(
         has_ended = is_now and story.until is not None
         return not story.is_bad, story.begin in parts, has_ended, importance(story.spans[0].kind), -_size(story)
 
-    known = None if POSITIONS.isdisjoint(topics) else True
+    known = None if POSITIONS.isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
         length = "in the history of the services" if times.is_live else f"in {end:.0f} s"
-        unknown = "" if known else "; no topic in the data has the validity of a position"
-        return Verdict(f"no faults {length}{unknown}", known)
+        doubt = "" if known else "; the data does not have the validity of a position"
+        return Verdict(f"no faults {length}{doubt}", known)
     worst = min(stories, key=order)
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and is_then else known

@@ -71,7 +71,17 @@ def test_verdict_without_faults() -> None:
     assert (found.text, found.usable, found.stories) == ("no faults in 105 s", True, ())
     assert verdict(flight, times=LIVE).text == "no faults in the history of the services"
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
-    assert (unknown.usable, "no topic in the data has the validity of a position" in unknown.text) == (None, True)
+    assert (unknown.usable, "the data does not have the validity of a position" in unknown.text) == (None, True)
+
+
+def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
+    """A position without flags, as of ArduPilot, is neither usable nor not."""
+    flight = Flight()
+    for _ in range(5):
+        flight.wait(0.1).send(missing=("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
+    (known,) = report_of(flight.account, "s", "h", flight.now, within=60).vehicles.values()
+    found = verdict_of("1", [], topics=known.topics, unknown=known.unknown, times=Times(), end=0.5)
+    assert (found.usable, found.text) == (None, "no faults in 0 s; the data does not have the validity of a position")
 
 
 def test_verdict_of_a_vehicle_that_stays_usable() -> None:

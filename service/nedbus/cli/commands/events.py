@@ -86,6 +86,8 @@ def events(
     if not files:
         if csv_output:
             write(csv_line(_HEAD))
+        elif not json_output:
+            write_stderr(f"times: {CLOCKS['host']}")
         with open_bus() as bus:
             times = Times(is_live=True)
             if within is not None:
@@ -147,7 +149,9 @@ def why(
         events = [event for event in found if event.vehicle in (name, ANY)]
         known, end = reporting[name].vehicles[name], reporting[name].now
         moment = _find_moment(at, times, events)
-        verdict = verdict_of(name, events, known.held, topics=known.topics, times=times, end=end, at=moment)
+        verdict = verdict_of(
+            name, events, known.held, topics=known.topics, unknown=known.unknown, times=times, end=end, at=moment
+        )
         if json_output:
             write(json.dumps({"vehicle": name} | _verdict_fields(verdict, times)))
             continue
