@@ -112,7 +112,8 @@ def state_of(conditions: Iterable[Condition]) -> State:
         is_single = each.begin.change == "once"
         return SEVERITIES.index(each.severity), is_single, -each.since if is_single else importance(each.kind)
 
-    ordered = sorted((each for each in conditions if each.severity != "info"), key=order)
+    counting = (each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless)
+    ordered = sorted(counting, key=order)
     if not ordered:
         return State("info", "ok", None, ())
     first = ordered[0]

@@ -96,10 +96,13 @@ def stories_of(
     return held or [story for story in stories if story.since <= at][-1:] or stories[:1]
 
 
-def story_of(event: Event, events: Sequence[Event], *, topics: Collection[str] = ()) -> Story | None:
+def story_of(
+    event: Event, events: Sequence[Event], conditions: Iterable[Condition] = (), *, topics: Collection[str] = ()
+) -> Story | None:
     """Return the story of the condition that an event begins or ends, or of a single event."""
-    spans = spans_of(events)
-    span = next((each for each in spans if event in (each.begin, each.end)), None)
+    spans = spans_of(events, conditions)
+    ends = ((span, each) for span in spans for each in (span.begin, span.end) if each is not None)
+    span = next((span for span, each in ends if each.identity == event.identity), None)
     return None if span is None else _make_story(_together(span, spans), spans, events, topics)
 
 

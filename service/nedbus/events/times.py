@@ -26,17 +26,18 @@ CLOCKS: Final[Mapping[str, str]] = {
 class Times:
     """Conversion of event times to UTC, for live data or for a file.
 
-    `is_live`: the account's clock is the clock of this host, in seconds since the epoch.
+    `is_live`: the account's clock is the clock of this host, `ahead` seconds behind Unix time.
     `offsets`: Unix time minus time since boot [s], for each vehicle whose messages contain it.
     """
 
     is_live: bool = False
     offsets: Mapping[str, float] = field(default_factory=dict)
+    ahead: float = 0.0
 
     def utc(self, event: Event) -> float | None:
         """Return the Unix time of an event [s], None if unknown."""
         if self.is_live:
-            return event.time
+            return event.time + self.ahead
         return None if event.boot is None else self.utc_of_boot(event.vehicle, event.boot)
 
     def utc_of_boot(self, vehicle: str, boot: float) -> float | None:

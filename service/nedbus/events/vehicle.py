@@ -163,7 +163,7 @@ class Vehicle:
         found = [each for each in self.conditions.values() if is_flying or KINDS[each.kind].on_ground != "info"]
         kinds = {each.kind for each in found}
         for event in reversed(self.recent):
-            if event.change == "once" and time - RECENT < event.time and not KINDS[event.kind].stateless:
+            if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
             elif event.change == "begin" and event.kind not in kinds and self._is_suppressed(event):
                 kinds.add(event.kind)

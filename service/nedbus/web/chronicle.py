@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 from nedbus.events import (
+    UNITS,
     Account,
     Condition,
     Event,
@@ -13,11 +15,13 @@ from nedbus.events import (
     State,
     Story,
     Times,
+    Verdict,
     spans_of,
     state_at,
     stories_of,
     story_of,
     to_clock,
+    verdict_of,
 )
 
 PAST: Final = 600.0
@@ -30,19 +34,20 @@ _TENTH: Final = 0.1  # s; time resolution of the page's URL
 class Chronicle:
     """The events of an account and those `before` it; re-evaluated only after new events.
 
-    `start`: Unix time of a recording's start, or what to add to the times of live events [s]; None if unknown.
+    `start`: what to add to times of the account on an axis [s]; `unit`: the name of the clock that this gives.
     """
 
     def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
         self.account = account
         self.times = times or Times(is_live=True)
-        self.start: float | None = None
+        self.start, self.unit = 0.0, UNITS["host" if self.times.is_live else "start"]
         self._before = before
         self._taken = -1
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
         self._stories: dict[tuple[str, Event | float | None], list[Story]] = {}
+        self._verdicts: dict[tuple[str, float | None], tuple[float, Verdict]] = {}
 
     @property
     def events(self) -> Sequence[Event]:
@@ -60,21 +65,22 @@ class Chronicle:
         """Return the state of a vehicle at a time."""
         return state_at(self.spans.get(vehicle, ()), time)
 
-    @property
-    def has_utc(self) -> bool:
-        """True if times are available in UTC."""
-        return self.times.is_live or self.start is not None
+    def set_start(self, vehicle: str, boot: float, time: float) -> None:
+        """Set the clock of the axis in a recording, from a message `boot` seconds after a vehicle's boot."""
+        utc = self.times.utc_of_boot(vehicle, boot)
+        if utc is not None:
+            self.start, self.unit = utc - time, UNITS["vehicle"]
+        elif len(self.account.vehicles) < 2:  # vehicles boot at different times
+            self.start, self.unit = boot - time, UNITS["boot"]
 
     def moment(self, seconds: float) -> str:
-        """Format a time of the account in UTC, or as minutes and seconds since the start if UTC is unknown."""
-        return to_clock(seconds + (self.start or 0.0))[:-2] if self.has_utc else _elapsed(seconds)
+        """Format a time of the account by the clock of the axis."""
+        return to_clock(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
 
     def clock(self, seconds: float) -> str:
-        """Format a time of the account for the header: in UTC and, for a recording, since its start."""
-        parts = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
-        if not self.times.is_live:
-            parts.append(_elapsed(seconds))
-        return ", ".join(parts)
+        """Format a time of the account with the name of its clock and, in a recording, since the start."""
+        since = "" if self.times.is_live or not self.start else f", {seconds:.1f} {UNITS['start']}"
+        return f"{self.moment(seconds)} {self.unit}{since}"
 
     def story(self, vehicle: str, now: float, at: Event | float | None, held: Sequence[Condition]) -> Story | None:
         """Return the story of the selected event or time; for now, that of the current state or a recent condition.
@@ -83,29 +89,46 @@ class Chronicle:
         """
         self._read()
         if at is None and held:  # the condition that gives the state its text
-            begin = held[0].begin.identity
-            at = next((event for event in self._by_vehicle.get(vehicle, ()) if event.identity == begin), None)
+            at = held[0].begin
         stories = self._tell(vehicle, at)
-        if at is not None:
-            return next(iter(stories), None)
-        stories = [story for story in stories if story.since <= now]
-        going = [story for story in stories if story.until is None or story.until > now]
-        fitting = [story for story in going if held and held[0].text in story.what]
-        recent = [story for story in stories if story not in going and (story.until or 0.0) > now - PAST]
-        return next(iter([*fitting, *going, *reversed(recent)]), None)
+        if at is None:
+            stories = [story for story in stories if story.since <= now and now - (story.until or now) < PAST][::-1]
+        return next(iter(stories), None)
+
+    def verdict(self, vehicle: str, end: float, at: float | None = None) -> Verdict:
+        """Return the verdict at a time, or on all of a recording or the last ten minutes; `end` is its end, or now."""
+        self._read()
+        made, verdict = self._verdicts.get((vehicle, at), (-math.inf, None))
+        if verdict is None or end - made >= 1.0:
+            events, (topics, held) = self._by_vehicle.get(vehicle, [])[-_MAX_EVENTS:], self._known(vehicle)
+            events = [event for event in events if event.time > end - PAST or not self.times.is_live]
+            verdict = verdict_of(vehicle, events, held, topics=topics, times=self.times, end=end, at=at)
+            self._verdicts[vehicle, at] = end, verdict
+        return verdict
+
+    @property
+    def faults(self) -> Sequence[tuple[str, Story]]:
+        """The stories of all vehicles, in order of time."""
+        self._read()
+        stories = [(name, story) for name in self._by_vehicle for story in self._tell(name, None)]
+        return sorted(stories, key=lambda each: each[1].since)
 
     def _tell(self, vehicle: str, at: Event | float | None) -> list[Story]:
         """Return the stories of an event, a time, or all times; cached for all viewers until the next event."""
         if (vehicle, at) not in self._stories:
-            known, events = self.account.vehicles.get(vehicle), self._by_vehicle.get(vehicle, [])
-            topics, initial = ([], []) if known is None else (list(known.topics), list(known.initial))
+            events, (topics, held) = self._by_vehicle.get(vehicle, []), self._known(vehicle)
             if isinstance(at, Event):
-                story = story_of(at, events, topics=topics)
+                story = story_of(at, events, held, topics=topics)
                 self._stories[vehicle, at] = [] if story is None else [story]
             else:
                 moment = None if at is None else at + _TENTH
-                self._stories[vehicle, at] = stories_of(events[-_MAX_EVENTS:], initial, topics=topics, at=moment)
+                self._stories[vehicle, at] = stories_of(events[-_MAX_EVENTS:], held, topics=topics, at=moment)
         return self._stories[vehicle, at]
+
+    def _known(self, vehicle: str) -> tuple[list[str], list[Condition]]:
+        """Return the topics of a vehicle, and the conditions that began before the first event or are still active."""
+        known = self.account.vehicles.get(vehicle)
+        return ([], []) if known is None else ([*known.topics], [*known.initial, *known.conditions.values()])
 
     def _read(self) -> None:
         if self._taken == self.account.reported:
@@ -113,6 +136,7 @@ class Chronicle:
         events, self._taken = self.account.events_since(0)
         self._events = sorted([*self._before, *events], key=lambda event: event.time)
         self._stories.clear()
+        self._verdicts.clear()
         vehicles = dict(self.account.vehicles)
         self._by_vehicle = {name: [] for name in vehicles}
         for event in self._events:
@@ -121,8 +145,3 @@ class Chronicle:
             name: spans_of(events, list(vehicles[name].initial) if name in vehicles else ())
             for name, events in self._by_vehicle.items()
         }
-
-
-def _elapsed(seconds: float) -> str:
-    tenths = round(seconds * 10)
-    return f"{tenths // 600}:{tenths % 600 / 10:04.1f}"

@@ -265,13 +265,9 @@ def _facts(lines: Sequence[Line]) -> dict[str, Fact]:
     return {
         "mode": fact("vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))),
         "armed": fact("vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"),
-        "battery": fact("battery_status", lambda last: _percent(last.remaining)),
+        "battery": fact("battery_status", lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else ""),
         "gps": fact(gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"),
     }
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if 0 <= share <= 1 else ""
 
 
 def natural(name: str) -> list[tuple[bool, int, str]]:

@@ -92,7 +92,7 @@ class Map:
             placed = [(event, place) for event, place in zip(events, places, strict=True) if place is not None]
         self.shown_events = [event for event, _ in placed]
         marks = [
-            {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.text[:80],
+            {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.words[:80],
              "colour": self._style.grades[event.severity]}
             for event, at in placed
         ]  # fmt: skip

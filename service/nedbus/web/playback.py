@@ -89,9 +89,8 @@ class Recording:
             if is_position(address):
                 row = codec_of(DEFAULT).decode_row(payload)
                 self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
-        offset = self.chronicle.times.offsets.get(address.vehicle)
-        if self.chronicle.start is None and reason is None and offset is not None:
-            self.chronicle.start = stamp / 1e6 + offset - message.due
+        if reason is None and address not in self._indices and is_position(address):
+            self.chronicle.set_start(address.vehicle, stamp / 1e6, message.due)
         self._indices.setdefault(address, []).append(len(self.entries))
         self.entries.append((address, kept))
         self.dues.append(message.due)

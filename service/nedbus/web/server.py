@@ -29,7 +29,7 @@ from tornado.web import HTTPError, RequestHandler
 from nedbus import clock
 from nedbus.client import Bus
 from nedbus.errors import ListenError
-from nedbus.events import ALL
+from nedbus.events import ALL, Times
 from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, leads_here
 from nedbus.settings import is_loopback
@@ -130,7 +130,8 @@ class LiveFleet:
 
     def _update(self, snapshot: Snapshot) -> None:
         account = self._exporter.account
-        self.chronicle.start = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
+        ahead = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
+        self.chronicle.start, self.chronicle.times = ahead, Times(is_live=True, ahead=ahead)
         self.fleet.reject(snapshot.rejected)
         vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}

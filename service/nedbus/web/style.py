@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,7 @@ from bokeh.themes import Theme
 
 from nedbus.client import to_age
 
+from .chronicle import Chronicle
 from .fleet import GRADES, MAX_STREAMS
 from .stream import is_position
 
@@ -71,9 +72,9 @@ class Style:
         variables = " ".join(f"--{name}: {colour};" for name, colour in self.colours.items())
         return f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"
 
-    def open_panels(self, moment: Callable[[float], str]) -> Any:
-        """Return the macros of `panels.html`; `moment` formats a time of the account."""
-        return _panels().make_module({"style": self, "moment": moment})
+    def open_panels(self, chronicle: Chronicle) -> Any:
+        """Return the macros of `panels.html`, with the times of a chronicle."""
+        return _panels().make_module({"style": self, "chronicle": chronicle, "moment": chronicle.moment})
 
 
 @cache

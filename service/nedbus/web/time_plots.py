@@ -56,6 +56,7 @@ class Timeline:
             title=Title(text=_LEGEND, text_color=style.quiet, text_font_size="11px"),
         )  # fmt: skip
         self.figure.yaxis.ticker = self._ticker
+        self.figure.xaxis.ticker = DatetimeTicker(desired_num_ticks=4)
         self.figure.ygrid.grid_line_color = None
         self.figure.hbar(
             y="row", left="begin", right="end", source=self._spans, height=0.28, color="colour", alpha=0.75
@@ -94,7 +95,7 @@ class Timeline:
         self.shown = [event for event in events if event.vehicle in rows]
         marks = [
             {"time": event.time * 1e3, "row": rows[event.vehicle], "marker": MARKERS[event.severity],
-             "colour": colours[event.severity], "words": event.text[:100], "vehicle": event.vehicle}
+             "colour": colours[event.severity], "words": event.words[:100], "vehicle": event.vehicle}
             for event in self.shown
         ]  # fmt: skip
         replace(self.marks, marks)

@@ -57,17 +57,18 @@ class Viewer:
         self._event: Event | None = None  # selected event of the selected vehicle
         self._is_open = False  # the table of streams is open
         self._listed: list[str] = []
+        self._faults: list[Event] = []
         self._fleet, self._chronicle, self._player = fleet, chronicle, player
         self._whole = player.recording.whole if player is not None else fleet
         self._style, self._name, self._document = LIGHT if query.get("theme") == "light" else DARK, title, document
         self._ticks = self._sent = 0
-        self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0})
+        self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0, "clock": ""})
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
         self._undrawn = self._plots.draw()
         self._map = Map(self._style, background)
         self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
-        self._panels = self._style.open_panels(chronicle.moment)
+        self._panels = self._style.open_panels(chronicle)
         sheets: list[Any] = [read_asset("text.css")]
         names = "head", "list", "why", "nums", "tool", "more", "marks"
         self._text = {name: Div(stylesheets=sheets, sizing_mode="stretch_width", css_classes=[name]) for name in names}
@@ -152,20 +153,29 @@ class Viewer:
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
         self._document.title = f"({bad} bad) {self._name}" if bad else self._name
-        self._clock.args = {"start": self._chronicle.start or 0.0}
+        self._clock.args = {"start": self._chronicle.start, "clock": self._chronicle.unit}
         clock = self._chronicle.clock(picture.time) if picture.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
         rows = [each for each in picture.rows if wanted in each.vehicle.lower() or wanted in each.state.text.lower()]
         self._listed = [each.vehicle for each in rows]
-        story, then = None, chosen
+        story, verdict, then, end = None, None, chosen, player.recording.length if player else picture.time
         if chosen is not None:
             at = self.pinned if self._event is None else self._event
             story = self._chronicle.story(chosen.vehicle, now, at, chosen.state.conditions)
+            if story is not None:
+                is_now = player is None and self.pinned is None
+                verdict = self._chronicle.verdict(chosen.vehicle, end, None if is_now else story.since)
             if self.pinned is not None:
                 then = replace(chosen, state=self._chronicle.state(chosen.vehicle, now))
         self._text["head"].text = panels.head(self._name, picture, clock)
-        self._text["list"].text = panels.vehicles(rows, self.chosen)
-        self._text["why"].text = panels.why(then, story, now, self.pinned is not None)
+        listed = panels.vehicles(rows, self.chosen)
+        if player is not None:
+            faults = self._chronicle.faults
+            whole = self._chronicle.verdict(self.chosen or "", end)
+            self._faults = [story.spans[0].begin for _, story in faults]
+            listed += panels.faults(faults, whole, end, len(picture.rows) > 1)
+        self._text["list"].text = listed
+        self._text["why"].text = panels.why(then, story, verdict, end, self.pinned)
         self._text["nums"].text = panels.numbers(chosen)
         self._text["more"].text = panels.streams(chosen, picture.reports, self._is_open)
         long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
@@ -220,8 +230,9 @@ class Viewer:
         match name:
             case "vehicle" if self._fleet.picture.row(value) is not None:
                 self._choose(value)
-            case "event" if value.isdecimal() and int(value) < len(self._timeline.shown):
-                self._show(self._timeline.shown[int(value)])
+            case "event" | "fault" if value.isdecimal():
+                for event in (self._timeline.shown if name == "event" else self._faults)[int(value) :][:1]:
+                    self._show(event)
             case "focus" if option in FOCUSES:
                 self._map.focus = option
             case "trail":
@@ -238,10 +249,8 @@ class Viewer:
                 self._choose_next(1 if name == "down" else -1)
             case "next" | "previous":
                 self._show_next(is_later=name == "next")
-            case "play" if player is not None:
-                player.toggle()
-            case "left" | "right" | "LEFT" | "RIGHT" if player is not None:
-                player.jump(player.time + _STEPS[name])
+            case "play" | "left" | "right" | "LEFT" | "RIGHT" if player is not None:
+                player.toggle() if name == "play" else player.jump(player.time + _STEPS[name])
         self._show_now()
 
     def _choose_next(self, step: int) -> None:

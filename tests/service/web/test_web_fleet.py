@@ -12,7 +12,7 @@ from nedbus.web.chronicle import Chronicle
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream
 from nedbus_msgs import Address, MapProjection
-from tests.flights.messages import VLP
+from tests.flights.messages import VLP, message
 from tests.service.web.page import NOON, QUAD, WING, Sky, addresses_of, sky
 
 __all__ = ["sky"]  # a fixture
@@ -338,11 +338,20 @@ def test_distance_needs_one_frame(sky: Sky) -> None:
     assert math.isnan(column(sky.stream(), "error")[-1])
 
 
-def test_clock_is_utc_or_since_the_start() -> None:
-    """Times are UTC live, and of a recording that tells it; else minutes and seconds since its start."""
+def test_each_time_names_its_clock() -> None:
+    """Times are UTC live, and of a recording that has it; else since boot if only one vehicle booted, or the start."""
     recorded = Chronicle(Account(), times=Times())
-    assert recorded.moment(75.25) == "1:15.2"
-    assert recorded.moment(119.99) == "2:00.0"
-    recorded.start = NOON
-    assert recorded.moment(600.0) == "22:23:20"
-    assert Chronicle(Account()).moment(NOON) == "22:13:20"
+    assert recorded.clock(75.25) == "75.2 s since the start"
+    recorded.set_start("1", 70.0, 10.0)
+    assert recorded.clock(75.25) == "135.2 s since boot, 75.2 s since the start"
+    recorded.times = Times(offsets={"1": NOON})
+    recorded.set_start("1", 70.0, 10.0)
+    assert recorded.clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start"
+    live = Chronicle(Account())
+    assert live.clock(NOON) == "22:13:20.0 UTC"
+    several = Account()
+    for name in ("1", "2"):
+        several.add(Address(name, VLP), message(1_000_000), 0.0)
+    recorded = Chronicle(several, times=Times())
+    recorded.set_start("1", 70.0, 10.0)
+    assert recorded.clock(75.25) == "75.2 s since the start"

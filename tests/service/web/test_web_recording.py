@@ -148,7 +148,7 @@ def open_page(recording: Recording, asked: str = "") -> Page:
 def test_event_is_jumped_to(recording: Recording) -> None:
     """A mark on the slider, an event in the timeline, and the keys n and p set the time to when it happened.
 
-    The state, the sentence and the marker are of that moment, and what came later is not told yet.
+    The state, the verdict and the marker are of that moment.
     """
     page = open_page(recording)
     assert page.grades == {"wing": "ok"}
@@ -161,8 +161,7 @@ def test_event_is_jumped_to(recording: Recording) -> None:
     page.say("event", marks[0][0])
     assert page.player.time == pytest.approx(90, abs=0.01)
     assert (page.grades, page.document.title) == ({"wing": "bad"}, "(1 bad) flight.mcap")
-    assert "<b>xy not valid</b> since" in page.part("why")
-    assert "over" not in page.part("why")
+    assert '<div class="verdict">xy not valid from 91.000 to 121.000 s since boot (30.0 s)' in page.part("why")
     assert page.marks["wing"]["north"] == pytest.approx(89.9)
     assert page.moments == pytest.approx((30, 90), abs=0.01)
     page.say("next")
@@ -181,6 +180,26 @@ def test_event_is_jumped_to(recording: Recording) -> None:
     page.say("trail")
     assert page.moments == pytest.approx((0, 179.9), abs=0.01)
     assert page.plotted["time"][-1] == pytest.approx(179_500, abs=500), "the whole flight, also what is still to come"
+
+
+@pytest.mark.usefixtures("clock")
+def test_recording_begins_with_its_faults(recording: Recording) -> None:
+    """The verdict on the recording is below its vehicles, with a list of faults, each a link to its moment.
+
+    Times are by the vehicle's clock, which the header and the axes name.
+    """
+    page = open_page(recording)
+    assert '<div class="verdict">xy not valid from 91.000 to 121.000 s since boot' in page.part("list")
+    faults = re.findall(r'data-do="fault" data-with="(\d)">.*?<b>(.*?)</b> (.*?)</div>', page.part("list"))
+    assert faults == [("0", "xy not valid", "from 91.000 to 121.000 s since boot (30.0 s)")]
+    assert "1.0 s since boot, 0.0 s since the start" in page.part("head")
+    assert page.viewer._clock.args == {"start": 1.0, "clock": "s since boot"}
+    assert page.grades == {"wing": "ok"}
+    page.say("fault", "0")
+    assert page.grades == {"wing": "bad"}
+    for value in ("0", "1", "-1", "x", "9" * 200):
+        page.say("fault", value)
+        assert page.player.time == pytest.approx(90, abs=0.01)
 
 
 @pytest.mark.usefixtures("clock")

@@ -1,7 +1,5 @@
-// Tick labels of a time axis: UTC if the start of the recording is known, else minutes and seconds since it.
+// Tick labels of a time axis: UTC, else seconds; the one in the middle names the clock.
 const seconds = tick / 1000 + start
-if (start || tick > 1e11) {
-  const text = new Date(seconds * 1000).toISOString()
-  return text.slice(11, ticks.length > 1 && ticks[1] - ticks[0] < 1000 ? 21 : 19)
-}
-return `${Math.floor(seconds / 60)}:${String(Math.round((seconds % 60) * 10) / 10).padStart(2, "0")}`
+const isFine = ticks.length > 1 && ticks[1] - ticks[0] < 1000
+const text = clock == "UTC" ? new Date(seconds * 1000).toISOString().slice(11, isFine ? 21 : 19) : seconds.toFixed(isFine ? 1 : 0)
+return tick == ticks[ticks.length >> 1] ? `${text} ${clock}` : text
