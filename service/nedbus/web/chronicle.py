@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from nedbus.events import (
-    UNITS,
     Account,
     Condition,
     Event,
@@ -21,6 +20,7 @@ from nedbus.events import (
     stories_of,
     story_of,
     to_clock,
+    unit_of,
     verdict_of,
 )
 
@@ -40,7 +40,7 @@ class Chronicle:
     def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
         self.account = account
         self.times = times or Times(is_live=True)
-        self.start, self.unit = 0.0, UNITS["host" if self.times.is_live else "start"]
+        self.start, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
         self._before = before
         self._taken = -1
         self._events: list[Event] = []
@@ -69,9 +69,9 @@ class Chronicle:
         """Set the clock of the axis in a recording, from a message `boot` seconds after a vehicle's boot."""
         utc = self.times.utc_of_boot(vehicle, boot)
         if utc is not None:
-            self.start, self.unit = utc - time, UNITS["vehicle"]
+            self.start, self.unit = utc - time, unit_of("vehicle")
         elif len(self.account.vehicles) < 2:  # vehicles boot at different times
-            self.start, self.unit = boot - time, UNITS["boot"]
+            self.start, self.unit = boot - time, unit_of("boot")
 
     def moment(self, seconds: float) -> str:
         """Format a time of the account by the clock of the axis."""
@@ -79,7 +79,7 @@ class Chronicle:
 
     def clock(self, seconds: float) -> str:
         """Format a time of the account with the name of its clock and, in a recording, since the start."""
-        since = "" if self.times.is_live or not self.start else f", {seconds:.1f} {UNITS['start']}"
+        since = "" if self.times.is_live or not self.start else f", {seconds:.1f} {unit_of('start')}"
         return f"{self.moment(seconds)} {self.unit}{since}"
 
     def story(self, vehicle: str, now: float, at: Event | float | None, held: Sequence[Condition]) -> Story | None:
