@@ -10,12 +10,14 @@ import lzma
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import Any, Final, NamedTuple
 
 MAX_PACKED: Final = 2**18  # bytes; PX4's have 17,000
 _MAX_UNPACKED: Final = 2**21  # bytes; PX4's have 170,000
 _MAX_MEMORY: Final = 2**27  # bytes for the dictionary of xz
-_MAX_TEXT: Final = 500  # characters of a template, and of one argument; PX4's longest template has 120
+_MAX_PARTS: Final = 64  # components, groups of events or modes, and modes of a group; PX4 has 30
+_MAX_TEXT: Final = 200  # characters of a template, and of one argument; PX4's longest template has 120
 _TYPES: Final = {
     "int8_t": "<b", "uint8_t": "<B", "int16_t": "<h", "uint16_t": "<H", "int32_t": "<i", "uint32_t": "<I",
     "int64_t": "<q", "uint64_t": "<Q", "float": "<f",
@@ -53,6 +55,9 @@ class EventMetadata:
             if not xz.eof:
                 raise ValueError(f"incomplete, or more than {_MAX_UNPACKED} bytes")
             self._components: Mapping[str, Any] = json.loads(unpacked)["components"]
+            parts = [self._components, *(each["event_groups"] for each in self._components.values())]
+            if max(map(len, parts)) > _MAX_PARTS:
+                raise ValueError(f"more than {_MAX_PARTS} components, or groups of events")
         except _DAMAGED as exc:
             raise ValueError(f"the metadata of events cannot be read: {str(exc) or type(exc).__name__}") from exc
 
@@ -68,8 +73,8 @@ class EventMetadata:
             modes = masks[0] if masks and group in _CHECKS else None
             listed = 0
             if event.get("type") == "append_health_and_arming_messages":
-                of_modes = component["navigation_mode_groups"]["groups"].items()
-                listed = next((1 << int(bit) % 32 for bit, custom in of_modes if values[0] in custom), 0)
+                of_modes = islice(component["navigation_mode_groups"]["groups"].items(), _MAX_PARTS)
+                listed = next((1 << int(bit) % 32 for bit, custom in of_modes if values[0] in custom[:_MAX_PARTS]), 0)
             return Event(group, _fill(event["message"][:_MAX_TEXT], shown), modes, listed)
         except (StopIteration, *_DAMAGED):
             return None

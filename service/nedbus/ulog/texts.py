@@ -28,13 +28,15 @@ _ALL_MODES: Final = 2**32 - 1
 _WINDOW: Final = 50_000  # us between two forms of a statement; 4 ms were seen
 _MAX_A_SECOND: Final = 100  # statements; PX4 makes 20 when it boots
 _MAX_BYTES: Final = 127
+_MAX_CHARACTERS: Final = 1000  # that are looked at, colours included
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
 
 
 def to_statement(text: str) -> str:
     """Return a text as one line of printable characters, in at most 127 bytes of UTF-8."""
-    plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in _COLOUR.sub("", text)).strip()
+    short = _COLOUR.sub("", text[:_MAX_CHARACTERS])
+    plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
     data = plain.encode()
     return plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
 
@@ -92,8 +94,8 @@ class Texts:
         if isinstance(record, LoggedText):
             return None if self._is_said(record) else record
         if isinstance(record, MultiInformation) and record.key == "metadata_events" and isinstance(record.value, bytes):
-            self._packed = (self._packed if record.continued else b"") + record.value
-            self._packed, self._metadata, self.problem = self._packed[:MAX_PACKED], None, ""
+            if self._metadata is None and not self.problem:  # the first metadata hold
+                self._packed = ((self._packed if record.continued else b"") + record.value)[:MAX_PACKED]
         elif isinstance(record, Data) and record.subscription.name == "event":
             return self._read_event(record.subscription.decode(record.payload))
         elif isinstance(record, Data) and record.subscription.name == "vehicle_status":

@@ -193,8 +193,9 @@ def changed(change: Callable[[dict[str, Any]], object]) -> bytes:
         changed(lambda px4: px4["enums"]["by_t"].update(entries=7)),
         changed(lambda px4: px4["enums"]["by_t"].update(type="by_t")),
         changed(lambda px4: px4.update(event_groups=[])),
+        changed(lambda px4: px4["event_groups"].update({f"group{number}": {} for number in range(99)})),
     ],
-    ids=map(str, range(14)),
+    ids=map(str, range(15)),
 )  # fmt: skip
 def test_metadata_that_are_damaged_or_hostile_only_cost_the_events(metadata: bytes) -> None:
     """Too large or deep, incomplete, of other types, with arguments beyond the 25 bytes: the texts remain."""
@@ -202,6 +203,17 @@ def test_metadata_that_are_damaged_or_hostile_only_cost_the_events(metadata: byt
     log.event(1, 1, b"\2")
     log.text(2, b"still here")
     assert log.said() == [(2, 6, "still here")]
+
+
+def test_second_metadata_are_ignored() -> None:
+    """Thousands of them in a log would cost a decompression each."""
+    log = Log()
+    log.event(1, 1, b"\2")
+    for piece in (b"", b"damaged", lzma.compress(b"{}")):
+        key = f"uint8_t[{len(piece)}] metadata_events".encode()
+        log.put("M", bytes([0, len(key)]) + key + piece)
+        log.event(2, 1, b"\2")
+    assert [text for *_, text in log.said()] == ["Armed by RC switch"] * 4
 
 
 def test_texts_are_one_printable_line_and_bounded_in_number() -> None:
