@@ -207,6 +207,12 @@ class Vehicle:
         detector = None if self.main is None else self._detectors[self.main]
         return detector.unknown if isinstance(detector, PositionDetector) else ()
 
+    @property
+    def held_from_start(self) -> str:
+        """The texts of faults that held in the first message and have not ended, "" if there are none."""
+        held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
+        return ", ".join(dict.fromkeys(held))
+
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)

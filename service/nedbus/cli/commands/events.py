@@ -27,12 +27,11 @@ from nedbus.events import (
     Event,
     Story,
     Times,
-    Vehicle,
     Verdict,
     by_vehicle,
     report_of,
     verdict_of,
-)  # fmt: skip
+)
 from nedbus.monitoring import Observer
 from nedbus.sources import FileAccount, read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
@@ -75,6 +74,12 @@ def events(
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
     form = _to_json if json_output else _to_csv if csv_output else to_line
 
+    def begin(clocks: set[str]) -> None:
+        if csv_output:
+            write(csv_line(_HEAD))
+        elif clocks and not json_output:
+            write_stderr(f"times: {'; '.join(CLOCKS[each] for each in sorted(clocks))}")
+
     def select(found: Iterable[Event]) -> list[Event]:
         chosen = [event for event in found if event.severity in severities and origin in (ANY, event.origin)]
         return [event for event in chosen if vehicle in (ANY, event.vehicle) or event.vehicle == ANY]
@@ -84,10 +89,7 @@ def events(
             write(form(event, times))
 
     if not files:
-        if csv_output:
-            write(csv_line(_HEAD))
-        elif not json_output:
-            write_stderr(f"times: {CLOCKS['host']}")
+        begin({"host"})
         with open_bus() as bus:
             times = Times(is_live=True)
             if within is not None:
@@ -99,12 +101,9 @@ def events(
     read, found = _read(files)
     _choose_vehicles(_name(files), read.account.vehicles, vehicle)
     found = select(found)
-    if csv_output:
-        write(csv_line(_HEAD))
-    elif not json_output:
-        _write_clock(found, read.times)
+    begin({read.times.clock(event) for event in found})
     show(found, read.times)
-    initial = {name: _held_from_start(each) for name, each in sorted(read.account.vehicles.items())}
+    initial = {name: each.held_from_start for name, each in sorted(read.account.vehicles.items())}
     texts = [f"{name}: {text}" for name, text in initial.items() if text and vehicle in (ANY, name)]
     if texts:
         write_stderr(f"throughout the file: {'; '.join(texts)}")
@@ -176,15 +175,12 @@ def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float
 def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
     """Yield the lines that explain a fault."""
     yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
-    if story.before:
-        yield "  before it"
-        yield from (fold(f"    {times.text(each)}  ", _before(each, story.since)) for each in story.before)
-    if story.meanwhile:
-        yield "  meanwhile"
-        yield from (fold(f"    {times.text(each)}  ", _shown(each)) for each in story.meanwhile)
-    if story.end is not None:
-        yield f"  ended at {times.text(story.end)}" + (" with" if story.after else "")
-        yield from (fold(f"    {times.text(each)}  ", _shown(each)) for each in story.after)
+    ended = "" if story.end is None else f"ended at {times.text(story.end)}{' with' * bool(story.after)}"
+    before = [(each, _before(each, story.since)) for each in story.before]
+    meanwhile, after = ([(each, _shown(each)) for each in found] for found in (story.meanwhile, story.after))
+    for title, shown in (("before it", before), ("meanwhile", meanwhile), (ended, after)):
+        yield from [f"  {title}"] * bool(shown or title == ended != "")
+        yield from (fold(f"    {times.text(each)}  ", text) for each, text in shown)
     if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before"
     if story.lacking:
@@ -229,7 +225,7 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
-                if initial := _held_from_start(each):
+                if initial := each.held_from_start:
                     write_stderr(f"{name}: {initial}, from the start")
 
     def handle(sample: Sample[Any]) -> bool:
@@ -257,17 +253,6 @@ def _read(files: Sequence[Path]) -> tuple[FileAccount, list[Event]]:
 
 def _merge(reports: Iterable[AccountReport]) -> list[Event]:
     return sorted((event for report in reports for event in report.events), key=lambda event: event.time)
-
-
-def _held_from_start(vehicle: Vehicle) -> str:
-    """Return the faults that were present in the first message and never ended."""
-    held = [each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"]
-    return ", ".join(dict.fromkeys(held))
-
-
-def _write_clock(found: Sequence[Event], times: Times) -> None:
-    if clocks := {times.clock(event) for event in found}:
-        write_stderr(f"times: {'; '.join(CLOCKS[each] for each in sorted(clocks))}")
 
 
 def _to_fields(event: Event, times: Times) -> dict[str, object]:
