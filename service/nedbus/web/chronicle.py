@@ -11,12 +11,10 @@ from nedbus.events import (
     Condition,
     Event,
     Span,
-    State,
     Story,
     Times,
     Verdict,
     spans_of,
-    state_at,
     stories_of,
     story_of,
     to_clock,
@@ -61,17 +59,11 @@ class Chronicle:
         self._read()
         return self._spans
 
-    def state(self, vehicle: str, time: float) -> State:
-        """Return the state of a vehicle at a time."""
-        return state_at(self.spans.get(vehicle, ()), time)
-
     def set_start(self, vehicle: str, boot: float, time: float) -> None:
         """Set the clock of the axis in a recording, from a message `boot` seconds after a vehicle's boot."""
         utc = self.times.utc_of_boot(vehicle, boot)
-        if utc is not None:
-            self.start, self.unit = utc - time, unit_of("vehicle")
-        elif len(self.account.vehicles) < 2:  # vehicles boot at different times
-            self.start, self.unit = boot - time, unit_of("boot")
+        if utc is not None or len(self.account.vehicles) < 2:  # vehicles boot at different times
+            self.start, self.unit = (boot if utc is None else utc) - time, unit_of("boot" if utc is None else "vehicle")
 
     def moment(self, seconds: float) -> str:
         """Format a time of the account by the clock of the axis."""

@@ -35,9 +35,9 @@ MAX_STREAMS: Final = 1000
 _SILENT: Final = 60.0  # s without a message after which a stream makes room for another
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = 2
-_DIGITS: Final = re.compile(r"(\d+)")
+_OK: Final = State("info", "ok", None, ())
+_DIGITS: Final = re.compile(r"\d+")
 _DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its details
-_MAX_BRIEF: Final = 32  # characters of the state in a row
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +62,7 @@ class Line:
 
 
 class Fact(NamedTuple):
-    """A value from another message than the position, "" if unknown.
-
-    `age`: age of the value [s] if its stream is silent, None while messages arrive.
-    """
+    """A value of another message than the position, "" if unknown; `age` of one that arrives no more [s], else None."""
 
     text: str = ""
     age: float | None = None
@@ -94,9 +91,8 @@ class Row:
 
     @property
     def brief(self) -> str:
-        """The state without details, up to 32 characters."""
-        text = _DETAIL.split(self.state.text, maxsplit=1)[0]
-        return text if len(text) <= _MAX_BRIEF else f"{text[: _MAX_BRIEF - 1]}…"
+        """The state without details."""
+        return _DETAIL.split(self.state.text, maxsplit=1)[0]
 
     @property
     def where(self) -> str:
@@ -135,16 +131,6 @@ class Picture:
     link: str = ""
     own: str = ""
 
-    @property
-    def rate(self) -> float:
-        """Messages per second of all streams."""
-        return sum(line.health.rate or 0.0 for row in self.rows for line in row.lines)
-
-    @property
-    def lost(self) -> int:
-        """Lost messages of all streams."""
-        return sum(line.health.lost for row in self.rows for line in row.lines)
-
     def row(self, vehicle: str | None) -> Row | None:
         """Return the row of a vehicle, None if there is none."""
         return next((row for row in self.rows if row.vehicle == vehicle), None)
@@ -164,7 +150,6 @@ class Fleet:
         self._long = long
         self._numbers: dict[str, int] = {}  # most recently shown last
         self._next_number = count()
-        self._truths: dict[str, PageStream] = {}
         self._left_out: set[Address] = set()
         self._gone: list[Address] = []  # removed by the thread that adds samples
         self._rejected: Counter[Address] = Counter()
@@ -173,7 +158,7 @@ class Fleet:
     def add(self, sample: Sample[Any], time: float) -> None:
         """Add a sample received at `time`, in seconds since the Unix epoch or since the start of a recording."""
         while self._gone:
-            self._remove(self._gone.pop())
+            self.streams.pop(self._gone.pop(), None)
         address = sample.address
         stream = self.streams.get(address)
         if stream is None:
@@ -183,9 +168,8 @@ class Fleet:
                 return
             stream = self.streams[address] = PageStream(self.origin, self._long)
             self._left_out.discard(address)
-            if address.topic == TRUTH:
-                self._truths[address.vehicle] = stream
-        stream.add(sample, time, None if address.topic == TRUTH else self._truths.get(address.vehicle))
+        is_estimate = is_position(address) and address.topic != TRUTH
+        stream.add(sample, time, self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None)
 
     def reject(self, reports: Sequence[RejectionReport]) -> None:
         """Add reports of rejected messages."""
@@ -197,7 +181,7 @@ class Fleet:
 
     def clear(self) -> None:
         """Remove all streams and reports, but keep the common origin; called before a seek."""
-        for part in (self.streams, self._truths, self._left_out, self._rejected, self._reports):
+        for part in (self.streams, self._left_out, self._rejected, self._reports):
             part.clear()
 
     def update(
@@ -212,9 +196,7 @@ class Fleet:
         """
         if alive is not None and not link:
             known, silent = {*alive, *healths}, time - _SILENT
-            self._gone = [
-                each for each, stream in [*self.streams.items()] if each not in known and stream.time < silent
-            ]
+            self._gone = [key for key, stream in [*self.streams.items()] if key not in known and stream.time < silent]
             self._left_out.intersection_update(alive)
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
@@ -224,32 +206,27 @@ class Fleet:
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
-        rows = [self._row(name, each, states.get(name), logs.get(name)) for name, each in lines.items()]
-        rows.sort(key=lambda row: (GRADES.index(row.grade), natural(row.vehicle)))
+        rows = [self._row(name, each, states.get(name, _OK), logs.get(name)) for name, each in lines.items()]
+        order = {row.vehicle: _DIGITS.sub(lambda found: found[0].zfill(20), row.vehicle) for row in rows}  # 2 before 10
+        rows.sort(key=lambda row: (GRADES.index(row.grade), order[row.vehicle]))
         rejected = self._rejected.total()
         self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture
 
-    def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, log: LogStreamStatus | None) -> Row:
+    def _row(self, vehicle: str, lines: Sequence[Line], state: State, log: LogStreamStatus | None) -> Row:
         main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
-        state = state or State("info", "ok", None, ())
         number = self._numbers.pop(vehicle) if vehicle in self._numbers else next(self._next_number)
         self._numbers[vehicle] = number
         if len(self._numbers) > MAX_STREAMS:
             del self._numbers[next(iter(self._numbers))]
         return Row(vehicle, state, main, tuple(lines), _facts(lines), number, log)
 
-    def _remove(self, address: Address) -> None:
-        self.streams.pop(address, None)
-        if address.topic == TRUTH:
-            self._truths.pop(address.vehicle, None)
-
     def _make_room(self, time: float) -> bool:
         """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False
-        self._remove(address)
+        del self.streams[address]
         return True
 
 
@@ -268,8 +245,3 @@ def _facts(lines: Sequence[Line]) -> dict[str, Fact]:
         "battery": fact("battery_status", lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else ""),
         "gps": fact(gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"),
     }
-
-
-def natural(name: str) -> list[tuple[bool, int, str]]:
-    """Return a key that sorts uav-2 before uav-10."""
-    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in _DIGITS.split(name)]

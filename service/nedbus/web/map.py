@@ -72,7 +72,7 @@ class Map:
             frame = [[middle - half, middle + half] for middle in chosen[0][1][:2]]
         replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
         labels = self._labels(placed, row, frame)
-        marks = [self._mark(each, place, *labels.get(each.vehicle, ("", False))) for each, place in placed]
+        marks = [self._mark(each, place, labels.get(each.vehicle)) for each, place in placed]
         replace(self.marks, marks)
         self.shown = [each.vehicle for each, _ in placed]
         ephs = [each.main.stream.last.message.eph for each, _ in chosen if each.main.stream.last is not None]
@@ -115,9 +115,7 @@ class Map:
             sides.append([math.floor((low - grow) / step) * step, math.ceil((high + grow) / step) * step])
         return sides
 
-    def _labels(
-        self, placed: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]
-    ) -> dict[str, tuple[str, bool]]:
+    def _labels(self, shown: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]) -> dict[str, bool]:
         """Return the names that have room, the most severe vehicles first, and whether each is left of its marker."""
         (west, east), (south, north) = frame
         width, height = self.size
@@ -125,10 +123,10 @@ class Map:
         start, end = (getattr(self.figure.x_range, side) for side in ("start", "end"))
         if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
             scale, right = (end - start) / width, end
-        places = [(each, at.east / scale, at.north / scale) for each, at in placed]
-        severe = {each.vehicle for each, _ in placed if each.grade == "bad" or each is row}  # may cover other markers
+        places = [(each, at.east / scale, at.north / scale) for each, at in shown]
+        severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is row}  # may cover other markers
         taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
-        labels: dict[str, tuple[str, bool]] = {}
+        labels: dict[str, bool] = {}
         for each, x, y in sorted(places, key=lambda known: known[0] is not row):
             name, low, size = each.vehicle, y + _MARK, len(each.vehicle) * _LETTER + 2 * _MARK
             is_left = x + size > right / scale  # it would extend beyond the map
@@ -139,10 +137,10 @@ class Map:
                 if owner != name and (owner in ("", *severe) or name not in severe)
             ):
                 taken.append(("", begin, end, low, low + _HEIGHT))
-                labels[name] = name, is_left
+                labels[name] = is_left
         return labels
 
-    def _mark(self, row: Row, place: Place, label: str, is_left: bool) -> dict[str, Any]:
+    def _mark(self, row: Row, place: Place, is_left: bool | None) -> dict[str, Any]:
         """Return a vehicle's marker, shaped by grade: filled at its current position, open at its last valid one."""
         last = row.main.stream.last
         heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
@@ -151,8 +149,8 @@ class Map:
             "east": round(place.east, 3), "north": round(place.north, 3), "angle": round(math.pi / 2 - heading, 3),
             "shape": MARKERS[row.grade], "colour": colour, "fill": colour if row.is_here else self._style.ground,
             "edge": colour if row.grade == "ok" else self._style.grades[row.grade],
-            "label": label, "align": "right" if is_left else "left", "offset": -11 if is_left else 11,
-            "name": row.vehicle, "words": row.state.text,
+            "label": "" if is_left is None else row.vehicle, "name": row.vehicle, "words": row.state.text,
+            "align": "right" if is_left else "left", "offset": -11 if is_left else 11,
         }  # fmt: skip
 
     def _draw(self) -> figure:

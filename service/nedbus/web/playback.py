@@ -15,7 +15,7 @@ from bokeh.models.widgets import Select, Slider, Toggle
 
 from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
-from nedbus.events import Account, Times
+from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
 from nedbus.sources import KEPT_OF_FILE, Flights, SourceMessage, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
@@ -58,10 +58,6 @@ class Recording:
     def length(self) -> float:
         """Duration read so far [s]."""
         return self.dues[-1] if self.dues else 0.0
-
-    def has(self, seconds: float) -> bool:
-        """Return whether the file has been read up to this time, or completely."""
-        return self.is_read or seconds <= self.length
 
     def before(self, index: int) -> list[int]:
         """Return the index of each stream's last entry before `index`, in order."""
@@ -159,8 +155,7 @@ class Player:
         for index in range(self._next, end):
             self._show(index)
         self._next = max(self._next, end)
-        chronicle = self.recording.chronicle
-        states = {name: chronicle.state(name, self.time) for name in chronicle.spans}
+        states = {name: state_at(spans, self.time) for name, spans in self.recording.chronicle.spans.items()}
         self.fleet.update(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
 
     def _show(self, index: int) -> None:

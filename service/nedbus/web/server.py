@@ -66,10 +66,6 @@ class Where:
     origins: tuple[str, ...] = ()
     background: Path | None = None
 
-    def open_background(self) -> Background | None:
-        """Load the background of the map, None without a file."""
-        return None if self.background is None else Background(self.background)
-
 
 def serve_live(
     bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
@@ -79,7 +75,7 @@ def serve_live(
     Raises ConfigError for an invalid background, ListenError if it cannot listen.
     """
     live = LiveFleet(bus, selection, version=version)
-    background = where.open_background()
+    background = None if where.background is None else Background(where.background)
     server = WebServer(where, lambda page: Viewer(page, live.fleet, live.chronicle, background=background), live.pages)
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
         reading = pool.submit(live.run, stop)  # sets `stop` when it fails
@@ -95,7 +91,7 @@ def serve_recording(
 
     Raises ConfigError and SourceError if the file cannot be read, and the errors of `serve_live`.
     """
-    recording, background = Recording(*paths), where.open_background()
+    recording, background = Recording(*paths), None if where.background is None else Background(where.background)
 
     def open_page(document: Document) -> None:
         player = Player(recording)

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 from bokeh.models import BasicTicker, ColumnDataSource, DatetimeTicker, FixedTicker, HoverTool, Range1d, TapTool
-from bokeh.models.annotations import Title
 from bokeh.plotting import figure
 
 from nedbus.events import ALL, KINDS, Event, Span
@@ -23,9 +22,7 @@ _PLOTS: Final = {
     "horizontal speed [m/s]": ("speed",),
     "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
 }
-_LEGEND: Final = (
-    f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} phase of flight  ▬ while it lasts  ┊ now"
-)
+_LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} phase of flight  ▬ lasting  ┊ now"
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _OF_TRUTH: Final = {"height", "speed"}
 
@@ -51,16 +48,12 @@ class Timeline:
         self._style = style
         self._ticker = FixedTicker()
         self.range = Range1d()
-        self.figure = _time_figure(
-            self.range, clock, y_range=Range1d(), height=100, css_classes=["time"],
-            title=Title(text=_LEGEND, text_color=style.quiet, text_font_size="11px"),
-        )  # fmt: skip
+        options: dict[str, Any] = {"y_range": Range1d(), "height": 100, "css_classes": ["time"], "title": _LEGEND}
+        self.figure = _time_figure(self.range, clock, **options)
         self.figure.yaxis.ticker = self._ticker
         self.figure.xaxis.ticker = DatetimeTicker(desired_num_ticks=4)
         self.figure.ygrid.grid_line_color = None
-        self.figure.hbar(
-            y="row", left="begin", right="end", source=self._spans, height=0.28, color="colour", alpha=0.75
-        )
+        self.figure.hbar("row", 0.28, "end", "begin", source=self._spans, color="colour", alpha=0.75)
         marks = self.figure.scatter(
             "time", "row", source=self.marks, marker="marker", size=11, fill_color="colour", line_color=style.ground,
             nonselection_alpha=1.0,
@@ -82,12 +75,8 @@ class Timeline:
             if span.severity == severity and span.until != span.since and (span.until is None or span.until > begin)
         ]
         affected = {event.vehicle for event in events if event.severity != "info"} | {name for name, _ in held}
-        first = [name for name in vehicles[:1] if name]  # the selected one
-        names = [
-            *([ALL] if ALL in affected else []),
-            *first,
-            *sorted(vehicles[1:], key=lambda name: name not in affected),
-        ]
+        others = sorted(vehicles[1:], key=lambda name: name not in affected)
+        names = [*([ALL] if ALL in affected else []), *vehicles[:1], *others]
         hidden = len(names) - _MAX_ROWS + 1 if len(names) > _MAX_ROWS else 0
         names = names[: len(names) - hidden]
         rows = {name: len(names) - index for index, name in enumerate(names)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlencode
@@ -15,7 +15,7 @@ from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, GlobalInlineStyleSheet, LayoutDOM
 from bokeh.models.widgets import Div, TextInput
 
-from nedbus.events import ALL, Event
+from nedbus.events import ALL, Event, state_at
 from nedbus_msgs import Address
 
 from .background import Background
@@ -52,7 +52,8 @@ class Viewer:
         query = _arguments(document)
         self.chosen: str | None = query.get("vehicle")
         self.pinned: float | None = None  # selected moment of live vehicles
-        self._requested_time = _seconds_in(query.get("time", ""))
+        asked = query.get("time", "")
+        self._requested_time = float(asked) if _SECONDS.fullmatch(asked) else None
         self._is_choice = self.chosen is not None
         self._event: Event | None = None  # selected event of the selected vehicle
         self._is_open = False  # the table of streams is open
@@ -70,11 +71,10 @@ class Viewer:
         self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
         self._panels = self._style.open_panels(chronicle)
         sheets: list[Any] = [read_asset("text.css")]
+        wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
         names = "head", "list", "why", "nums", "tool", "more", "marks"
-        self._text = {name: Div(stylesheets=sheets, sizing_mode="stretch_width", css_classes=[name]) for name in names}
-        self._search = TextInput(
-            placeholder="search vehicle  /", sizing_mode="stretch_width", css_classes=["find"], stylesheets=sheets
-        )
+        self._text = {name: Div(css_classes=[name], **wide) for name in names}
+        self._search = TextInput(placeholder="search vehicle  /", css_classes=["find"], **wide)
         self._grid = column(sizing_mode="stretch_both", css_classes=["plots"], visible=False)
         # Hidden inputs as channels to the browser: number of the update, last update drawn, click or key, URL.
         self._update_number, self._drawn, self._message, self._url = (TextInput(visible=False) for _ in range(4))
@@ -143,7 +143,7 @@ class Viewer:
     def _go_to_requested(self) -> None:
         """Go to the moment in the URL once the recording has been read that far."""
         time, player = self._requested_time, self._player
-        if time is not None and (player is None or player.recording.has(time)):
+        if time is not None and (player is None or player.recording.is_read or time <= player.recording.length):
             if player is not None:
                 player.toggle(pause=True)
             self._go_to(time)
@@ -160,18 +160,17 @@ class Viewer:
         self._listed = [each.vehicle for each in rows]
         story, verdict, then, end = None, None, chosen, player.recording.length if player else picture.time
         if chosen is not None:
-            at = self.pinned if self._event is None else self._event
+            at = self._event if self._event is not None and abs(now - self._event.time) < 1.0 else self.pinned
             story = self._chronicle.story(chosen.vehicle, now, at, chosen.state.conditions)
             if story is not None:
                 is_now = player is None and self.pinned is None
                 verdict = self._chronicle.verdict(chosen.vehicle, end, None if is_now else story.since)
             if self.pinned is not None:
-                then = replace(chosen, state=self._chronicle.state(chosen.vehicle, now))
+                then = replace(chosen, state=state_at(self._chronicle.spans.get(chosen.vehicle, ()), now))
         self._text["head"].text = panels.head(self._name, picture, clock)
         listed = panels.vehicles(rows, self.chosen)
         if player is not None:
-            faults = self._chronicle.faults
-            whole = self._chronicle.verdict(self.chosen or "", end)
+            faults, whole = self._chronicle.faults, self._chronicle.verdict(self.chosen or "", end)
             self._faults = [story.spans[0].begin for _, story in faults]
             listed += panels.faults(faults, whole, end, len(picture.rows) > 1)
         self._text["list"].text = listed
@@ -212,7 +211,7 @@ class Viewer:
             begin = max(begin, min(first, now - _MINUTE) - 1.0)
         events = self._events_of_chosen()
         self._plots.mark(events, self._chronicle.spans.get(vehicle, ()), end)
-        order = [vehicle, *(each.vehicle for each in picture.rows if each.vehicle != vehicle)]
+        order = [*filter(None, [vehicle]), *(each.vehicle for each in picture.rows if each.vehicle != vehicle)]
         self._timeline.update(self._chronicle.events, self._chronicle.spans, order, begin=begin, end=end, now=now)
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:
             move(self._timeline.range, begin, max(end, begin + 1.0))
@@ -265,9 +264,7 @@ class Viewer:
         for event in later[:1] if is_later else earlier[-1:]:
             self._show(event)
 
-    def _on_tap(
-        self, source: ColumnDataSource, shown: Callable[[], Sequence[Any]], show: Callable[[Any], object]
-    ) -> None:
+    def _on_tap(self, source: ColumnDataSource, shown: Callable[[], list[Any]], show: Callable[[Any], object]) -> None:
         """Call `show` for a tapped row, then clear the selection, so that the row can be tapped again."""
 
         def tap(_: str, __: object, rows: list[int]) -> None:
@@ -307,8 +304,3 @@ def _arguments(document: Document) -> Mapping[str, str]:
     request = getattr(document.session_context, "request", None)  # None without a browser
     given = request.arguments if request is not None else {}
     return {name: values[0].decode(errors="replace")[:_MAX_MESSAGE] for name, values in given.items() if values}
-
-
-def _seconds_in(text: str) -> float | None:
-    """Parse a time by the account's clock [s] from a URL; None if it is invalid."""
-    return float(text) if _SECONDS.fullmatch(text) else None

@@ -560,7 +560,7 @@ def test_timeline_counts_the_vehicles_without_a_row(sky: Sky) -> None:
 def test_timeline_has_a_legend(sky: Sky) -> None:
     """Each shape in the timeline is explained in the line above it."""
     figure = cast("Any", Page(sky).viewer._timeline.figure)
-    for words in ("■ bad", "▲ watch", "● phase of flight", "▬ while it lasts", "┊ now"):
+    for words in ("■ bad", "▲ watch", "● phase of flight", "▬ lasting", "┊ now"):
         assert words in figure.title.text
 
 
