@@ -1,10 +1,11 @@
 """Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
 
 To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`). One that needs more than a flag needs
-a detector, too, which yields its findings (`detectors.py` or `position.py`).
+a detector, too, which yields its findings (`detectors.py`, `position.py` or `ekf.py`).
 """
 
 from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
+from .ekf import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity
@@ -12,7 +13,7 @@ from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle,
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import CLOCKS, Times, since_text, to_age, to_clock, unit_of
-from .vehicle import EKF_SELECTOR, Vehicle
+from .vehicle import Vehicle
 from .verdict import Verdict, verdict_of
 
 __all__ = [

@@ -36,7 +36,7 @@ class Finding:
 
 
 class FieldReader:
-    """Fast access to fields of a model, a row, or a dict; fields that a dict lacks have the value `absent`."""
+    """Fast access to fields of a model, a row, or a dict; fields that it lacks have the value `absent`."""
 
     def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
         self.names, self._absent = tuple(names), absent
@@ -45,12 +45,12 @@ class FieldReader:
 
     def __call__(self, message: object) -> tuple[Any, ...]:
         """Return the values in the order of `names`."""
-        if type(message) is not dict:
-            return self._of_message(message)
         try:
-            return self._of_fields(message)
+            return self._of_fields(message) if type(message) is dict else self._of_message(message)
         except KeyError:
-            return tuple(message.get(name, self._absent) for name in self.names)
+            return tuple(cast("Fields", message).get(name, self._absent) for name in self.names)
+        except AttributeError:  # a message without a file has the fields that its publisher gave it
+            return tuple(getattr(message, name, self._absent) for name in self.names)
 
 
 class ChangeDetector:
@@ -58,7 +58,8 @@ class ChangeDetector:
 
     `detect(before, after)` yields findings from the fields of two messages, by name: None for fields that were not
     provided; `before` is empty at the first message. `context`: names of further fields that `detect` gets.
-    `stamp`, `earlier`: the timestamps of the last message and of the one before [us].
+    `last`, `missing`: the last message, and the names of its fields that were not provided.
+    `stamp`, `earlier`: its timestamp and that of the one before [us].
     """
 
     def __init__(
@@ -71,26 +72,30 @@ class ChangeDetector:
         self._read = FieldReader(("timestamp", *compared))
         self._read_all = FieldReader(("timestamp", *compared, *context))
         self._detect = detect
-        self._last: object = None
+        self.last: object = None
         self._state: tuple[Any, ...] = ()
-        self._missing = _NONE
+        self.missing = _NONE
         self.stamp = self.earlier = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings of a message whose `missing` fields were not provided; None if nothing has changed."""
         values = self._read(message)
         self.earlier, self.stamp, state = self.stamp, values[0], values[1:]
-        last, self._last = self._last, message
-        if state == self._state and (missing is self._missing or missing == self._missing):
+        last, self.last = self.last, message
+        if state == self._state and (missing is self.missing or missing == self.missing):
             return None
-        before = {} if last is None else self._by_name(last, self._missing)
-        self._state, self._missing = state, missing
+        before = {} if last is None else self._by_name(last, self.missing)
+        self._state, self.missing = state, missing
         return self._detect(before, self._by_name(message, missing))
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
-        self._last, self._state = None, ()
+        self.last, self._state = None, ()
         self.stamp = self.earlier = 0
+
+    def again(self, before: Fields) -> Iterator[Finding]:
+        """Return the findings of the last message as if the one before had had these fields."""
+        return iter(()) if self.last is None else self._detect(before, self._by_name(self.last, self.missing))
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
         values = zip(self._read_all.names, self._read_all(message), strict=True)
@@ -265,7 +270,6 @@ def _warning_of(battery: Fields) -> int | None:
 # Further detection in a message, beyond flags: the fields that it compares, and those that it needs besides.
 _FURTHER: Final[Mapping[str, tuple[Sequence[str], Sequence[str], Callable[[Fields, Fields], Iterator[Finding]]]]] = {
     "VehicleStatus": (("arming_state", "nav_state"), (), detect_status),
-    "EstimatorStatusFlags": (tuple(rules.FAKE_AIDING), (), detect_aiding),
     "BatteryStatus": (("warning", "connected"), ("remaining",), detect_battery),
     "VehicleLandDetected": (("landed",), (), detect_landing),
 }

@@ -63,7 +63,7 @@ _GPS: Final = "SensorGps"
 _JAMMED: Final = ("jamming", "spoofing")
 _SENSING: Final = (
     "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided", "innovation_rejected",
-    "estimator_fault",
+    "estimator_fault", "ekf_changed",
 )  # fmt: skip
 _INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning")
 
@@ -107,6 +107,7 @@ _ROWS: Final = (
         "estimator_fault", "watch", _FLAGS, ("text",), flags=FAULTS, initial=True, begin="EKF fault: {}",
         end="EKF fault cleared: {}",
     ),
+    Kind("ekf_changed", "watch", causes=("text", "estimator_fault", "innovation_rejected"), on_ground="info"),
     Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites")),
     Kind("few_satellites", "watch", _GPS, _JAMMED),
     Kind("jamming", "watch", _GPS, ("text",)),
@@ -162,6 +163,7 @@ _ROWS: Final = (
     ),
     Kind("takeoff", "info", "VehicleLandDetected", row="armed, landed", phase=True),
     Kind("landed", "info", "VehicleLandDetected", row="armed, landed", phase=True),
+    Kind("other_ekf", "info", flags={**FAULTS, **REJECTED}),
     Kind("dropout", "info"),
 )  # fmt: skip
 

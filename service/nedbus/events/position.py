@@ -65,7 +65,7 @@ class PositionDetector(ChangeDetector):
     @property
     def unknown(self) -> tuple[str, ...]:
         """The flags that the last message did not provide."""
-        last, absent = zip(_COMPARED, self._state, strict=False), self._missing
+        last, absent = zip(_COMPARED, self._state, strict=False), self.missing
         return tuple(name for name, value in last if value is None or name in absent)
 
     def reset(self) -> None:

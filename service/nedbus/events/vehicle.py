@@ -11,17 +11,14 @@ from typing import Final
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
 from .detectors import ChangeDetector, Finding, make_detector
+from .ekf import EKF_SELECTOR, HEALTHY, EstimateDetector, flags_detector, selection_detector
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
 from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, RECENT
 from .times import to_age
 
-EKF_SELECTOR: Final = "estimator_selector_status"
-"""The topic that names the EKF in use."""
-
 _EKF: Final = "estimator_status_flags"
-_MAX_EKFS: Final = 9  # instances; 255 stands for none
 _REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
@@ -65,7 +62,8 @@ class Vehicle:
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
         self._lost, self._rejected = _Burst(), _Burst()
         self._dropouts = _Burst()  # in ms
-        self._primary = 0  # instance of the EKF in use
+        self._ekf = 0  # instance of the EKF in use
+        self._equal: dict[int, bool] = {}  # by EKF, if its estimate is the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
         """Add a message; `lost` is the number of messages lost before it."""
@@ -77,15 +75,13 @@ class Vehicle:
             if len(self._detectors) >= _MAX_STREAMS:
                 return
             detector = self._detectors[address] = self._open(address)
-        if address.topic == EKF_SELECTOR:
-            self._select_ekf(message)
         if detector is None:
             return
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
         self.time, self.boot = time, stamp / 1e6
-        if address == self.main:
+        if type(detector) is PositionDetector:  # of `main`
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
@@ -98,6 +94,8 @@ class Vehicle:
             if each.kind in ("armed", "disarmed"):
                 self.armed = each.kind == "armed"
             self.emit(each, address.topic, time)
+            if each.kind == "ekf_changed":
+                self._use_ekf(int(each.numbers["to"]))
 
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record that the logger recorded nothing from `time` on; the vehicle is not silent meanwhile."""
@@ -204,7 +202,7 @@ class Vehicle:
     @property
     def unknown(self) -> tuple[str, ...]:
         """The flags that the position estimate in use does not provide."""
-        detector = None if self.main is None else self._detectors[self.main]
+        detector = self._position()
         return detector.unknown if isinstance(detector, PositionDetector) else ()
 
     @property
@@ -216,37 +214,54 @@ class Vehicle:
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)
-        used = self._primary if address.topic == _EKF else 0  # only the first sensor and battery, and the EKF in use
-        if (address.instance or 0) != used and address.topic not in _POSITIONS:
+        topic, instance = address.topic, address.instance or 0
+        if topic == EKF_SELECTOR:
+            sought = [each for each, known in self._detectors.items() if isinstance(known, EstimateDetector)]
+            self._detectors |= dict.fromkeys(sought)
+        if topic in (EKF_SELECTOR, _EKF):
+            return flags_detector(instance, lambda: self._ekf) if topic == _EKF else selection_detector()
+        if instance and topic not in _POSITIONS:  # only the first sensor and battery
             return None
-        group = next((each for each in _GROUPS if address.topic in each), ())
+        group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
-                return None
+                if topic != _POSITIONS[-1] or current.topic == topic or EKF_SELECTOR in self.topics:
+                    return None
+                return EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
             if current is not None:
                 self._supersede(current, address)
             self._preferred[group] = address
         if group is _POSITIONS:
             self.main = address
             return PositionDetector()
-        return make_detector(BY_TOPIC[address.topic].name) if address.topic in BY_TOPIC else None
+        return make_detector(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
 
-    def _select_ekf(self, message: object) -> None:
-        """Use the flags of the EKF that an estimator_selector_status names."""
-        name = "primary_instance"
-        primary = message.get(name) if isinstance(message, dict) else getattr(message, name, None)
-        if type(primary) is int and primary in range(_MAX_EKFS) and primary != self._primary:
-            old, new = (Address(self.name, _EKF, each) for each in (self._primary, primary))
-            self._primary = primary
-            self._supersede(old, new)
-            self._detectors.pop(new, None)
+    def _position(self) -> ChangeDetector | None:
+        """Return the detector of the position estimate in use."""
+        return None if self.main is None else self._detectors.get(self.main)
+
+    def _use_ekf(self, instance: int) -> None:
+        """Use the flags of another EKF: those of both that are set begin conditions anew."""
+        old, self._ekf = self._ekf, instance
+        if old == instance:
+            return
+        stream, kinds = Address(self.name, _EKF, instance), kinds_of(BY_TOPIC[_EKF].name)
+        self._end(stream, lambda kind, flag: kind in kinds or flag.startswith(f"{instance}:"))
+        for each in (old, instance):
+            detector = self._detectors.get(replace(stream, instance=each))
+            for found in () if detector is None else detector.again(HEALTHY):
+                self.emit(found, _EKF, self.time)
 
     def _supersede(self, old: Address, new: Address) -> None:
-        """Stop using a stream, and end its conditions, when a better one arrives."""
-        self._detectors[old] = None
+        """Stop using a stream as before, and end its conditions, when a better one arrives; open unused ones anew."""
+        self._detectors = {each: found for each, found in self._detectors.items() if found and each != old}
         kinds = kinds_of(BY_TOPIC[new.topic].name)
-        for each in [each for (kind, _), each in self.conditions.items() if kind in kinds]:
+        self._end(new, lambda kind, _: kind in kinds)
+
+    def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
+        """End the conditions whose kind and flag are over, as a better stream is in use."""
+        for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
             ended = Finding(each.kind, "end", text, each.begin.names, initial=each.initial)
             self.emit(ended, new.topic, self.time)

@@ -198,8 +198,8 @@ def test_dropout_of_the_logger_is_no_silence(sent: Sent) -> None:
     assert sent.told[1:] == [("silent", "begin")]
 
 
-def test_only_the_ekf_in_use_has_events(sent: Sent) -> None:
-    """The selector names the EKF in use: faults of others are no events, and those of the former one end."""
+def test_only_the_ekf_in_use_has_states(sent: Sent) -> None:
+    """The selector names the EKF in use: faults of others are no states, and those of the former one end."""
     for primary, faulty in ((1, 0), (0, 0), (1, 1)):
         for time in (0.0, 1.0):
             sent(time, "estimator_selector_status", primary_instance=primary)
@@ -219,6 +219,45 @@ def test_only_the_ekf_in_use_has_events(sent: Sent) -> None:
     sent(3.0, "estimator_status_flags", 1, cs_gnss_pos=True, cs_mag_fault=False)
     sent(4.0, "estimator_status_flags", 0, cs_gnss_pos=True, cs_mag_fault=True)
     assert sent.state(4.0) == "info"
+
+
+def test_fault_of_an_unused_ekf_names_it(sent: Sent) -> None:
+    """It is information of its own kind, which explains nothing; that of an EKF that comes into use is a fault."""
+    for time, primary, rejects in ((0.0, 0, False), (1.0, 0, True), (2.0, 1, True), (3.0, 0, True)):
+        sent(time, "estimator_status_flags", 1, reject_hor_pos=rejects)
+        sent(time, "estimator_selector_status", primary_instance=primary)
+        sent(time, xy_reset_counter=round(time), x=5.0 * time)
+    found = [each for each in sent.account.events if each.kind not in ("reset", "jump")]
+    rejected = "EKF 1, not in use: rejects horizontal position"
+    assert [(each.change, each.severity, each.text) for each in found] == [
+        ("begin", "info", rejected),
+        ("once", "watch", "EKF 1 in use, was EKF 0"),
+        ("end", "info", f"{rejected}: superseded by estimator_status_flags/1 after 1.0 s"),
+        ("begin", "watch", "EKF rejects horizontal position"),
+        ("once", "watch", "EKF 0 in use, was EKF 1"),
+        ("end", "info", "EKF rejects horizontal position: superseded by estimator_status_flags/0 after 1.0 s"),
+        ("begin", "info", rejected),
+    ]  # fmt: skip
+    resets = [each for each in sent.account.events if each.kind == "reset"]
+    assert [[each.kind for each in reset.evidence] for reset in resets] == [
+        [], ["ekf_changed", "innovation_rejected"], ["ekf_changed", "innovation_rejected"],
+    ]  # fmt: skip
+    assert sent.account.vehicles["1"].state(100.0).conditions == ()
+
+
+def test_ekf_in_use_without_a_selector(sent: Sent) -> None:
+    """It is the one whose estimates equal the vehicle's; two that are equal tell nothing."""
+    for time, other in ((0.0, 0.0), (1.0, 5.0), (2.0, 6.0)):
+        for instance, x in ((0, other), (1, time)):
+            sent(time, "estimator_local_position", instance, timestamp_sample=round(1e6 * time), x=x)
+        sent(time, timestamp_sample=round(1e6 * time), x=time, vx=1.0)
+        for instance in (0, 1):
+            sent(time, "estimator_status_flags", instance, cs_mag_fault=False)
+    sent(3.0, "estimator_status_flags", 0, cs_mag_fault=True)
+    sent(4.0, "estimator_status_flags", 1, cs_mag_fault=True)
+    texts = [each.text for each in sent.account.events]
+    assert texts == ["EKF 0, not in use: fault: magnetometer", "EKF fault: magnetometer"]
+    assert [each.kind for each in sent.account.vehicles["1"].state(100.0).conditions] == ["estimator_fault"]
 
 
 @pytest.mark.parametrize("gnss", [False, True])

@@ -31,6 +31,7 @@ TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").re
 NAMES: Final = [name for name in TABLE if name != "from"]
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
 FLAPPING: Final = 4, 10.0, 5.0  # changes within so many seconds that are told; then the last, after so many without one
+NOT_IN_TABLE: Final = ("dropout", "text", "ekf_changed", "other_ekf")
 RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # as the layout of today calls what PX4 1.15 logs
 
 pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there")]
@@ -102,7 +103,7 @@ def test_every_event_of_the_table_is_told(name: str) -> None:
     ten seconds is told once more, when it has come to rest; PX4's older names are those of the newest layout.
     """
     dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]  # which the table does not have
-    left = [each for each in told_in(name) if each.kind not in ("dropout", "text")]
+    left = [each for each in told_in(name) if each.kind not in NOT_IN_TABLE]
     told = [each.numbers["duration"] for each in told_in(name) if each.kind == "dropout"]
     assert sum(told) == pytest.approx(sum(dropouts))
     for row, count in without_flapping(TABLE[name]):
@@ -224,6 +225,20 @@ def test_what_held_at_a_moment() -> None:
     assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
     assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
     assert [each.what for each in why("gps_loss", at=36.0)] == ["failsafe"]
+
+
+def test_changes_of_the_ekf_in_use() -> None:
+    """Each change that the selector's messages have is an event, and evidence for the reset after it."""
+    path = path_of("fmuv6c_1.17_selector_whipsaw")
+    selector = ULog(str(path), ["estimator_selector_status"]).data_list[0].data
+    primary = selector["primary_instance"]
+    changes = [index for index in range(1, len(primary)) if primary[index] != primary[index - 1]]
+    told = [each for each in told_in(path.stem) if each.kind == "ekf_changed"]
+    assert [each.boot for each in told] == [pytest.approx(selector["timestamp"][index] / 1e6) for index in changes]
+    assert [each.numbers["to"] for each in told] == [primary[index] for index in changes]
+    assert len(told) == 15  # PX4 counts 16, with the first choice
+    resets = [each for each in told_in(path.stem) if each.kind == "reset" and "xy" in each.names and each.evidence]
+    assert sum("ekf_changed" in [cause.kind for cause in each.evidence] for each in resets) >= 15
 
 
 def test_vehicle_that_fell() -> None:

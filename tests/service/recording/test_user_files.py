@@ -61,7 +61,7 @@ RIGHT: Final[list[tuple[Callable[[str], object], str, object]]] = [
     (events, "15_logging_dropout_5s.ulg", {("dropout", "info")}),
     (events, "16_home_position_50s_old.ulg", set()),
     (events, "17_old_log_without_release.ulg", {("mode", "info")}),
-    (events, "18_primary_ekf_is_1.ulg", set()),
+    (events, "18_primary_ekf_is_1.ulg", {("other_ekf", "info")}),  # of EKF 0
 ]  # fmt: skip
 
 
