@@ -340,7 +340,7 @@ def test_distance_needs_one_frame(sky: Sky) -> None:
 def test_each_time_names_its_clock() -> None:
     """Times are UTC live, and of a recording that has it; else since boot if only one vehicle booted, or the start."""
     recorded = Chronicle(Account(), times=Times())
-    assert recorded.clock(75.25) == "75.2 s since the start"
+    assert recorded.clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_start("1", 70.0, 10.0)
     assert recorded.clock(75.25) == "135.2 s since boot, 75.2 s since the start"
     recorded.times = Times(offsets={"1": NOON})
@@ -353,4 +353,4 @@ def test_each_time_names_its_clock() -> None:
         several.add(Address(name, VLP), message(1_000_000), 0.0)
     recorded = Chronicle(several, times=Times())
     recorded.set_start("1", 70.0, 10.0)
-    assert recorded.clock(75.25) == "75.2 s since the start"
+    assert recorded.clock(75.25) == "75.2 s since the start of the recording"
