@@ -342,10 +342,10 @@ def test_each_time_names_its_clock() -> None:
     recorded = Chronicle(Account(), times=Times())
     assert recorded.clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_start("1", 70.0, 10.0)
-    assert recorded.clock(75.25) == "135.2 s since boot, 75.2 s since the start"
+    assert recorded.clock(75.25) == "135.2 s since boot, 75.2 s since the start of the recording"
     recorded.times = Times(offsets={"1": NOON})
     recorded.set_start("1", 70.0, 10.0)
-    assert recorded.clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start"
+    assert recorded.clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
     live = Chronicle(Account())
     assert live.clock(NOON) == "22:13:20.0 UTC"
     several = Account()
