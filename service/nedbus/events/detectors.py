@@ -120,7 +120,8 @@ class GpsDetector(ChangeDetector):
         fix, was = after["fix_type"], before.get("fix_type")
         satellites, earlier = after["satellites_used"], before.get("satellites_used")
         if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
-            yield Finding("gps_fix_lost", "begin", "no GPS fix", severity="info", initial=True)
+            text = f"no GPS fix, {satellites} satellites" if satellites in range(_UNKNOWN_SATELLITES) else "no GPS fix"
+            yield Finding("gps_fix_lost", "begin", text, initial=True)
         elif was is not None and fix is not None and was != fix:
             names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
             numbers = {"fix_before": was, "fix": fix}

@@ -30,6 +30,7 @@ class Kind:
     value in `flags` is a label. Flags that change in the same message become one event.
     `begin`, `end`: event texts, with `{}` for the labels. `first`: text for the end of an initial condition.
     `minor`: flags whose begin is info. `initial`: a flag that is bad in the first message begins a condition.
+    `once_armed`: what holds in the first messages is a condition once the vehicle is armed; on the ground it is usual.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Kind:
     bad: bool = True
     minor: frozenset[str] = frozenset()
     initial: bool = False
+    once_armed: bool = False
 
     def conditions(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the flags of an event, each of which is a condition of its own; "" for a kind without flags."""
@@ -79,7 +81,7 @@ def _validity(name: str, flag: str, quantity: str, *causes: str) -> Kind:
 def _not_global(quantity: str) -> Kind:
     return Kind(
         f"{quantity}_not_global", "watch", _ESTIMATE, _SENSING, on_ground="info",
-        flags={f"{quantity}_global": quantity},
+        flags={f"{quantity}_global": quantity}, initial=True, once_armed=True,
         bad=False, begin=f"{quantity} has no global reference", end=f"{quantity} has a global reference",
     )  # fmt: skip
 
@@ -108,7 +110,7 @@ _ROWS: Final = (
         end="EKF fault cleared: {}",
     ),
     Kind("ekf_changed", "watch", causes=("text", "estimator_fault", "innovation_rejected"), on_ground="info"),
-    Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites")),
+    Kind("gps_fix_lost", "watch", _GPS, ("text", *_JAMMED, "few_satellites"), once_armed=True),
     Kind("few_satellites", "watch", _GPS, _JAMMED),
     Kind("jamming", "watch", _GPS, ("text",)),
     Kind("spoofing", "watch", _GPS, ("text",)),

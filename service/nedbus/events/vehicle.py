@@ -46,6 +46,7 @@ class Vehicle:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
+        self._on_ground: dict[tuple[str, str], Condition] = {}  # of the first messages, which count once it is armed
         self.topics: set[str] = set()
         self.main: Address | None = None
         self.armed: bool | None = None
@@ -93,6 +94,10 @@ class Vehicle:
         for each in found or ():
             if each.kind in ("armed", "disarmed"):
                 self.armed = each.kind == "armed"
+                if self.armed:
+                    self.conditions |= self._on_ground
+                    self.initial += dict.fromkeys(self._on_ground.values())
+                    self._on_ground.clear()
             self.emit(each, address.topic, time)
             if each.kind == "ekf_changed":
                 self._use_ekf(int(each.numbers["to"]))
@@ -180,6 +185,8 @@ class Vehicle:
         is_on_ground = kind.on_ground is not None and self.armed is False and in_air != "info"
         severity = (kind.on_ground if is_on_ground else None) or in_air
         keys = [(found.kind, flag) for flag in kind.conditions(found.names)]
+        for key in keys:
+            self._on_ground.pop(key, None)
         if found.change == "end":
             held = [self.conditions.pop(key) for key in keys if key in self.conditions]
             if known := [each.since for each in held if not each.initial]:
@@ -193,8 +200,9 @@ class Vehicle:
         )
         if found.change == "begin":
             condition = Condition(found.kind, in_air, text, changed, event, found.initial)
-            self.conditions |= dict.fromkeys(keys, condition)
-            if found.initial and len(self.initial) < _MAX_RECENT:
+            is_waiting = found.initial and kind.once_armed and not self.armed
+            (self._on_ground if is_waiting else self.conditions).update(dict.fromkeys(keys, condition))
+            if found.initial and not is_waiting and len(self.initial) < _MAX_RECENT:
                 self.initial.append(condition)
         if not found.initial and not self._is_flapping(event):
             self._report(event)
@@ -261,6 +269,7 @@ class Vehicle:
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
         """End the conditions whose kind and flag are over, as a better stream is in use."""
+        self._on_ground = {key: each for key, each in self._on_ground.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
             ended = Finding(each.kind, "end", text, each.begin.names, initial=each.initial)
@@ -272,6 +281,7 @@ class Vehicle:
             detector.reset()
         self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
         self.armed = None
+        self._on_ground.clear()
         last, self._rebooted = self._rebooted, time
         if time - last >= PAUSE and ("duplicate", "") not in self.conditions:
             text = f"rebooted: time since boot {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"

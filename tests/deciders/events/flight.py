@@ -13,6 +13,9 @@ POSITION: Final = Address("1", VLP)
 GOOD_GPS: Final[dict[str, Any]] = {
     "fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0,
 }  # fmt: skip
+ORIGIN: Final[dict[str, Any]] = {
+    "xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 500.0,
+}  # fmt: skip
 DISARMED, ARMED = 1, 2
 
 
@@ -38,7 +41,7 @@ class Flight:
         stamp = round((self.now - self.booted) * 1e6)
         values: object = {"timestamp": stamp, **fields}
         if topic == VLP:
-            values = message(stamp, **(VALID | fields))
+            values = message(stamp, **(VALID | ORIGIN | fields))
         instance = 0 if instance is None and get_topic(topic).instances else instance
         address = Address(vehicle, topic, instance)
         self.account.add(address, values, self.now, missing=frozenset(missing), lost=lost)

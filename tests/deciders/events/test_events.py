@@ -336,6 +336,47 @@ def test_estimator_flags(flight: Flight) -> None:
     assert brief(send()) == [("not_fused", "begin", "watch")]
 
 
+def test_flight_without_fix_or_global_reference() -> None:
+    """A lack of the first message is no state on the ground; once the vehicle is armed it is one since that message."""
+    flight, since = Flight(), 100.0
+    assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
+    assert flight.wait(1.0).status(DISARMED) == []
+    assert (flight.severity, flight.account.vehicles["1"].initial[1:]) == ("info", [])  # few satellites are information
+    assert brief(flight.wait(1.0).status(ARMED)) == [("armed", "once", "info")]
+    held = flight.account.state("1", flight.now).conditions
+    assert [(each.text, each.severity, each.since, each.initial) for each in held] == [
+        ("no GPS fix, 0 satellites", "watch", since, True), ("xy has no global reference", "watch", since, True),
+    ]  # fmt: skip
+    assert set(held) <= set(flight.account.vehicles["1"].initial)
+    assert brief(flight.gps(satellites_used=0)) == [("gps_fix_lost", "end", "info")]
+    flight.wait(1.0).status(DISARMED)
+    assert flight.severity == "info"
+    flight.booted = flight.now
+    flight.wait(1.0).send()
+    flight.wait(1.0).status(ARMED)
+    assert flight.kinds == ["reboot"]
+
+
+def test_fix_before_arming_is_no_state() -> None:
+    """Receivers and estimators start without a fix and a global reference."""
+    flight = Flight()
+    flight.status(DISARMED)
+    flight.gps(fix_type=0, satellites_used=0)
+    flight.send(xy_global=False, z_global=False)
+    flight.wait(5.0).gps()
+    flight.send()
+    flight.wait(5.0).status(ARMED)
+    assert flight.kinds == []
+
+
+def test_labels_are_words() -> None:
+    """No event shows the name of a field."""
+    for kind in KINDS.values():
+        for name, label in kind.flags.items():
+            assert "_" not in label
+            assert not re.match(r"(fd|cs|fs|reject) |.*relaxed$", label), name
+
+
 def test_on_the_ground(flight: Flight) -> None:
     """Faults of sensors and links are info while the vehicle is disarmed."""
     flight.status(DISARMED, gcs_connection_lost=False)
@@ -400,8 +441,10 @@ def test_second_receiver_and_battery_are_not_used(flight: Flight) -> None:
     assert flight.severity == "watch"
 
 
-def test_origin_that_only_has_a_new_time(flight: Flight) -> None:
+def test_origin_that_only_has_a_new_time() -> None:
     """An origin is set once, and moves by a centimetre or more; a new ref_timestamp alone is ignored."""
+    flight = Flight()
+    flight.send(xy_global=False, z_global=False)
     origin: dict[str, Any] = {
         "xy_global": True,
         "z_global": True,

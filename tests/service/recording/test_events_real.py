@@ -167,10 +167,16 @@ def short(events: Sequence[Event]) -> list[tuple[str, float | None]]:
     return [(event.kind, None if event.boot is None else round(event.boot, 3)) for event in own]
 
 
-@pytest.mark.parametrize("name", ["cuav_1.16_gps_interference", "sitl_1.15_events"])
-def test_flight_without_a_fault_has_no_story(name: str) -> None:
-    """The estimate of both is good from begin to end; the start of the estimator is no fault."""
-    assert why(name) == []
+def test_flight_without_a_fault_has_no_story() -> None:
+    """The estimate is good from begin to end; the start of the estimator, without a fix and an origin, is no fault."""
+    assert why("sitl_1.15_events") == []
+
+
+def test_flight_without_gnss_has_one_story() -> None:
+    """It has the lack of a fix and of a global reference from the first message on, and an estimate that is valid."""
+    (only,) = why("cuav_1.16_gps_interference")
+    assert (only.begin, only.until, only.is_bad) == (None, None, False)
+    assert only.what == "no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
 
 
 @pytest.mark.parametrize(
@@ -186,6 +192,19 @@ def test_estimate_that_was_never_valid(name: str, lacking: tuple[str, ...]) -> N
     assert [(each.what, each.begin, each.until) for each in only] == [("xy and vxy not valid", None, None)]
     assert only[0].since < 1.0
     assert (only[0].before, only[0].lacking) == ((), lacking)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_held_for_the_whole_flight(name: str) -> None:
+    """A flight without fix and global reference has these conditions, also after landing; others got both in time."""
+    vehicle = account_of(name).account.vehicles["1"]
+    held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
+    not_global = {"xy has no global reference", "z has no global reference"}
+    assert held == {
+        "cuav_1.16_gps_interference": {"no GPS fix, 0 satellites", *not_global},
+        "cubeorange_1.12_small": {"xy not valid", "vxy not valid", *not_global},
+        "sitl_1.13_three_topics": {"xy not valid", "vxy not valid"},
+    }.get(name, set())
 
 
 def test_gps_loss_without_gps_messages() -> None:
