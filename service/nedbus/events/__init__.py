@@ -1,11 +1,12 @@
 """Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
 
 To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`). One that needs more than a flag needs
-a detector, too, which yields its findings (`detectors.py`, `position.py` or `ekf.py`).
+a detector, too, which yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
 """
 
 from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
-from .ekf import EKF_SELECTOR
+from .contradictions import AIR_DATA
+from .detectors import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity
@@ -17,9 +18,9 @@ from .vehicle import Vehicle
 from .verdict import Verdict, verdict_of
 
 __all__ = [
-    "ACCOUNT_PARAMETER", "ALL", "CLOCKS", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MAX_VEHICLES",
-    "MODES", "RECENT", "SEVERITIES", "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event",
-    "Expectation", "Kind", "Severity", "Span", "State", "Story", "Times", "Vehicle", "VehicleReport", "Verdict",
-    "by_vehicle", "faults_of", "from_json", "joined", "report_of", "since_text", "spans_of", "state_at",
+    "ACCOUNT_PARAMETER", "AIR_DATA", "ALL", "CLOCKS", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS",
+    "MAX_VEHICLES", "MODES", "RECENT", "SEVERITIES", "VALID", "WINDOW", "Account", "AccountReport", "Condition",
+    "Event", "Expectation", "Kind", "Severity", "Span", "State", "Story", "Times", "Vehicle", "VehicleReport",
+    "Verdict", "by_vehicle", "faults_of", "from_json", "joined", "report_of", "since_text", "spans_of", "state_at",
     "stories_of", "story_of", "to_age", "to_clock", "unit_of", "verdict_of",
 ]  # fmt: skip

@@ -67,7 +67,8 @@ _SENSING: Final = (
     "gps_fix_lost", "gps_fix", "few_satellites", *_JAMMED, "not_fused", "not_aided", "innovation_rejected",
     "estimator_fault", "ekf_changed",
 )  # fmt: skip
-_INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning")
+_CONTRADICTED: Final = ("height_contradicted", "position_contradicted")
+_INVALID: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning", *_CONTRADICTED)
 
 
 def _validity(name: str, flag: str, quantity: str, *causes: str) -> Kind:
@@ -100,6 +101,10 @@ _ROWS: Final = (
     _validity("z_invalid", "z_valid", "z"),
     _validity("v_xy_invalid", "v_xy_valid", "vxy", "dead_reckoning"),
     _validity("v_z_invalid", "v_z_valid", "vz"),
+    *(
+        Kind(name, "bad", _ESTIMATE, ("text", *_SENSING, "dead_reckoning", "reset", "jump"), "info", fault=True)
+        for name in _CONTRADICTED
+    ),
     Kind("battery", "bad", "BatteryStatus", ("text",), fault=True),
     Kind(
         "dead_reckoning", "watch", _ESTIMATE, ("text", *_SENSING), flags={"dead_reckoning": "dead reckoning"},

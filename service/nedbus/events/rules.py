@@ -65,6 +65,15 @@ JAMMING_END: Final = 60
 JUMP_DISTANCE: Final = 1.0  # m of unexplained motion; JUMP_SHARE of the distance flown is added
 JUMP_SHARE: Final = 0.2
 SMALL_RESET: Final = 0.5  # m or m/s; the severity of a smaller reset is info
+# A reference contradicts a valid estimate that is off by more than this limit, the share of the height, SIGMAS of the
+# receiver's accuracy, and the way flown in its delay. Healthy logs: at most 2.9 m, and 2.2 m at 18 m/s.
+HEIGHT_LIMIT: Final = 8.0  # m; twice that and all that is added if there is only one reference
+HEIGHT_SHARE: Final = 0.05
+POSITION_LIMIT: Final = 4.0  # m
+GNSS_DELAY: Final = 0.5  # s
+SIGMAS: Final = 3.0
+UNKNOWN_ACCURACY: Final = 10.0  # m
+CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all references must contradict the estimate
 FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of a kind of them, within WINDOW; of further ones only the last
 MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; of further ones only the last
 PAUSE: Final = 5.0  # s without a further one after which flapping, losses, rejections or an overload have ended

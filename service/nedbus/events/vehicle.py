@@ -10,8 +10,17 @@ from typing import Final
 
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
-from .detectors import ChangeDetector, Finding, make_detector
-from .ekf import EKF_SELECTOR, HEALTHY, EstimateDetector, flags_detector, selection_detector
+from .contradictions import REFERENCES, Comparison, ReferenceDetector
+from .detectors import (
+    EKF_SELECTOR,
+    HEALTHY,
+    ChangeDetector,
+    EstimateDetector,
+    Finding,
+    flags_detector,
+    make_detector,
+    selection_detector,
+)
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
@@ -64,6 +73,7 @@ class Vehicle:
         self._lost, self._rejected = _Burst(), _Burst()
         self._dropouts = _Burst()  # in ms
         self._ekf = 0  # instance of the EKF in use
+        self._comparison = Comparison(self._position)
         self._equal: dict[int, bool] = {}  # by EKF, if its estimate is the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
@@ -98,7 +108,7 @@ class Vehicle:
                     self.conditions |= self._on_ground
                     self.initial += dict.fromkeys(self._on_ground.values())
                     self._on_ground.clear()
-            self.emit(each, address.topic, time)
+            self.emit(each, address.topic, time - each.age)
             if each.kind == "ekf_changed":
                 self._use_ekf(int(each.numbers["to"]))
 
@@ -243,7 +253,8 @@ class Vehicle:
         if group is _POSITIONS:
             self.main = address
             return PositionDetector()
-        return make_detector(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        detector = make_detector(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        return ReferenceDetector(topic, self._comparison, detector) if topic in REFERENCES else detector
 
     def _position(self) -> ChangeDetector | None:
         """Return the detector of the position estimate in use."""

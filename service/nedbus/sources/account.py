@@ -14,7 +14,7 @@ from typing import Final, cast
 
 from nedbus import recording
 from nedbus.errors import InvalidMessageError, SourceError
-from nedbus.events import EKF_SELECTOR, Account, Times
+from nedbus.events import AIR_DATA, EKF_SELECTOR, Account, Times
 from nedbus_msgs import BY_TOPIC, TOPICS, codec_of, upgrade_fields
 
 from .kinds import parse_source, source_text_of_file
@@ -40,12 +40,12 @@ class FileAccount:
 
 
 class _EventOptions(RecordedOptions):
-    """Options of a replay for its events: all known topics, and the one that names the EKF in use."""
+    """Options of a replay for its events: all known topics, and two without a file that events need."""
 
     @property
     def chosen_topics(self) -> Collection[str]:
         """The topics to deliver."""
-        return {*TOPICS, EKF_SELECTOR}
+        return {*TOPICS, EKF_SELECTOR, AIR_DATA}
 
 
 class Flights:
