@@ -82,7 +82,7 @@ def stories_of(
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
     chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
     if not any(span.until is None if at is None else span.holds(at) for span in chosen):
-        others = [s for s in spans if s not in chosen and s.severity != "info" and not KINDS[s.kind].stateless]
+        others = [s for s in spans if s.severity != "info" and not (KINDS[s.kind].fault or KINDS[s.kind].stateless)]
         chosen += [s for s in others if s.until is None] if chosen and at is None else others
     stories: list[Story] = []
     while chosen:

@@ -51,10 +51,6 @@ class Times:
             return "host" if self.is_live else "vehicle"
         return "start" if event.boot is None else "boot"
 
-    def unit(self, event: Event) -> str:
-        """Return the unit of the time of an event: "UTC", "s since boot" or "s since the start of the recording"."""
-        return unit_of(self.clock(event))
-
     def text(self, event: Event) -> str:
         """Format the time of an event, without a date, as `find` reads it: 14:05:12.3, 123.400 or +12.300."""
         utc = self.utc(event)
@@ -67,10 +63,10 @@ class Times:
         still = f"until {'now' if self.is_live else 'the end'}"
         if begin is None:
             return f"from the first message on, {still} ({to_age(lasted)})"
-        if end is None and lasted == 0:
-            return f"at {self.text(begin)} {self.unit(begin)}"
-        until = f"{self.unit(begin)}, {still}" if end is None else f"to {self.text(end)} {self.unit(end)}"
-        return f"from {self.text(begin)} {until} ({to_age(lasted)})"
+        since = f"{self.text(begin)} {unit_of(self.clock(begin))}"
+        if end is None:
+            return f"at {since}" if lasted == 0 else f"from {since}, {still} ({to_age(lasted)})"
+        return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({to_age(lasted)})"
 
     def find(self, text: str, near: Event) -> float:
         """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the account's time [s].

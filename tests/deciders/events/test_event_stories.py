@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Event, Story, Times, stories_of
+from nedbus.events import Event, Story, Times, stories_of, unit_of
 
 from .flight import ARMED, Flight
 
@@ -188,7 +188,7 @@ def test_clock_that_is_not_known() -> None:
 def test_time_since_the_start() -> None:
     """An event before any time since boot is labelled since the start of the recording, as `find` reads it."""
     told = event_at(40.0)
-    assert (Times().clock(told), Times().text(told), Times().unit(told)) == (
+    assert (Times().clock(told), Times().text(told), unit_of(Times().clock(told))) == (
         "start",
         "+40.000",
         "s since the start of the recording",
