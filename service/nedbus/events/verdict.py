@@ -60,7 +60,13 @@ def verdict_of(
 
     def order(story: Story) -> tuple[bool, bool, bool, int, float]:
         has_ended = is_now and story.until is not None
-        return not story.is_bad, story.begin in parts, has_ended, importance(story.spans[0].kind), -_size(story)
+        return (
+            not story.is_bad,
+            story.begin in parts,
+            has_ended,
+            importance(story.spans[0].kind),
+            -_size(story),
+        )
 
     known = None if POSITIONS.isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
@@ -73,7 +79,7 @@ def verdict_of(
     head = "" if is_then else "no fault then; the nearest: "
     head = "position valid throughout, but " if usable and is_then else head
     cause = _cause(worst, events)
-    text = f"{head}{_cut(worst.what)} {worst.when(times, end)}."
+    text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, _LENGTH - len(text) - 15))])
     also = ""
     for part in _also(worst, cause, stories, times):
@@ -110,27 +116,28 @@ def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[
     return [*([f"No evidence in the {WINDOW:.0f} s before"] if story.begin and not cause else []), *missing]
 
 
-def _also(worst: Story, cause: Iterable[Event], stories: Iterable[Story], times: Times) -> list[str]:
+def _also(worst: Story, cause: Iterable[Event], stories: Sequence[Story], times: Times) -> list[str]:
     """Return the largest other fault of each kind, those near in time first."""
     told = {worst.begin, *cause}
-    by_kind: dict[str, list[Story]] = {}
-    for story in stories:
-        by_kind.setdefault(story.spans[0].kind, []).append(story)
-    largest = sorted(
-        (max(group, key=_size) for group in by_kind.values()), key=lambda each: abs(each.since - worst.since)
-    )
-    counts = {kind: f" (one of {len(group)})" * (len(group) > 1) for kind, group in by_kind.items()}
+    by_size = sorted(stories, key=lambda each: (_size(each), -each.since))
+    largest = {each.spans[0].kind: each for each in by_size}.values()
     return [
-        f"{times.text(each.begin)} {_cut(each.what, 60)}{counts[each.spans[0].kind]}"
-        for each in largest
+        f"{times.text(each.begin)} {_cut(each.what, 60)}{_count(each, stories)}"
+        for each in sorted(largest, key=lambda each: abs(each.since - worst.since))
         if each.begin is not None and each.begin not in told
     ]
+
+
+def _count(story: Story, stories: Iterable[Story]) -> str:
+    """Return the number of faults of the kind of a story, "" if it is the only one."""
+    number = sum(each.spans[0].kind == story.spans[0].kind for each in stories)
+    return f" (one of {number})" if number > 1 else ""
 
 
 def _size(story: Story) -> float:
     """Return the duration of a condition, the largest number of a single event."""
     numbers = map(abs, story.begin.numbers.values()) if story.begin and story.until == story.since else ()
-    return max(numbers, default=(story.until or math.inf) - story.since)
+    return round(max(numbers, default=(story.until or math.inf) - story.since), 2)
 
 
 def _cut(text: str, width: int = 80) -> str:

@@ -198,6 +198,16 @@ def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
     assert verdict(flight, at=107.0).text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot")
 
 
+def test_verdict_counts_faults_of_a_kind() -> None:
+    """The longest of several equal faults is the worst one, and the verdict says that there are more."""
+    flight = Flight()
+    flight.send()
+    for seconds in (1.0, 3.0, 2.0):
+        flight.wait(20.0).send(xy_valid=False)
+        flight.wait(seconds).send()
+    assert verdict(flight).text.startswith("xy not valid (one of 3) from 51.000 to 54.000 s since boot (3.0 s).")
+
+
 def test_verdict_is_short() -> None:
     """Long texts of PX4 are cut: a verdict has at most three lines of 100 columns."""
     flight = Flight()
