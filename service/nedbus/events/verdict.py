@@ -78,7 +78,7 @@ def verdict_of(
     usable = False if worst.is_bad and is_then else known
     head = "" if is_then else "no fault then; the nearest: "
     head = "position valid throughout, but " if usable and is_then else head
-    cause = _cause(worst, events)
+    cause = _cause(worst, events, stories[0].since)
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, _LENGTH - len(text) - 15))])
     also = ""
@@ -89,10 +89,13 @@ def verdict_of(
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 
 
-def _cause(story: Story, events: Iterable[Event]) -> tuple[Event, ...]:
-    """Return the evidence of a fault in order of time: what preceded it, and new texts of PX4 until a second after."""
+def _cause(story: Story, events: Iterable[Event], first: float) -> tuple[Event, ...]:
+    """Return the evidence of a fault in order of time: what preceded it, and texts of PX4 until a second after it.
+
+    Texts that PX4 had said before the `first` of all faults are left out.
+    """
     texts = [event for event in events if event.kind == "text"]
-    earlier = {each.text for each in texts if each.time < story.since - WINDOW}
+    earlier = {each.text for each in texts if each.time < first - WINDOW}
     near = (e for e in texts if e.severity != "info" and -WINDOW <= e.time - story.since <= TOGETHER)
     found = [each for each in near if each.text not in earlier] + [e for e in story.before if e.kind != "text"]
     return tuple(sorted(found, key=lambda each: each.time))
@@ -100,9 +103,12 @@ def _cause(story: Story, events: Iterable[Event]) -> tuple[Event, ...]:
 
 def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[str]:
     """Return sentences with the evidence of a fault that fits into `room` characters, and with what is missing."""
-    missing = [f"Not in the data: {', '.join(story.lacking)}"] if story.lacking else []
+    missing = [f"Not in the data: {', '.join(story.lacking)}"] * bool(story.lacking and (story.is_bad or not cause))
+    said = [
+        (each.numbers.get("level", 0.0), abs(each.time - story.since), each) for each in cause if each.kind == "text"
+    ]
     texts: list[Event] = []
-    for each in sorted((e for e in cause if e.kind == "text"), key=lambda each: each.numbers.get("level", 0.0)):
+    for *_, each in sorted(said, key=lambda text: text[:2]):
         if not any(each.text in other.text or other.text in each.text for other in texts):
             texts.append(each)
     ranked = [*texts[:1], *[each for each in cause if each.kind != "text"][-3:], *texts[1:2]]

@@ -175,11 +175,14 @@ def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float
 def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
     """Yield the lines that explain a fault."""
     yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
-    ended = "" if story.end is None else f"ended at {times.text(story.end)}{' with' * bool(story.after)}"
-    before = [(each, _before(each, story.since)) for each in story.before]
-    meanwhile, after = ([(each, _shown(each)) for each in found] for found in (story.meanwhile, story.after))
-    for title, shown in (("before it", before), ("meanwhile", meanwhile), (ended, after)):
-        yield from [f"  {title}"] * bool(shown or title == ended != "")
+    sections = {"before it": [(each, _before(each, story.since)) for each in story.before]}
+    sections["meanwhile"] = [(each, _shown(each)) for each in story.meanwhile]
+    sections = {title: shown for title, shown in sections.items() if shown}
+    if story.end is not None:
+        title = f"ended at {times.text(story.end)}{' with' * bool(story.after)}"
+        sections[title] = [(each, _shown(each)) for each in story.after]
+    for title, shown in sections.items():
+        yield f"  {title}"
         yield from (fold(f"    {times.text(each)}  ", text) for each, text in shown)
     if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before"
