@@ -70,14 +70,12 @@ def verdict_of(
 
     known = None if POSITIONS.isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
-        length = "in the history of the services" if times.is_live else f"in {end:.0f} s"
-        doubt = "" if known else "; the data does not have the validity of a position"
-        return Verdict(f"no faults {length}{doubt}", known)
+        length = "the history of the services" if times.is_live else f"{end:.0f} s"
+        return Verdict(f"no faults in {length}{'' if known else '; the data has no validity of a position'}", known)
     worst = min(stories, key=order)
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and is_then else known
-    head = "" if is_then else "no fault then; the nearest: "
-    head = "position valid throughout, but " if usable and is_then else head
+    head = ("position valid throughout, but " if usable else "") if is_then else "no fault then; the nearest: "
     cause = _cause(worst, events, stories[0].since)
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, _LENGTH - len(text) - 15))])
@@ -92,11 +90,13 @@ def verdict_of(
 def _cause(story: Story, events: Iterable[Event], first: float) -> tuple[Event, ...]:
     """Return the evidence of a fault in order of time: what preceded it, and texts of PX4 until a second after it.
 
-    Texts that PX4 had said before the `first` of all faults are left out.
+    Texts that PX4 had said before the `first` of all faults are left out. A bad fault that held in the first message
+    has those until its end.
     """
     texts = [event for event in events if event.kind == "text"]
     earlier = {each.text for each in texts if each.time < first - WINDOW}
-    near = (e for e in texts if e.severity != "info" and -WINDOW <= e.time - story.since <= TOGETHER)
+    late = TOGETHER if story.begin else math.inf if story.is_bad else -WINDOW
+    near = (e for e in texts if e.severity != "info" and -WINDOW <= e.time - story.since <= late)
     found = [each for each in near if each.text not in earlier] + [e for e in story.before if e.kind != "text"]
     return tuple(sorted(found, key=lambda each: each.time))
 

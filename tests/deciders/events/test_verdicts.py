@@ -71,7 +71,7 @@ def test_verdict_without_faults() -> None:
     assert (found.text, found.usable, found.stories) == ("no faults in 105 s", True, ())
     assert verdict(flight, times=LIVE).text == "no faults in the history of the services"
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
-    assert (unknown.usable, "the data does not have the validity of a position" in unknown.text) == (None, True)
+    assert (unknown.usable, "the data has no validity of a position" in unknown.text) == (None, True)
 
 
 def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
@@ -81,7 +81,7 @@ def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
         flight.wait(0.1).send(missing=("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
     (known,) = report_of(flight.account, "s", "h", flight.now, within=60).vehicles.values()
     found = verdict_of("1", [], topics=known.topics, unknown=known.unknown, times=Times(), end=0.5)
-    assert (found.usable, found.text) == (None, "no faults in 0 s; the data does not have the validity of a position")
+    assert (found.usable, found.text) == (None, "no faults in 0 s; the data has no validity of a position")
 
 
 def test_verdict_of_a_vehicle_that_stays_usable() -> None:
@@ -196,6 +196,19 @@ def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
     assert verdict(flight, at=flight.now - 30).text.startswith("no fault then; the nearest: ")
     assert verdict(flight, at=flight.now - 30).usable is True
     assert verdict(flight, at=107.0).text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot")
+
+
+def test_verdict_of_a_vehicle_that_was_never_ready_quotes_px4() -> None:
+    """The most severe text while the fault lasts answers why a vehicle is not ready, however late it comes."""
+    flight = Flight()
+    flight.send(xy_valid=False)
+    text(flight, "Preflight Fail: GPS Vertical Pos Drift too high", 4)
+    flight.wait(30.0).send(xy_valid=False)
+    text(flight, "Preflight Fail: ekf2 missing data", 2)
+    assert verdict(flight).text.startswith(
+        "xy not valid from the first message on, until the end (30.0 s). "
+        'Evidence: 40.000 PX4: "Preflight Fail: ekf2 missing data". Not in the data: '
+    )
 
 
 def test_verdict_counts_faults_of_a_kind() -> None:
