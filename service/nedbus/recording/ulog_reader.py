@@ -125,7 +125,7 @@ class UlogReader:
                     self.position += len(chunk)
                     yield self._parser.feed(chunk)
             yield self._parser.close()
-            self.damaged |= self._parser.undecodable > 0
+            self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
         except ulog.UlogError as exc:
             raise SourceError(str(self._path), f"not a readable ULog file: {exc}") from exc
         except OSError as exc:

@@ -177,9 +177,11 @@ def make_logs(folder: Path) -> list[Path]:
 
 
 def rows_of(path: Path) -> dict[Address, MessageArray]:
+    """Return the messages of a log without PX4's words: one bit of the metadata changes all that are events."""
     return {
         address: nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
         for address in nedbus.addresses_of(path)
+        if address.topic != "log_message"
     }
 
 
