@@ -205,7 +205,7 @@ class Viewer:
             move(self._plots.range, begin, end)
         else:
             first = max(begin, now - _MINUTE)
-            move(self._plots.range, first, first + _MINUTE)
+            move(self._plots.range, first, min(first + _MINUTE, max(end, 1.0)))
         if self._player is None:  # the timeline of live vehicles begins with the first event
             first = next((event.time for event in self._chronicle.events if event.time > begin), now)
             begin = max(begin, min(first, now - _MINUTE) - 1.0)

@@ -243,6 +243,7 @@ def test_of_other_messages_only_the_time_is_kept(tmp_path: Path, clock: SimpleNa
     assert {type(payload) for address, payload in opened.entries if address.topic != VLP} == {int}
     player = Player(opened)
     run(player, clock, 10)
+    assert Page(opened, player).moments == pytest.approx((0, 19.9), abs=0.01), "the plots end with the recording"
     (row,) = player.fleet.picture.rows
     line = next(line for line in row.lines if line.address.topic == "vehicle_attitude")
     assert line.health.rate == pytest.approx(10, rel=0.1)
