@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter, itemgetter
-from typing import Any, Final, Literal, TypeGuard, cast
+from typing import Any, Final, Literal, cast
 
 from . import rules
 from .kinds import Kind, Severity, flagged
@@ -280,11 +280,6 @@ def _warning_of(battery: Fields) -> int | None:
     return 0 if battery["connected"] is False else cast("int | None", battery["warning"])
 
 
-def selection_detector() -> ChangeDetector:
-    """Return a detector of the EKF that an estimator_selector_status names."""
-    return ChangeDetector(["primary_instance"], _detect_selection)
-
-
 def flags_detector(instance: int, used: Callable[[], int]) -> ChangeDetector:
     """Return a detector of the flags of an EKF; `used` returns the instance in use."""
 
@@ -333,14 +328,11 @@ class EstimateDetector(ChangeDetector):
         self.stamp = self.earlier = 0
 
 
-def _detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
+def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the EKF that an EKF_SELECTOR names; its fields are whatever its publisher defines."""
     was, now = (each.get("primary_instance") for each in (before, after))
-    if _is_ekf(now):
-        yield _selected(now, was if _is_ekf(was) else None)
-
-
-def _is_ekf(instance: object) -> TypeGuard[int]:
-    return type(instance) is int and instance in range(_MAX_EKFS)
+    if type(now) is int and now in range(_MAX_EKFS):
+        yield _selected(now, was if type(was) is int and was in range(_MAX_EKFS) else None)
 
 
 def _selected(now: int, was: int | None) -> Finding:

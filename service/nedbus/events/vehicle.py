@@ -17,9 +17,9 @@ from .detectors import (
     ChangeDetector,
     EstimateDetector,
     Finding,
+    detect_selection,
     flags_detector,
     make_detector,
-    selection_detector,
 )
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
@@ -236,17 +236,18 @@ class Vehicle:
         if topic == EKF_SELECTOR:
             sought = [each for each, known in self._detectors.items() if isinstance(known, EstimateDetector)]
             self._detectors |= dict.fromkeys(sought)
-        if topic in (EKF_SELECTOR, _EKF):
-            return flags_detector(instance, lambda: self._ekf) if topic == _EKF else selection_detector()
+            return ChangeDetector(["primary_instance"], detect_selection)
+        if topic == _EKF:
+            return flags_detector(instance, lambda: self._ekf)
         if instance and topic not in _POSITIONS:  # only the first sensor and battery
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
-                if topic != _POSITIONS[-1] or current.topic == topic or EKF_SELECTOR in self.topics:
-                    return None
-                return EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
+                is_sought = topic == _POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
+                equals = EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
+                return equals if is_sought else None
             if current is not None:
                 self._supersede(current, address)
             self._preferred[group] = address
