@@ -186,11 +186,18 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
     """Drop stories that are part of an earlier bad story, or evidence of a bad story."""
     kept: list[Story] = []
     for story in stories:
-        parts = {event for each in kept if each.is_bad for event in (*each.meanwhile, *each.after)}
-        if story.spans[0].begin not in parts:
+        if not any(_is_part(story, each) for each in kept):
             kept.append(story)
     causes = {event for story in kept if story.is_bad for event in story.before}
     return [story for story in kept if story.is_bad or story.spans[0].begin not in causes]
+
+
+def _is_part(story: Story, of: Story) -> bool:
+    """Return True if a story is part of another; a fault of the estimate that outlasts it is not."""
+    if not of.is_bad or story.spans[0].begin not in (*of.meanwhile, *of.after):
+        return False
+    outlasts = of.until is not None and (story.until is None or story.until > of.until + TOGETHER)
+    return not (outlasts and story.is_bad and KINDS[story.spans[0].kind].message == "VehicleLocalPosition")
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:

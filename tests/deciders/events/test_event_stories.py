@@ -63,6 +63,18 @@ def test_story_that_ended() -> None:
     ]  # fmt: skip
 
 
+def test_part_of_the_estimate_that_stays_invalid_is_a_story() -> None:
+    """A fault of the estimate that begins during another one is a story if it outlasts it; its consequences are not."""
+    flight = Flight()
+    flight.status(ARMED)
+    flight.send()
+    flight.wait(1.0).send(z_valid=False)
+    flight.wait(2.0).send(z_valid=False, xy_valid=False)
+    flight.status(ARMED, failsafe=True)
+    flight.wait(2.0).send(xy_valid=False)
+    assert [each.what for each in why(flight)] == ["z not valid", "xy not valid"]
+
+
 def test_reboot_ends_a_story() -> None:
     """A reboot ends earlier conditions without an event of their own; it is a story itself."""
     flight = Flight()
