@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from .stream import COLUMNS, History
 from .style import MARKERS, SHAPES, Style
 
 _MAX_ROWS: Final = 7  # vehicles, or one fewer and the number of the others
+_MAX_MARKS: Final = 2000
 _MIN_ROWS: Final = 4  # rows of height, to keep the bars of a few vehicles thin
 _PLOTS: Final = {
     "height above own origin [m]": ("height",),
@@ -27,9 +28,10 @@ _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _OF_TRUTH: Final = {"height", "speed"}
 
 
-def is_notable(event: Event) -> bool:
-    """Return whether an event is shown: severity bad or watch, or a phase of a flight."""
-    return event.severity != "info" or KINDS[event.kind].phase
+def notable(events: Iterable[Event]) -> list[Event]:
+    """Return the events that are shown: faults and phases of a flight; of more than 2,000 the latest faults."""
+    shown = [event for event in events if event.severity != "info" or KINDS[event.kind].phase]
+    return shown if len(shown) <= _MAX_MARKS else [each for each in shown if each.severity != "info"][-_MAX_MARKS:]
 
 
 def move(axis: Range1d, begin: float, end: float) -> None:
@@ -66,7 +68,7 @@ class Timeline:
         begin: float, end: float, now: float,
     ) -> None:  # fmt: skip
         """Show the events from `begin` to `end` [s]; `vehicles` in order of importance."""
-        events = [event for event in events if begin <= event.time <= end and is_notable(event)]
+        events = notable(event for event in events if begin <= event.time <= end)
         held = [  # bad last, drawn over watch
             (name, span)
             for severity in ("watch", "bad")

@@ -25,7 +25,7 @@ from .map import FOCUSES, Map
 from .playback import Player
 from .stream import is_position
 from .style import DARK, LIGHT, read_asset
-from .time_plots import Plots, Timeline, is_notable, move
+from .time_plots import Plots, Timeline, move, notable
 
 _TICK: Final = 100  # ms between updates of the map
 _TEXT_TICKS: Final = 5  # map updates per update of text and plots
@@ -221,7 +221,7 @@ class Viewer:
         self._map.mark([event for event in events if since < event.time <= now + 1.0], chosen, self._whole)
 
     def _events_of_chosen(self) -> list[Event]:
-        return [event for event in self._chronicle.events if event.vehicle == self.chosen and is_notable(event)]
+        return notable(event for event in self._chronicle.events if event.vehicle == self.chosen)
 
     def _act(self, action: str, value: str) -> None:
         """Perform the action of a click or key; ignore unknown actions."""

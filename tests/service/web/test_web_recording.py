@@ -302,3 +302,16 @@ def test_condition_after_the_playback_time_lasts_to_the_end() -> None:
     renderers: list[Any] = list(timeline.figure.renderers)
     [bars] = [each.data_source.data for each in renderers if isinstance(getattr(each, "glyph", None), HBar)]
     assert (list(bars["begin"]), list(bars["end"])) == ([50e3], [60e3])
+
+
+def test_timeline_of_a_log_with_many_texts_has_the_latest_faults() -> None:
+    """A log may have 100,000 texts, too many for a browser: beyond 2,000 marks only the latest faults are drawn."""
+    info = [Event("1", "text", "once", "info", "text", 0.01 * number) for number in range(3000)]
+    watch = [Event("1", "text", "once", "watch", "text", 0.01 * number) for number in range(2500)]
+    timeline = Timeline(DARK, DatetimeTickFormatter())
+    cases: list[tuple[list[Event], list[Event]]] = [
+        (info[:1500], info[:1500]), (info, []), ([*info, *watch[:7]], watch[:7]), (watch, watch[-2000:]),
+    ]  # fmt: skip
+    for events, shown in cases:
+        timeline.update(events, {}, ["1"], begin=0.0, end=60.0, now=10.0)
+        assert timeline.shown == shown
