@@ -425,7 +425,11 @@ def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, e
         assert "xy" in shown.out or "--at" in command
         return
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=7")
-    wait_for(lambda: [each for each in bus.accounts() if "7" in each.vehicles], what="the vehicle")
+
+    def is_well() -> bool:  # with the fix that the simulation has after two seconds
+        return [each.vehicles["7"].severity for each in bus.accounts() if "7" in each.vehicles] == ["info"]
+
+    wait_for(is_well, what="the vehicle")
     if "health" in command:
         shown = run_command(*arguments, "-c", endpoint)
         assert (shown.exit_code, shown.err) == (
