@@ -14,7 +14,7 @@ from .kinds import importance
 from .story import POSITIONS, TOGETHER, Story, stories_of
 from .times import Times
 
-_WIDTH: Final = 95  # columns of a verdict beside the name of the vehicle; it has at most three lines
+_WIDTH: Final = 97  # columns of a verdict beside a short name of the vehicle; it has at most three lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +78,11 @@ def verdict_of(
     head = ("position valid throughout, but " if usable else "") if is_then else "no fault then; the nearest: "
     cause = _cause(worst, events, stories[0].since)
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
-    text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, 3 * _WIDTH - len(text) - 25))])
+    text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, 3 * _WIDTH - len(text) - 30))])
     also = ""
     for part in _also(worst, cause, stories, times):
         longer = f"{also}; {part}" if also else f" Also {part}"
-        also = longer if len(textwrap.wrap(text + longer, _WIDTH)) < 4 else also
+        also = longer if len(textwrap.wrap(f"{text}{longer}.", _WIDTH)) < 4 else also
     text += f"{also}." * bool(also)
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
 

