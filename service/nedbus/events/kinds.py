@@ -30,7 +30,7 @@ class Kind:
     value in `flags` is a label. Flags that change in the same message become one event.
     `begin`, `end`: event texts, with `{}` for the labels. `first`: text for the end of an initial condition.
     `minor`: flags whose begin is info. `initial`: a flag that is bad in the first message begins a condition.
-    `once_armed`: what holds in the first messages is a condition once the vehicle is armed; on the ground it is usual.
+    `once_armed`: what holds in the first messages is a condition once the vehicle has been armed for PAUSE.
     """
 
     name: str

@@ -56,6 +56,7 @@ class Vehicle:
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
         self._on_ground: dict[tuple[str, str], Condition] = {}  # of the first messages, which count once it is armed
+        self._armed_at = math.inf
         self.topics: set[str] = set()
         self.main: Address | None = None
         self.armed: bool | None = None
@@ -104,10 +105,7 @@ class Vehicle:
         for each in found or ():
             if each.kind in ("armed", "disarmed"):
                 self.armed = each.kind == "armed"
-                if self.armed:
-                    self.conditions |= self._on_ground
-                    self.initial += dict.fromkeys(self._on_ground.values())
-                    self._on_ground.clear()
+                self._armed_at = time if self.armed else math.inf
             self.emit(each, address.topic, time - each.age)
             if each.kind == "ekf_changed":
                 self._use_ekf(int(each.numbers["to"]))
@@ -126,7 +124,7 @@ class Vehicle:
         self._rejected.add(time, 1, topic)
 
     def settle(self, time: float) -> None:
-        """Report bursts of losses and rejections, and flapping, that have ended."""
+        """Report bursts of losses and rejections, and flapping, that have ended, and what a flight began without."""
         lost, rejected, dropouts = self._lost, self._rejected, self._dropouts
         if lost.is_over(time) or (lost.count and time - lost.begin > MAX_BURST):
             names = tuple(sorted(lost.topics))
@@ -142,6 +140,10 @@ class Vehicle:
             text = f"rejections stopped ({rejected.count} message{'s' * (rejected.count > 1)})"
             self.emit(Finding("rejected", "end", text, numbers={"messages": rejected.count}), "", rejected.end)
             self._rejected = _Burst()
+        if self._on_ground and time - self._armed_at >= PAUSE:
+            self.conditions |= self._on_ground
+            self.initial += dict.fromkeys(self._on_ground.values())
+            self._on_ground.clear()
         for key, events in list(self._changes.items()):
             last = events[-1]
             if key in self._suppressed and time - last.time > PAUSE:
@@ -210,7 +212,7 @@ class Vehicle:
         )
         if found.change == "begin":
             condition = Condition(found.kind, in_air, text, changed, event, found.initial)
-            is_waiting = found.initial and kind.once_armed and not self.armed
+            is_waiting = found.initial and kind.once_armed
             (self._on_ground if is_waiting else self.conditions).update(dict.fromkeys(keys, condition))
             if found.initial and not is_waiting and len(self.initial) < _MAX_RECENT:
                 self.initial.append(condition)
@@ -293,6 +295,7 @@ class Vehicle:
             detector.reset()
         self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
         self.armed = None
+        self._armed_at = math.inf
         self._on_ground.clear()
         last, self._rebooted = self._rebooted, time
         if time - last >= PAUSE and ("duplicate", "") not in self.conditions:

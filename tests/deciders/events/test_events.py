@@ -343,6 +343,9 @@ def test_flight_without_fix_or_global_reference() -> None:
     assert flight.wait(1.0).status(DISARMED) == []
     assert (flight.severity, flight.account.vehicles["1"].initial[1:]) == ("info", [])  # few satellites are information
     assert brief(flight.wait(1.0).status(ARMED)) == [("armed", "once", "info")]
+    assert flight.wait(PAUSE - 0.1).look() == []
+    assert flight.kinds == []
+    assert flight.wait(0.2).look() == []
     held = flight.account.state("1", flight.now).conditions
     assert [(each.text, each.severity, each.since, each.initial) for each in held] == [
         ("no GPS fix, 0 satellites", "watch", since, True), ("xy has no global reference", "watch", since, True),
@@ -354,6 +357,7 @@ def test_flight_without_fix_or_global_reference() -> None:
     flight.booted = flight.now
     flight.wait(1.0).send()
     flight.wait(1.0).status(ARMED)
+    flight.wait(PAUSE).look()
     assert flight.kinds == ["reboot"]
 
 
@@ -366,6 +370,7 @@ def test_fix_before_arming_is_no_state() -> None:
     flight.wait(5.0).gps()
     flight.send()
     flight.wait(5.0).status(ARMED)
+    flight.wait(PAUSE).look()
     assert flight.kinds == []
 
 
