@@ -425,11 +425,7 @@ def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, e
         assert "xy" in shown.out or "--at" in command
         return
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=7")
-
-    def is_well() -> bool:  # with the fix that the simulation has after two seconds
-        return [each.vehicles["7"].severity for each in bus.accounts() if "7" in each.vehicles] == ["info"]
-
-    wait_for(is_well, what="the vehicle")
+    wait_for(lambda: [each for each in bus.accounts() if "7" in each.vehicles], what="the vehicle")
     if "health" in command:
         shown = run_command(*arguments, "-c", endpoint)
         assert (shown.exit_code, shown.err) == (
@@ -437,9 +433,7 @@ def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, e
         )  # fmt: skip
     else:
         shown = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
-        assert shown.exit_code == 0
-        usual = "times: UTC, from the clocks of the hosts", "7: xy has no global", "--all shows 1 fault"  # GPS is late
-        assert all(line.startswith(usual) for line in shown.err.splitlines()), shown.err
+        assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n" * ("events" in command))
 
 
 def test_every_kind_is_on_the_page() -> None:
