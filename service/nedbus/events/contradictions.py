@@ -35,6 +35,7 @@ class ReferenceDetector(ChangeDetector):
         self._name, fields = REFERENCES[topic]
         self._read = FieldReader(fields, math.nan)
         self._comparison, self._own = comparison, own
+        self.pause = 0.0 if own else 1.05e-6 * _INTERVAL
         self.stamp = self.earlier = self._compared = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
@@ -53,6 +54,7 @@ class ReferenceDetector(ChangeDetector):
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         self.stamp = self.earlier = self._compared = 0
+        self.due = -math.inf
         self._comparison.reset()
         if self._own is not None:
             self._own.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter, itemgetter
@@ -72,7 +73,11 @@ class ChangeDetector:
     provided; `before` is empty at the first message. `context`: names of further fields that `detect` gets.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: its timestamp and that of the one before [us].
+    `pause`: seconds after a message in which further ones are not needed, until `due` by the account's clock.
     """
+
+    pause = 0.0
+    due = -math.inf
 
     def __init__(
         self,

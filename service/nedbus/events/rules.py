@@ -64,6 +64,7 @@ JAMMING_BEGIN: Final = 80  # jamming_indicator; "too high" in PX4's guide to fli
 JAMMING_END: Final = 60
 JUMP_DISTANCE: Final = 1.0  # m of unexplained motion; JUMP_SHARE of the distance flown is added
 JUMP_SHARE: Final = 0.2
+LARGE_CORRECTION: Final = 10.0  # m or m/s; a verdict begins with a larger reset or jump if no fault is bad
 SMALL_RESET: Final = 0.5  # m or m/s; the severity of a smaller reset is info
 # A reference contradicts a valid estimate that is off by more than this limit, the share of the height, SIGMAS of the
 # receiver's accuracy, and the way flown in its delay. Healthy logs: at most 2.9 m, and 2.2 m at 18 m/s.

@@ -17,6 +17,7 @@ from .detectors import (
     ChangeDetector,
     EstimateDetector,
     Finding,
+    TextDetector,
     detect_selection,
     flags_detector,
     make_detector,
@@ -87,8 +88,10 @@ class Vehicle:
             if len(self._detectors) >= _MAX_STREAMS:
                 return
             detector = self._detectors[address] = self._open(address)
-        if detector is None:
+        if detector is None or time < detector.due:
             return
+        if detector.pause:
+            detector.due = time + detector.pause
         before, earlier = detector.stamp, detector.earlier
         found = detector.add(message, missing)
         stamp = detector.stamp
@@ -99,7 +102,9 @@ class Vehicle:
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} is back"), address.topic, time)
         # If the message before the last one is close in time, the last one was damaged: no reboot.
-        if stamp < before - _REBOOT and not 0 < earlier <= stamp + _REBOOT:
+        # PX4's texts wait in queues, and a log may begin with old ones.
+        is_earlier = stamp < before - _REBOOT and type(detector) is not TextDetector
+        if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
             found = detector.add(message, missing)
         for each in found or ():

@@ -10,7 +10,8 @@ from itertools import groupby
 from typing import Final
 
 from .event import ALL, WINDOW, Condition, Event
-from .kinds import importance
+from .kinds import KINDS, importance
+from .rules import LARGE_CORRECTION
 from .story import POSITIONS, TOGETHER, Story, stories_of
 from .times import Times
 
@@ -58,15 +59,10 @@ def verdict_of(
     parts = {event for story in stories if story.is_bad for event in story.meanwhile}
     is_now = times.is_live and at is None
 
-    def order(story: Story) -> tuple[bool, bool, bool, int, float]:
-        has_ended = is_now and story.until is not None
-        return (
-            not story.is_bad,
-            story.begin in parts,
-            has_ended,
-            importance(story.spans[0].kind),
-            -_size(story),
-        )
+    def order(story: Story) -> tuple[bool, bool, bool, bool, int, float]:
+        kind, has_ended = story.spans[0].kind, is_now and story.until is not None
+        is_large = KINDS[kind].correction and _size(story) >= LARGE_CORRECTION
+        return not story.is_bad, story.begin in parts, has_ended, not is_large, importance(kind), -_size(story)
 
     known = None if POSITIONS.isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
@@ -75,10 +71,13 @@ def verdict_of(
     worst = min(stories, key=order)
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and is_then else known
-    head = ("position valid throughout, but " if usable else "") if is_then else "no fault then; the nearest: "
+    of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
+    head = "position valid throughout, but " if usable else "not usable: " * of_estimate
+    head = head if is_then else "no fault then; the nearest: "
     cause = _cause(worst, events, stories[0].since)
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
-    text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, 3 * _WIDTH - len(text) - 30))])
+    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # the rest for others
+    text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
     also = ""
     for part in _also(worst, cause, stories, times):
         longer = f"{also}; {part}" if also else f" Also {part}"

@@ -40,7 +40,8 @@ def test_verdict_of_a_fault_that_lasts() -> None:
     lose_gps(flight)
     found = verdict(flight)
     assert found.text == (
-        "xy and vxy not valid from 16.000 s since boot, until the end (1.0 s). Evidence: 11.000 GPS fix 3D to none, "
+        "not usable: xy and vxy not valid from 16.000 s since boot, until the end (1.0 s). "
+        "Evidence: 11.000 GPS fix 3D to none, "
         "12 satellites to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
         "failsafe_flags."
     )
@@ -57,7 +58,9 @@ def test_verdict_of_a_fault_that_ended() -> None:
     lose_gps(flight)
     flight.wait(1.0).send()
     found = verdict(flight)
-    assert found.text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot (2.0 s). Evidence: ")
+    assert found.text.startswith(
+        "not usable: xy and vxy not valid from 16.000 to 18.000 s since boot (2.0 s). Evidence: "
+    )
     assert found.begin is not None
     assert found.end is not None
     assert (found.usable, found.begin.time, found.end.time) == (False, flight.now - 2.0, flight.now)
@@ -136,7 +139,7 @@ def test_verdict_quotes_px4() -> None:
     text(flight, "Failsafe activated", 2)
     flight.wait(5.0).send(xy_valid=False)
     assert verdict(flight).text.startswith(
-        "xy not valid from 30.000 s since boot, until the end (5.2 s). Evidence: 29.000 "
+        "not usable: xy not valid from 30.000 s since boot, until the end (5.2 s). Evidence: 29.000 "
         'PX4: "GNSS fix too low", dead reckoning; 30.200 PX4: "Failsafe activated". Not in the data: vehicle_gps_'
     )
 
@@ -175,7 +178,7 @@ def test_verdict_of_what_holds_from_begin_to_end() -> None:
     assert (found.usable, len(found.stories)) == (True, 1)
     invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
-    assert found.text.startswith("xy not valid from the first message on, until the end (62.0 s). ")
+    assert found.text.startswith("not usable: xy not valid from the first message on, until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
     assert (found.usable, len(found.stories)) == (False, 1)
 
@@ -195,7 +198,9 @@ def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
     assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).stories
     assert verdict(flight, at=flight.now - 30).text.startswith("no fault then; the nearest: ")
     assert verdict(flight, at=flight.now - 30).usable is True
-    assert verdict(flight, at=107.0).text.startswith("xy and vxy not valid from 16.000 to 18.000 s since boot")
+    assert verdict(flight, at=107.0).text.startswith(
+        "not usable: xy and vxy not valid from 16.000 to 18.000 s since boot"
+    )
 
 
 def test_verdict_of_a_vehicle_that_was_never_ready_quotes_px4() -> None:
@@ -206,7 +211,7 @@ def test_verdict_of_a_vehicle_that_was_never_ready_quotes_px4() -> None:
     flight.wait(30.0).send(xy_valid=False)
     text(flight, "Preflight Fail: ekf2 missing data", 2)
     assert verdict(flight).text.startswith(
-        "xy not valid from the first message on, until the end (30.0 s). "
+        "not usable: xy not valid from the first message on, until the end (30.0 s). "
         'Evidence: 40.000 PX4: "Preflight Fail: ekf2 missing data". Not in the data: '
     )
 
@@ -218,7 +223,9 @@ def test_verdict_counts_faults_of_a_kind() -> None:
     for seconds in (1.0, 3.0, 2.0):
         flight.wait(20.0).send(xy_valid=False)
         flight.wait(seconds).send()
-    assert verdict(flight).text.startswith("xy not valid (one of 3) from 51.000 to 54.000 s since boot (3.0 s).")
+    assert verdict(flight).text.startswith(
+        "not usable: xy not valid (one of 3) from 51.000 to 54.000 s since boot (3.0 s)."
+    )
 
 
 def test_verdict_is_short() -> None:

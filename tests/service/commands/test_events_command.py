@@ -39,8 +39,8 @@ TOLD = [
 ]
 MISSING = "vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags"
 VERDICT = f"""\
-1: xy and vxy not valid from 8.000 to 12.000 s since boot (4.0 s). Evidence: 5.000 dead reckoning. \
-Not in the data: {MISSING}.
+1: not usable: xy and vxy not valid from 8.000 to 12.000 s since boot (4.0 s). \
+Evidence: 5.000 dead reckoning. Not in the data: {MISSING}.
 """
 WHY = f"""\
 {VERDICT}
@@ -147,9 +147,10 @@ def test_events_of_a_real_flight() -> None:
         run_command("events", str(REAL)).out
     )
     story = run_command("why", str(REAL), "--all").out
-    begin = "1: xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
-    assert story.startswith(f"{begin}. Evidence: 23:08:59.8 GPS fix 3D to none, 10 satellites to 0")
-    assert f"\n\n{begin}\n  before it\n    23:08:59.8  GPS fix" in story
+    fault = "xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
+    begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix 3D to none, 10 satellites to 0"
+    assert story.startswith(begin)
+    assert f"\n\n1: {fault}\n  before it\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
 
 
@@ -210,7 +211,8 @@ def test_what_never_was_valid_is_said(tmp_path: Path) -> None:
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = str(writer.write(tmp_path / "never.ulg"))
     assert run_command("events", log).err == "throughout the file: 1: xy not valid\n"
-    assert run_command("why", log).out.startswith("1: xy not valid from the first message on, until the end (4.8 s).")
+    begin = "1: not usable: xy not valid from the first message on, until the end (4.8 s)."
+    assert run_command("why", log).out.startswith(begin)
 
 
 def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,7 +290,7 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
     shown = run_command("why", "-c", endpoint)
     assert (shown.exit_code, shown.err) == (0, "--all shows 1 fault in detail\n")
-    assert shown.out.startswith("1: xy and vxy not valid from ")
+    assert shown.out.startswith("1: not usable: xy and vxy not valid from ")
     assert shown.out.endswith("\n2: no faults in the history of the services\n")
     bus.publisher(VLP, vehicle="mocap1").publish(message(1))
     shown = run_command("why", "-c", endpoint, "-v", "mocap1")
@@ -298,8 +300,9 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the history of the services\n"
     shown = run_command("why", "-c", endpoint, "-v", "1", "--all")
     clock = r"\d\d:\d\d:\d\d\.\d"
-    begin = rf"1: xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
-    assert re.match(rf"{begin}\. Evidence: {clock} dead reckoning\. Not in .*\n\n{begin}\n  before it\n", shown.out)
+    fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
+    begin = rf"1: not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
+    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", shown.out)
     assert "to publish them: PX4's dds_topics.yaml" in shown.out
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
     assert set(shown.out.splitlines()) <= set(since_boot.out.splitlines())
@@ -323,7 +326,8 @@ def test_why_live_of_what_held_before(run_nedbus: Start, bus: nedbus.Bus, endpoi
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = writer.write(tmp_path / "never.ulg")
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
-    assert run_command("why", "-c", endpoint).out.startswith("1: xy not valid from the first message on, until now (")
+    begin = "1: not usable: xy not valid from the first message on, until now ("
+    assert run_command("why", "-c", endpoint).out.startswith(begin)
 
 
 def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:

@@ -61,7 +61,7 @@ def test_events_of_several_files_are_on_one_axis(swarm: list[str]) -> None:
     assert {(each["vehicle"], each["time"]) for each in found} == {("b", "2025-10-09T08:54:25.000+00:00")}
     assert run_command("events", "-v", "a_1", *swarm).out == ""
     why = run_command("why", "-v", "b", "--at", "08:54:26", *swarm)
-    assert "b: xy and vxy not valid from 08:54:25.0" in why.out, why.err
+    assert "b: not usable: xy and vxy not valid from 08:54:25.0" in why.out, why.err
 
 
 def test_commands_of_the_page_run(swarm: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
