@@ -161,7 +161,9 @@ def test_event_is_jumped_to(recording: Recording) -> None:
     page.say("event", marks[0][0])
     assert page.player.time == pytest.approx(90, abs=0.01)
     assert (page.grades, page.document.title) == ({"wing": "bad"}, "(1 bad) flight.mcap")
-    assert '<div class="verdict">xy not valid from 91.000 to 121.000 s since boot (30.0 s)' in page.part("why")
+    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)' in page.part(
+        "why"
+    )
     assert page.marks["wing"]["north"] == pytest.approx(89.9)
     assert page.moments == pytest.approx((30, 90), abs=0.01)
     page.say("next")
@@ -189,7 +191,7 @@ def test_recording_begins_with_its_faults(recording: Recording) -> None:
     Times are by the vehicle's clock, which the header and the axes name.
     """
     page = open_page(recording)
-    assert '<div class="verdict">xy not valid from 91.000 to 121.000 s since boot' in page.part("list")
+    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot' in page.part("list")
     faults = re.findall(r'data-do="fault" data-with="(\d)">.*?<b>(.*?)</b> (.*?)</div>', page.part("list"))
     assert faults == [("0", "xy not valid", "from 91.000 to 121.000 s since boot (30.0 s)")]
     assert "1.0 s since boot, 0.0 s since the start" in page.part("head")
