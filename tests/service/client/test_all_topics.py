@@ -64,6 +64,7 @@ UTC: Final = {  # source of UTC, and the date of the boot
 
 pytestmark = [
     pytest.mark.logs,
+    pytest.mark.usefixtures("patient_lookups"),
     pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there"),
 ]
 each_flight = pytest.mark.parametrize("flight", FLIGHTS, ids=lambda path: path.stem)

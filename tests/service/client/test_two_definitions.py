@@ -21,8 +21,6 @@ from hypothesis import strategies as st
 
 import nedbus
 from nedbus import Counts
-from nedbus.client import discovery
-from nedbus.client.receiving import layout_lookup
 from nedbus.recording.mcap_writer import RecordingWriter
 from nedbus.recording.recorder import Recorder
 from nedbus.transport import Session, open_router, query
@@ -36,6 +34,8 @@ from tests.service.delivery.publishing import wait_for_subscriber
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
 NAME, TOPIC = "WindCell", "wind_cell"
+pytestmark = pytest.mark.usefixtures("patient_lookups")
+
 FIELDS: Final = {
     "A": ("timestamp", "north", "east"),
     "B": ("timestamp", "east", "north"),  # the same types: only the hash tells them apart
@@ -61,15 +61,6 @@ def publisher_of(bus: nedbus.Bus, firmware: str, vehicle: str | None = None) -> 
 
 def as_dict(message: Any) -> dict[str, object]:
     return dict(message._asdict() if hasattr(message, "_asdict") else message.model_dump())
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _patient_lookups() -> Iterator[None]:
-    """Let readers wait for definitions until the deadline: a message whose lookup takes too long is invalid."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(discovery, "_SCHEMA_TIMEOUT", 2 * DEADLINE)
-        patch.setattr(layout_lookup, "_PATIENCE", DEADLINE)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -69,8 +69,10 @@ def test_real_log_equals_pyulog(path: Path) -> None:
         flat = {name.replace("[", "_").replace("]", "").replace(".", "_"): column for name, column in columns.items()}
         compared = 0
         for name in rows.dtype.names or ():
-            values = rows[name].reshape(len(rows), -1)
-            names = [f"{name}_{index}" for index in range(values.shape[1])] if rows[name].ndim > 1 else [name]
+            is_text = rows[name].dtype.kind == "S"  # pyulog reads it as its characters
+            values = (np.ascontiguousarray(rows[name]).view(np.uint8) if is_text else rows[name]).reshape(len(rows), -1)
+            is_array = is_text or rows[name].ndim > 1
+            names = [f"{name}_{index}" for index in range(values.shape[1])] if is_array else [name]
             for column, value in zip(names, values.T, strict=True):
                 assert flat[column].tobytes() == np.ascontiguousarray(value).tobytes(), (subscription.name, column)
                 compared += 1
