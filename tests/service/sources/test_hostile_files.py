@@ -149,6 +149,6 @@ def test_service_ends_with_a_hostile_log(run_nedbus: Start, endpoint: str, tmp_p
 
 def _check(start: Start, path: Path) -> None:
     process = start("-c", _READ, str(path))
-    assert process.wait() == 0, process.err
+    assert process.wait(100.0) == 0, process.err
     *_, growth = process.out.split()
     assert int(growth) < _MEMORY, process.out
