@@ -35,7 +35,7 @@ docs: $(DEV)  ## the site with its reference, in build/site; a link that leads n
 quick: $(DEV)  ## the tests of rules alone, without routers and processes: under half a minute
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
-test: check behaviour  ## lint, types, and all tests that prove behaviour: under three minutes
+test: check behaviour  ## lint, types, and all tests that prove behaviour: three to four minutes on two cores
 
 behaviour: $(DEV)
 	$(BIN)/pytest -q -n 4 --dist worksteal -m "not slow and not compose"

@@ -90,7 +90,7 @@ class Texts:
                     yield Data(SPOKEN, _FORM.pack(found.timestamp, found.level, to_statement(found.text).encode()))
 
     def _read(self, record: Record) -> LoggedText | None:
-        """Return what is said for the first time."""
+        """Return the statement that a record completes, None if there is none or it is a repetition."""
         if isinstance(record, LoggedText):
             return None if self._is_said(record) else record
         if isinstance(record, MultiInformation) and record.key == "metadata_events" and isinstance(record.value, bytes):

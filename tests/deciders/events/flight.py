@@ -84,3 +84,15 @@ class Flight:
     @property
     def kinds(self) -> list[str]:
         return [each.kind for each in self.account.state("1", self.now).conditions]
+
+
+def lose_gps(flight: Flight) -> None:
+    """Lose the receiver, and then the estimate."""
+    flight.gps()
+    flight.fly(1)
+    flight.gps(fix_type=0, satellites_used=0)
+    flight.wait(1.0).send(dead_reckoning=True)
+    flight.wait(2.0).send(dead_reckoning=True)
+    flight.wait(2.0).send(dead_reckoning=True, xy_valid=False, v_xy_valid=False)
+    flight.wait(0.5).status(ARMED)
+    flight.wait(0.5).status(ARMED, failsafe=True)

@@ -44,7 +44,7 @@ def flight() -> Flight:
 
 
 def test_contradicted_height(flight: Flight) -> None:
-    """It begins when all references contradict it, is told when that has lasted, and ends with the first agreement."""
+    """A contradiction begins when all references disagree for long enough, and ends when the first one agrees."""
     since = flight.now
     begun = fly(flight, 4.0, up=36.0, baro=36.0)
     assert [(each.kind, each.change, each.severity, each.text) for each in begun] == [

@@ -9,7 +9,7 @@ import pytest
 
 from nedbus.events import Event, Story, Times, stories_of, unit_of
 
-from .flight import ARMED, Flight
+from .flight import ARMED, Flight, lose_gps
 
 
 def why(flight: Flight, *, at: float | None = None) -> list[Story]:
@@ -17,18 +17,6 @@ def why(flight: Flight, *, at: float | None = None) -> list[Story]:
     followed = flight.account.vehicles["1"]
     events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
     return stories_of(events, followed.conditions.values(), topics=list(followed.topics), at=at)
-
-
-def lose_gps(flight: Flight) -> None:
-    """Lose the receiver, and then the estimate."""
-    flight.gps()
-    flight.fly(1)
-    flight.gps(fix_type=0, satellites_used=0)
-    flight.wait(1.0).send(dead_reckoning=True)
-    flight.wait(2.0).send(dead_reckoning=True)
-    flight.wait(2.0).send(dead_reckoning=True, xy_valid=False, v_xy_valid=False)
-    flight.wait(0.5).status(ARMED)
-    flight.wait(0.5).status(ARMED, failsafe=True)
 
 
 def recover(flight: Flight) -> None:

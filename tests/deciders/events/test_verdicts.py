@@ -10,7 +10,7 @@ from typing import Any
 from nedbus.events import ALL, Condition, Event, Times, Verdict, from_json, report_of, verdict_of
 from nedbus.events.detectors import Finding
 
-from .flight import ARMED, Flight
+from .flight import ARMED, Flight, lose_gps
 
 LIVE = Times(is_live=True)
 
@@ -21,17 +21,6 @@ def verdict(flight: Flight, *, times: Times | None = None, at: float | None = No
     events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
     held = [each for each in followed.conditions.values() if each.severity != "info"]
     return verdict_of("1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at)
-
-
-def lose_gps(flight: Flight) -> None:
-    flight.gps()
-    flight.fly(1)
-    flight.gps(fix_type=0, satellites_used=0)
-    flight.wait(1.0).send(dead_reckoning=True)
-    flight.wait(2.0).send(dead_reckoning=True)
-    flight.wait(2.0).send(dead_reckoning=True, xy_valid=False, v_xy_valid=False)
-    flight.wait(0.5).status(ARMED)
-    flight.wait(0.5).status(ARMED, failsafe=True)
 
 
 def test_verdict_of_a_fault_that_lasts() -> None:

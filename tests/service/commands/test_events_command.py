@@ -344,7 +344,7 @@ def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, end
 
 
 def test_texts_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
-    """PX4's own texts are told to those who ask later, as they are by a file."""
+    """A service keeps PX4's own texts, and `events --within` and `why` show them as they do from a file."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 60):

@@ -294,8 +294,8 @@ def test_vehicle_that_fell() -> None:
 def test_texts_are_those_of_px4(name: str) -> None:
     """Each statement of a table made by hand with pyulog is an event, once, with its time and words, and no other.
 
-    Of a statement in two forms, either one is told. A failed check that PX4 reports again, as another check has
-    changed, is told when it is new.
+    Of a statement in two forms, one is an event. A failed check that PX4 repeats because another check has changed
+    is an event only the first time.
     """
     told = [(each.boot or 0.0, each.text) for each in told_in(name) if each.kind == "text"]
     checks: set[str] = set()
