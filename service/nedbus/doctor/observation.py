@@ -83,7 +83,8 @@ class Observation:
     """A network as seen by this client, and the scope of the examination.
 
     `version`: of this nedbus; `vehicle`: the one to examine, None for all; `verdict`: its write permission.
-    `alive`: number of publishers of each address, by tokens; `ages`: age of the last message returned by one [s].
+    `alive`: number of publishers of each address, by tokens.
+    `ages`: age of the last message of each, at the end [s]; None without a timestamp.
     `streams`: messages by key; `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes; `ros2`: publishers of ROS 2 topics.
     `routers`: routers that disclose their sessions; `accounts`: histories of vehicles kept by services.
@@ -129,6 +130,7 @@ class Observation:
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             for address in _parse_each(self._address_of, [str(sample.key_expr)]):
                 self.ages[address] = _age_of(sample)
+        queried = clock.utc()
         tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add_messages(take_messages())
@@ -140,6 +142,7 @@ class Observation:
             self._add_messages(take_messages())
             keys = (key for sample in take_others() if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}"))
             others.update(islice((key for key in keys if len(key) < _MAX_KEY_LENGTH), max(0, _MAX_KEYS - len(others))))
+        self.ages = {each: None if age is None else age + clock.utc() - queried for each, age in self.ages.items()}
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
