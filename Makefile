@@ -22,7 +22,7 @@ check: $(DEV)  ## lint and types
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
 
-generated: $(DEV)  ## what is made from the files of messages: the stubs of type checkers, and a page each
+generated: $(DEV)  ## a page for each message, made from its file
 	$(BIN)/python -m docs.generator
 
 docs: $(DEV)  ## the site with its reference, in build/site; a link that leads nowhere is an error

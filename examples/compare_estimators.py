@@ -9,6 +9,8 @@ truth: nedbus.VehicleLocalPosition | None = None
 with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     for sample in bus.subscribe("*", vehicle="1", mode="every"):
         message = sample.message
+        if not isinstance(message, nedbus.VehicleLocalPosition):
+            continue
         if sample.topic == "vehicle_local_position_groundtruth":
             truth = message
         elif sample.topic == "estimator_local_position" and truth is not None:

@@ -61,7 +61,8 @@ def test_example_runs(start: Start, flying: str, tmp_path: Path, name: str) -> N
 def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
     """The vehicle of examples/publish.py moves."""
     process = run_example(start, "publish.py", endpoint, tmp_path)
-    with bus.subscribe("external_ins_local_position", vehicle="mine", mode="every") as subscription:
+    position, topic = nedbus.VehicleLocalPosition, "external_ins_local_position"
+    with bus.subscribe(position, topic=topic, vehicle="mine", mode="every") as subscription:
         first, second = (subscription.receive(30).message for _ in range(2))
     assert second.timestamp > first.timestamp
     assert (first.x, first.y) != (second.x, second.y)

@@ -1,4 +1,4 @@
-"""Generated files: the stubs of type checkers, a page for each message, and the reference of the site."""
+"""Generated files: a page for each message, and the reference of the site."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from .api import api_page
 from .commands import commands_page
 from .messages import module_of, page
 from .metrics import metrics_page
-from .stubs import ROOT, stubs
 from .tables import events_page, keys_page, limits_page, settings_page
 
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
 
 def committed() -> dict[Path, str]:
-    """Return what is kept in the repository: what type checkers read, and the pages of messages."""
-    pages = {DOCS / "messages" / f"{module_of(each)}.md": page(each) for each in MESSAGES.values()}
-    return {**stubs(), **pages}
+    """Return the pages of messages, which are kept in the repository."""
+    return {DOCS / "messages" / f"{module_of(each)}.md": page(each) for each in MESSAGES.values()}
 
 
 def reference() -> dict[str, str]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from . import DOCS, committed, reference
-from .stubs import ROOT
+from . import DOCS, ROOT, committed, reference
 
 files = committed()
 if "--site" in sys.argv:

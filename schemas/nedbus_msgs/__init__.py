@@ -70,6 +70,7 @@ from .topics import (
     schema_key,
     split_ros2_topic,
     status_key,
+    topic_of,
     vehicle_name,
 )
 from .undeclared import define
@@ -88,6 +89,7 @@ __all__ = [
     "is_vehicle_input", "json_schema_of", "layout_table_of", "message_doubts", "message_of_type_hash",
     "ned_to_enu", "provenance_of", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "quaternion_to_euler",
     "read_msg", "rejected_key_expr", "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "schema_of",
-    "short_hash", "split_ros2_topic", "status_key", "to_global", "to_local", "upgrade_fields", "upgrade_with",
-    "variances_enu_to_ned", "variances_ned_to_enu", "vehicle_name", "wrap", "yaw_enu_to_ned", "yaw_ned_to_enu",
+    "short_hash", "split_ros2_topic", "status_key", "to_global", "to_local", "topic_of", "upgrade_fields",
+    "upgrade_with", "variances_enu_to_ned", "variances_ned_to_enu", "vehicle_name", "wrap",
+    "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip

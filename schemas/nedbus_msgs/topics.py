@@ -11,6 +11,7 @@ from typing import Final, cast
 from .errors import AddressError
 from .model.declaration import Topic
 from .model.definition import MESSAGES, TOPICS
+from .model.message import Message
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"
@@ -237,6 +238,21 @@ def ros2_topic_of(address: Address, namespace: str) -> str:
 def vehicle_name(vehicle: str | int) -> str:
     """Return the name of a vehicle, given by name or by number, such as a MAVLink system id."""
     return str(vehicle) if type(vehicle) is int else cast("str", vehicle)
+
+
+def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
+    """Return the topic of a message: the first one of its class, or `topic`, another one of it; a name as it is.
+
+    Raises AddressError for a topic of another message, and for a class that declares no topics.
+    """
+    if isinstance(message, str):
+        topics = [message]
+    elif not (topics := [each.name for each in vars(message).get("TOPICS", ())]):
+        raise AddressError("message", message.__name__, "a class that declares TOPICS, or the name of a topic")
+    if topic not in (None, *topics):
+        name = message if isinstance(message, str) else message.__name__
+        raise AddressError("topic", topic, f"one of {name}: {', '.join(topics)}")
+    return topic or topics[0]
 
 
 def check_vehicle(vehicle: object) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +15,7 @@ from .recorder import Recorder
 from .stack import ENVIRONMENT, ROOT, STAND_IN, Stack, docker, require_docker
 
 StartStack = Callable[..., Stack]
-Record = Callable[[nedbus.Subscription], Recorder]
+Record = Callable[[nedbus.Subscription[Any]], Recorder]
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +48,7 @@ def record() -> Iterator[Record]:
     """Make recorders that end with the test."""
     recorders: list[Recorder] = []
 
-    def start(subscription: nedbus.Subscription) -> Recorder:
+    def start(subscription: nedbus.Subscription[Any]) -> Recorder:
         recorders.append(Recorder(subscription))
         return recorders[-1]
 

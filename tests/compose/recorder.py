@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import nedbus
 from nedbus.sources import SourceMessage
@@ -16,9 +17,9 @@ from tests.waits import DEADLINE, wait_for
 class Recorder:
     """Reads a subscription in a thread of its own, as a script does, and keeps everything."""
 
-    def __init__(self, subscription: nedbus.Subscription) -> None:
+    def __init__(self, subscription: nedbus.Subscription[Any]) -> None:
         self.subscription = subscription
-        self.samples: list[nedbus.Sample] = []
+        self.samples: list[nedbus.Sample[Any]] = []
         self.unseen = 0  # messages that may have been superseded before the first one that was read
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -35,7 +36,7 @@ class Recorder:
         wait_for(lambda: len(self.samples) >= before + count, what=f"{count} more samples", seconds=seconds)
         return time.monotonic() - start
 
-    def of(self, address: Address) -> list[nedbus.Sample]:
+    def of(self, address: Address) -> list[nedbus.Sample[Any]]:
         """Return what arrived of one address so far."""
         return [sample for sample in list(self.samples) if sample.address == address]
 
@@ -44,7 +45,7 @@ class Recorder:
         self._thread.join(DEADLINE)
 
 
-def indices(samples: list[nedbus.Sample], flight: Flight) -> list[int]:
+def indices(samples: list[nedbus.Sample[Any]], flight: Flight) -> list[int]:
     """Return the indices of these samples of one address in its flight; every value must be right."""
     return flight.indices((sample.address, sample.message) for sample in samples).popitem()[1]
 

@@ -36,6 +36,7 @@ from nedbus_msgs import (
     hash_of,
     hash_of_msg,
     message_of_type_hash,
+    messages,
     schema_of,
     upgrade_fields,
 )
@@ -299,8 +300,10 @@ def test_message_is_described(name: str) -> None:
 
 @pytest.mark.process
 def test_what_is_made_from_the_files_is_up_to_date() -> None:
-    """The stubs of type checkers and the page of each message: after a change, `make generated`."""
+    """The page of each message, after a change by `make generated`, and its import for type checkers."""
     assert [path.name for path, text in committed().items() if not path.exists() or path.read_text() != text] == []
+    imports = Path(messages.__file__ or "").read_text()
+    assert [name for name in MESSAGES if f"import {name} as {name}\n" not in imports] == []
     assert {path.name for path in PAGES.glob("*.md")} == {path.name for path in committed() if path.suffix == ".md"}
 
 

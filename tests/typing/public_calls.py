@@ -5,17 +5,18 @@ An ignore that is not needed is an error of mypy's, so a mistake that slips thro
 
 from __future__ import annotations
 
-from typing import Any, assert_type
+from typing import assert_type
 
 import numpy as np
 import pandas as pd
 
 import nedbus
+from nedbus_msgs.model.px4_types import Float32, field
 
 
 def subscribe(bus: nedbus.Bus) -> None:
     """The form of the iteration decides what `message` is."""
-    with bus.subscribe("vehicle_local_position", vehicle="7", mode="every") as subscription:
+    with bus.subscribe(vehicle="7", mode="every") as subscription:
         for sample in subscription:
             assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
             assert_type(sample.message.x, float)
@@ -34,17 +35,28 @@ def subscribe(bus: nedbus.Bus) -> None:
     bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-overload] # the vehicle by name only
 
 
+class WheelEncoders(nedbus.Message):
+    """A message of a script."""
+
+    TOPICS = (nedbus.Topic("wheel_encoders", 50.0, "a rover"),)
+    wheel_speed: Float32 = field("Speed of the wheels [rad/s]")
+
+
 def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
-    """The topic decides which message it is; of one that is not known, or of all, it may be any."""
-    for sample in bus.subscribe("vehicle_attitude"):
+    """The class gives the fields of a message; a name of a topic gives any message."""
+    for sample in bus.subscribe(nedbus.VehicleAttitude):
         assert_type(sample, nedbus.Sample[nedbus.VehicleAttitude])
         assert_type(sample.message.q, tuple[float, float, float, float])
         sample.message.x  # type: ignore[attr-defined] # an attitude has no position
-    assert_type(bus.subscribe("sensor_gps", mode="every").receive().message.fix_type, int)
-    assert_type(bus.subscribe("vehicle_gps_position"), nedbus.Subscription[nedbus.SensorGps])
-    assert_type(bus.subscribe("*"), nedbus.Subscription[Any])
-    assert_type(bus.subscribe(any_topic), nedbus.Subscription[Any])
-    assert_type(bus.latest("home_position")[0].message.alt, float)
+    assert_type(bus.subscribe(nedbus.SensorGps, mode="every").receive().message.fix_type, int)
+    gps = bus.subscribe(nedbus.SensorGps, topic="vehicle_gps_position", vehicle=7, max_rate=5)
+    assert_type(gps, nedbus.Subscription[nedbus.SensorGps])
+    assert_type(bus.subscribe(WheelEncoders).receive().message.wheel_speed, float)
+    assert_type(bus.subscribe("*"), nedbus.Subscription[nedbus.Message])
+    assert_type(bus.subscribe(any_topic).receive().message.timestamp, int)
+    bus.subscribe(any_topic).receive().message.x  # type: ignore[attr-defined] # of which message
+    assert_type(bus.latest(nedbus.HomePosition)[0].message.alt, float)
+    assert_type(bus.latest("*", vehicle=7), list[nedbus.Sample[nedbus.Message]])
     assert_type(bus.latest(), list[nedbus.Sample[nedbus.VehicleLocalPosition]])
 
 
@@ -79,19 +91,25 @@ async def read_and_publish() -> None:
         async for row in bus.subscribe().rows():
             assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
         assert_type(bus.subscribe(max_rate=0.5), nedbus.AsyncSubscription)
-        for sample in bus.subscribe():  # type: ignore[attr-defined] # async for
+        async for attitude in bus.subscribe(nedbus.VehicleAttitude):
+            assert_type(attitude.message.q, tuple[float, float, float, float])
+            attitude.message.x  # type: ignore[attr-defined] # an attitude has no position
+        assert_type(bus.subscribe("*"), nedbus.AsyncSubscription[nedbus.Message])
+        for _ in bus.subscribe():  # type: ignore[attr-defined] # async for
             pass
         publisher = await bus.publisher("external_ins_local_position", vehicle="mine")
         assert_type(publisher, nedbus.AsyncPublisher)
         await publisher.publish(nedbus.VehicleLocalPosition(timestamp=1))
         await publisher.publish(nedbus.VehicleAttitude(timestamp=1))
-        await publisher.publish_row(sample.message)
+        await publisher.publish_row(nedbus.VehicleLocalPosition(timestamp=1))
         assert_type(await publisher.flush(), bool)
         await publisher.flush("1")  # type: ignore[arg-type] # seconds
         vehicles = await bus.vehicles(timeout=1.0)
         assert_type(vehicles["7"], list[nedbus.Address])
         assert_type(vehicles.complete, bool)
         assert_type(await bus.latest(), list[nedbus.Sample])
+        assert_type(await bus.latest(nedbus.HomePosition), list[nedbus.Sample[nedbus.HomePosition]])
+        assert_type(await bus.latest("home_position"), list[nedbus.Sample[nedbus.Message]])
 
 
 def read() -> None:

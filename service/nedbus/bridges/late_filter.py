@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from typing import Final
+from typing import Any, Final
 
 from nedbus.client import Sample
 from nedbus_msgs import Address
@@ -24,13 +24,13 @@ class LateFilter:
     `last`: the latest samples at start-up; they are held back because their age is unknown.
     """
 
-    def __init__(self, last: Iterable[Sample] = ()) -> None:
+    def __init__(self, last: Iterable[Sample[Any]] = ()) -> None:
         self._last = {sample.address: (_publisher(sample), sample.sent) for sample in last}
         self._clocks: dict[Address, tuple[str, PublisherClock]] = {}
         self._held = Counter[Address]()
         self._latest = 0  # ns, greatest lateness among these
 
-    def admits(self, sample: Sample, *, arrived: int) -> bool:
+    def admits(self, sample: Sample[Any], *, arrived: int) -> bool:
         """Return True if a sample is current or has no timestamp.
 
         `arrived`: arrival time by this host's monotonic clock [ns].
@@ -94,6 +94,6 @@ class PublisherClock:
         return offset - min(self._before, self._smallest)
 
 
-def _publisher(sample: Sample) -> str:
+def _publisher(sample: Sample[Any]) -> str:
     """Return the session that stamped a sample; a restarted publisher may have another clock."""
     return "" if sample.stamp is None else str(sample.stamp.get_id())

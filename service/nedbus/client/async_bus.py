@@ -9,17 +9,16 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, overload
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Definition, Selection, vehicle_name
+from nedbus_msgs import ANY, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
 from .bus import Bus, connect_with
-from .by_topic import by_topic_async, last_async
 from .publishing.publisher import Publisher
-from .sample import Mode
+from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
 
 _WAKE_INTERVAL: Final = 1.0  # s between checks for Ctrl-C while connecting
@@ -76,18 +75,27 @@ class AsyncBus:
         """The endpoints of the routers."""
         return self._blocking.routers
 
-    @by_topic_async
+    @overload
+    def subscribe(
+        self, message: type[M_co], *, topic: str = ..., **options: Unpack[Subscribe]
+    ) -> AsyncSubscription[M_co]: ...
+    @overload
+    def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
+    @overload
+    def subscribe(self, **options: Unpack[Subscribe]) -> AsyncSubscription[VehicleLocalPosition]: ...
     def subscribe(
         self,
-        topic: str = DEFAULT_TOPIC,
+        message: type[Message] | str = VehicleLocalPosition,
         *,
+        topic: str | None = None,
         vehicle: str | int = ANY,
         instance: int | None = None,
         mode: Mode = "latest",
         max_rate: float | None = None,
     ) -> AsyncSubscription[Any]:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens with the first wait."""
-        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
+        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
+        return self.subscribe_to(selection, mode=mode, max_rate=max_rate)
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -98,7 +106,18 @@ class AsyncBus:
         open_receiver = partial(self._in_thread, bus._open_receiver, selection, pending_queue)
         return AsyncSubscription(open_receiver, pending_queue)
 
-    latest = last_async(_awaited(Bus.latest))
+    @overload
+    async def latest(
+        self, message: type[M_co], *, topic: str = ..., **options: Unpack[Query]
+    ) -> list[Sample[M_co]]: ...
+    @overload
+    async def latest(self, message: str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
+    @overload
+    async def latest(self, **options: Unpack[Query]) -> list[Sample[VehicleLocalPosition]]: ...
+    async def latest(self, *message: Any, **options: Any) -> Any:
+        """Query the last sample of each key; see `Bus.latest`."""
+        return await self._in_thread(self._blocking.latest, *message, **options)
+
     vehicles = _awaited(Bus.vehicles)
     publishers = _awaited(Bus.publishers)
     services = _awaited(Bus.services)

@@ -10,15 +10,14 @@ from functools import partial
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack, overload
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import AccountReport
 from nedbus.settings import Settings, load_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Definition, Selection, vehicle_name
+from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
-from .by_topic import by_topic, last
 from .closing import Finalizer
 from .discovery import (
     Publishers,
@@ -36,15 +35,15 @@ from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .rate_gate import check_max_rate, rate_step
 from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
-from .sample import Mode, Sample
+from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
 
 class Bus:
     """A connection to a router, from `connect`.
 
-    Topics and vehicles are selected by name, instances by number; "*" and None match any. Vehicle 7 is vehicle "7".
-    The default topic is vehicle_local_position.
+    Topics are selected by message class or by name, vehicles by name, instances by number; "*" and None match any.
+    Vehicle 7 is vehicle "7". The default is VehicleLocalPosition on vehicle_local_position.
     Thread-safe. Methods raise AddressError for an invalid name, and ClosedError once the bus is closed.
     """
 
@@ -70,11 +69,19 @@ class Bus:
         """True if the bus is connected to a router."""
         return bool(self._session.info.routers_zid())
 
-    @by_topic
+    @overload
+    def subscribe(
+        self, message: type[M_co], *, topic: str = ..., **options: Unpack[Subscribe]
+    ) -> Subscription[M_co]: ...
+    @overload
+    def subscribe(self, message: str, **options: Unpack[Subscribe]) -> Subscription[Message]: ...
+    @overload
+    def subscribe(self, **options: Unpack[Subscribe]) -> Subscription[VehicleLocalPosition]: ...
     def subscribe(
         self,
-        topic: str = DEFAULT_TOPIC,
+        message: type[Message] | str = VehicleLocalPosition,
         *,
+        topic: str | None = None,
         vehicle: str | int = ANY,
         instance: int | None = None,
         mode: Mode = "latest",
@@ -82,7 +89,8 @@ class Bus:
     ) -> Subscription[Any]:
         """Return a subscription to iterate over, which starts with the last message of each key.
 
-        The type of messages depends on the topic: "vehicle_attitude" has VehicleAttitude, "*" has all types.
+        `message`: a class, such as VehicleAttitude, whose fields type checkers then know; its first topic, or the one
+        of its topics in `topic`, such as "estimator_attitude". Or the name of a topic, or "*" for all.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
         about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
@@ -93,7 +101,8 @@ class Bus:
 
         Raises ConfigError if `max_rate` is not a finite number above 0.
         """
-        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
+        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
+        return self.subscribe_to(selection, mode=mode, max_rate=max_rate)
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -103,16 +112,28 @@ class Bus:
         receiver = self._open_receiver(selection, pending_queue)
         return Subscription(receiver, pending_queue, owner=self)
 
-    @last
+    @overload
+    def latest(self, message: type[M_co], *, topic: str = ..., **options: Unpack[Query]) -> list[Sample[M_co]]: ...
+    @overload
+    def latest(self, message: str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
+    @overload
+    def latest(self, **options: Unpack[Query]) -> list[Sample[VehicleLocalPosition]]: ...
     def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
+        self,
+        message: type[Message] | str = VehicleLocalPosition,
+        *,
+        topic: str | None = None,
+        vehicle: str | int = ANY,
+        instance: int | None = None,
+        timeout: float = 2.0,
     ) -> list[Sample[Any]]:
-        """Query the last sample of each key, sorted by address; its `latency` is its age.
+        """Query the last sample of each key, sorted by address; its `latency` is its age. Topics as in `subscribe`.
 
         Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and left out.
         Samples from a storage have `stored` set, and are only returned without a reply of the publisher.
         """
-        key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
+        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
+        key_expr = selection.key_expr(prefix=self.prefix)
         decoder = Decoder(self._layouts, prefix=self.prefix)
         samples: list[Sample[Any]] = []
         answers = query(self._session, key_expr, timeout=timeout, newest=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Generic, Literal
+from typing import TYPE_CHECKING, Final, Generic, Literal, TypedDict
 
 from typing_extensions import TypeVar
 
@@ -14,6 +14,24 @@ if TYPE_CHECKING:
 
 Mode = Literal["latest", "every"]  # a slow reader gets the newest message of each key, or every message
 M_co = TypeVar("M_co", bound=Message, default=VehicleLocalPosition, covariant=True)
+
+
+class Query(TypedDict, total=False):
+    """Options of `latest`."""
+
+    vehicle: str | int
+    instance: int | None
+    timeout: float
+
+
+class Subscribe(TypedDict, total=False):
+    """Options of `subscribe`."""
+
+    vehicle: str | int
+    instance: int | None
+    mode: Mode
+    max_rate: float | None
+
 
 _UNKNOWN: Final = Provenance()
 

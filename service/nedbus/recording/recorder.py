@@ -6,7 +6,7 @@ import threading
 import time
 from itertools import repeat
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from nedbus.client import Batch, Subscription
 from nedbus.errors import ClosedError, NoDataError
@@ -24,7 +24,7 @@ class Recorder:
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
     """
 
-    def __init__(self, subscription: Subscription, path: Path) -> None:
+    def __init__(self, subscription: Subscription[Any], path: Path) -> None:
         check_recording(path)
         self._subscription = subscription
         self._writer = RecordingWriter(path)

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
+from typing import Any
 
 import pytest
 import zenoh
@@ -44,7 +45,7 @@ async def until_waiting(publisher: nedbus.AsyncPublisher) -> None:
 
 
 @pytest.fixture
-def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[nedbus.VehicleLocalPosition]]:
+def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
     """Subscribe without reading."""
     with bus.subscribe(VLP, mode="every") as subscription:
         yield subscription

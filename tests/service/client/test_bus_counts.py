@@ -171,7 +171,7 @@ def test_invalid_payload_never_ends_an_iteration(
     raw.delete(KEY)
     raw.put(f"nedbus/2/{VLP}", good)
     sample = subscription.receive(DEADLINE)
-    assert (sample.vehicle, sample.message.x, sample.sent) == ("2", 1.0, None)
+    assert (sample.vehicle, sample.message, sample.sent) == ("2", message(2, x=1.0), None)
     assert subscription.counts == Counts(received=2, invalid=7)
     warned = warnings(caplog)
     assert len(warned) == len({text.split(":")[0] for text in warned}), "each key is named once"
@@ -209,7 +209,7 @@ def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, ca
         asked.append(query)
         reply(query)
 
-    subscription = client.subscribe(VLP, mode="every")
+    subscription = client.subscribe(mode="every")
     wait_for_reader(raw, KEY)
     with answering(raw, SCHEMA, count), repeating(lambda: raw.put(KEY, msgpack.packb([9, 4, True, 2.5]))):
         taken = list(islice(subscription, 2))
@@ -226,7 +226,7 @@ def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, raw: Session
     schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)
     with answering(raw, SCHEMA, schema), answering(raw, KEY, last):
-        assert [(each.message.timestamp, each.message.x) for each in client.latest(VLP)] == [(4, 2.5)]
+        assert [(each.message.timestamp, each.message.x) for each in client.latest()] == [(4, 2.5)]
 
 
 @pytest.mark.parametrize(

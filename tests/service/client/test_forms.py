@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
-from typing import cast
+from typing import Any, cast
 
 import msgpack
 import numpy as np
@@ -27,7 +27,7 @@ COUNT = 900  # fewer than half a window: here one thread publishes and reads
 
 
 @pytest.fixture
-def subscription(endpoint: str) -> Iterator[nedbus.Subscription]:
+def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
     """Subscribe to everything; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
@@ -40,7 +40,7 @@ def take_batches(batches: Iterator[Batch], count: int) -> list[Batch]:
     return taken
 
 
-def test_rows_are_the_messages(subscription: nedbus.Subscription, bus: nedbus.Bus) -> None:
+def test_rows_are_the_messages(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
     """Rows are named tuples with the published values, in order and complete."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
@@ -55,7 +55,7 @@ def test_rows_are_the_messages(subscription: nedbus.Subscription, bus: nedbus.Bu
     assert subscription.counts == nedbus.Counts(received=len(sent))
 
 
-def test_batches_hold_everything(subscription: nedbus.Subscription, bus: nedbus.Bus) -> None:
+def test_batches_hold_everything(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
     """Arrays have the published values, with address, sequence number and time of each message."""
     messages = to_array([message(number, x=number / 3) for number in range(1, COUNT)])
     for vehicle in ("1", "2"):
@@ -77,7 +77,7 @@ def test_batches_hold_everything(subscription: nedbus.Subscription, bus: nedbus.
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_closing_waits_for_readers(subscription: nedbus.Subscription, bus: nedbus.Bus, whole_bus: bool) -> None:
+def test_closing_waits_for_readers(subscription: nedbus.Subscription[Any], bus: nedbus.Bus, whole_bus: bool) -> None:
     """A lossless publisher closes, alone or with its bus, once a reader that pauses has received everything."""
     count = 3 * WINDOW
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)

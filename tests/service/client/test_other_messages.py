@@ -22,6 +22,7 @@ from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, d
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import run_command
+from tests.peers.processes import Start
 from tests.service.delivery.downsampling import MS, Clock, clock, wait_for_demand
 from tests.service.delivery.lossy import LossyQueue
 from tests.service.delivery.publishing import take, wait_for_subscriber
@@ -215,12 +216,64 @@ def test_script_publishes_a_message_of_its_own(client: nedbus.Bus, endpoint: str
     with nedbus.connect(endpoint) as reader, reader.subscribe("range_beacon", vehicle="mine") as subscription:
         publisher = client.publisher("range_beacon", vehicle="mine", definition=definition)
         publisher.publish({"timestamp": 5, "range": 2.5, "beacon": 3})
-        [received] = [subscription.receive(DEADLINE).message]
-        assert (received.timestamp, received.range, received.beacon) == (5, 2.5, 3)
+        assert dict(subscription.receive(DEADLINE).message) == {"timestamp": 5, "range": 2.5, "beacon": 3}
         with pytest.raises(nedbus.InvalidMessageError, match="range"):
             publisher.publish({"timestamp": 6, "range": 200.0, "beacon": 3})
     with pytest.raises(nedbus.AddressError, match=r"expected a definition from nedbus\.define_msg, or one of "):
         client.publisher("other_beacon", vehicle="mine")
+
+
+@pytest.mark.parametrize("topic", [None, "vehicle_attitude_groundtruth"])
+def test_subscription_by_class(client: nedbus.Bus, bus: nedbus.Bus, topic: str | None) -> None:
+    """A class selects its first topic, or another one of its topics by name, for `subscribe` and `latest`."""
+    chosen, options = topic or ATTITUDE.topic, dict[str, Any](topic=topic) if topic else {}
+    for number, each in enumerate(["vehicle_attitude", "vehicle_attitude_groundtruth", "estimator_attitude"]):
+        instance = 0 if each == "estimator_attitude" else None
+        bus.publisher(each, vehicle="7", instance=instance).publish(make(ATTITUDE, number))
+    wait_for(lambda: client.latest("*") and len(client.latest("*")) == 3, what="the messages")
+    sample = client.subscribe(nedbus.VehicleAttitude, **options).receive(DEADLINE)
+    [last] = client.latest(nedbus.VehicleAttitude, **options)
+    assert (sample.topic, sample.message, last.message) == (chosen, last.message, sample.message)
+
+
+def test_class_without_the_topic_raises(client: nedbus.Bus) -> None:
+    """A topic of another message, or a class without topics, raises an error that says what to do."""
+    undeclared = nedbus.define_msg("RangeBeacon", "uint64 timestamp\n").model
+    for call in (client.subscribe, client.latest):
+        with pytest.raises(nedbus.AddressError, match="expected one of VehicleAttitude: vehicle_attitude, "):
+            call(nedbus.VehicleAttitude, topic=VLP)
+        for without in (undeclared, Message):
+            with pytest.raises(nedbus.AddressError, match=f"'{without.__name__}' .* TOPICS, or the name of a topic"):
+                call(without)
+
+
+OWN_CLASS = """
+import signal, sys, nedbus
+from nedbus_msgs.model.px4_types import Float32x2, field
+
+class WheelSpeeds(nedbus.Message):
+    "Speeds of a rover's wheels."
+
+    TOPICS = (nedbus.Topic("wheel_speeds", 50.0, "a rover"),)
+    speed: Float32x2 = field("Speeds [rad/s]")
+
+with nedbus.connect(sys.argv[1]) as bus, bus.publisher("wheel_speeds", vehicle=1) as publisher:
+    publisher.publish(WheelSpeeds(timestamp=1, speed=(2.0, 3.0)))
+    with nedbus.connect(sys.argv[1]) as reader:
+        received = reader.subscribe(WheelSpeeds).receive(30).message, reader.latest(WheelSpeeds)[0].message
+    for message in received:
+        print(repr(message), flush=True)
+    signal.pause()
+"""
+
+
+@pytest.mark.process
+def test_class_of_a_script_is_subscribed_to(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A script's own class is read as that class, and by others, without the class, with the same fields."""
+    process = start("-c", OWN_CLASS, endpoint)
+    wait_for(lambda: process.out.count("\n") == 2 or process.err, what="the script")
+    assert process.out == 2 * "WheelSpeeds(timestamp=1, speed=(2.0, 3.0))\n", process.err
+    assert dict(bus.subscribe("wheel_speeds").receive(DEADLINE).message) == {"timestamp": 1, "speed": (2.0, 3.0)}
 
 
 def test_line_says_what_was_lost_before_what_has_no_room() -> None:

@@ -37,7 +37,7 @@ def test_stream_in_another_process(run_nedbus: Start, tmp_path: Path) -> None:
     service = run_nedbus("serve", "--listen", endpoint, "--http", pages.where, "--source", source)
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
-        bus.subscribe("vehicle_local_position", vehicle="1", mode="every") as positions,
+        bus.subscribe(vehicle="1", mode="every") as positions,
         Px4LogStream(read_recording(SHORT), port) as peer,
     ):
         wait_for(peer.finished.is_set, what="the end of the recording")
@@ -73,7 +73,7 @@ def test_refused_stream_is_explained(run_nedbus: Start) -> None:
     service = run_nedbus("serve", "--listen", endpoint, "--source", f"mavlink:udpin:127.0.0.1:{port}?log=1")
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
-        bus.subscribe("vehicle_local_position", vehicle="1", mode="every") as positions,
+        bus.subscribe(vehicle="1", mode="every") as positions,
         Px4LogStream(read_recording(SHORT), port, refusal=1),
     ):
         wait_for(lambda: (log := log_stream(bus)) and log.state == "refused", what=f"the refusal: {service.err}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 from playwright.sync_api import Browser
@@ -98,7 +98,7 @@ def wait_for_event(process: Process, vehicle: str, kind: str, change: str) -> No
     wait_for(lambda: (vehicle, kind, change) in told_by(process), what=f"{vehicle} {kind} {change}", seconds=PATIENCE)
 
 
-def freeze(process: Process, subscription: nedbus.Subscription, messages: int) -> None:
+def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: int) -> None:
     """Stop a process for as long as a vehicle sends this many messages."""
     process.signal(signal.SIGSTOP)
     try:

@@ -6,6 +6,7 @@ import socket
 import threading
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
 import pytest
 
@@ -102,7 +103,7 @@ def wait_for_demand(publisher: nedbus.Publisher) -> None:
     wait_for(partial(is_wanted, publisher), what="the demand for a downsampled stream")
 
 
-def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription) -> None:
+def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any]) -> None:
     """Wait until a subscription is open and matched: take message 0, which was published before.
 
     The last message is queried, and one published meanwhile may be overtaken by the reply.

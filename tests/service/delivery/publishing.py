@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import zenoh
@@ -40,6 +40,6 @@ def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
     wait_for(partial(is_read, publisher), what=f"a subscriber of {publisher.key}")
 
 
-def take(subscription: nedbus.Subscription, count: int) -> list[int]:
+def take(subscription: nedbus.Subscription[Any], count: int) -> list[int]:
     """Wait for `count` messages, and return their timestamps."""
     return [subscription.receive(DEADLINE).message.timestamp for _ in range(count)]

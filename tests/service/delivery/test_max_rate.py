@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import closing, suppress
+from typing import Any
 
 import pytest
 import zenoh
@@ -161,8 +162,8 @@ def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> N
 
 
 def publish_over_a_break(
-    publisher: nedbus.Publisher, subscription: nedbus.Subscription, clock: Clock, link: Link, seconds: int
-) -> list[nedbus.Sample]:
+    publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any], clock: Clock, link: Link, seconds: int
+) -> list[nedbus.Sample[Any]]:
     """Publish 1 s of 100 Hz, the rest while the link is down and after; return all that arrived until a later one."""
     take_last(publisher, subscription)
     taken = []
@@ -183,7 +184,7 @@ def publish_over_a_break(
         publish(publisher, clock, end, 1)
         with suppress(nedbus.NoDataError):
             taken.append(subscription.receive(0.01))
-        return taken[-1].message.timestamp > last
+        return bool(taken[-1].message.timestamp > last)
 
     wait_for(publish_one_and_take, what="a message from after the break")
     return taken

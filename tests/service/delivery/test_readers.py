@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Any
 
 import psutil
 import pytest
@@ -49,7 +50,7 @@ with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mo
 """
 
 
-def subscribe(endpoint: str) -> Iterator[nedbus.Subscription]:
+def subscribe(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
     """Open a reader; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
@@ -72,7 +73,7 @@ def publish_all(
 
 
 def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
-    stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
+    stuck: nedbus.Subscription[Any], reader: nedbus.Subscription[Any], bus: nedbus.Bus
 ) -> None:
     """While a reader reads nothing, a window is sent at once and then a trickle for others; both get everything."""
     publisher, sending = publish_all(bus)
@@ -170,7 +171,7 @@ def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: ned
 def test_reader_that_dies_is_given_up(
     start: Start,
     endpoint: str,
-    reader: nedbus.Subscription,
+    reader: nedbus.Subscription[Any],
     bus: nedbus.Bus,
     monkeypatch: pytest.MonkeyPatch,
     *,
@@ -189,7 +190,7 @@ def test_reader_that_dies_is_given_up(
 
 
 def test_flush_waits_for_arrival_and_not_for_scripts(
-    stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
+    stuck: nedbus.Subscription[Any], reader: nedbus.Subscription[Any], bus: nedbus.Bus
 ) -> None:
     """A flush waits for messages to arrive at readers, not for scripts to read them."""
     publisher, sending = publish_all(bus, count=WINDOW // 2)

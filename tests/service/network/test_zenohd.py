@@ -11,6 +11,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -94,7 +95,7 @@ def test_storage_keeps_what_a_vehicle_sent_last(start: Start, tmp_path: Path, ze
         subscription = reader.subscribe(VLP, mode="every")
         ahead = vehicle.new_timestamp().get_time() + dt.timedelta(hours=1)
         timestamps = itertools.count(1)
-        received: list[nedbus.Sample] = []
+        received: list[nedbus.Sample[Any]] = []
         stamps: list[zenoh.Timestamp] = []
 
         def are_both_there() -> bool:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -89,7 +89,7 @@ class Px4:
 
 
 @pytest.fixture
-def every(bus: nedbus.Bus) -> Iterator[nedbus.Subscription]:
+def every(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
     """Receive every message of all topics that the service publishes."""
     with bus.subscribe(ANY, mode="every") as subscription:
         yield subscription
@@ -359,7 +359,9 @@ def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:
     assert any("update nedbus" in each.reason for each in listener.rejections)
 
 
-def test_invalid_messages_are_reported(serve: Callable[[], Process], raw: Session, every: nedbus.Subscription) -> None:
+def test_invalid_messages_are_reported(
+    serve: Callable[[], Process], raw: Session, every: nedbus.Subscription[Any]
+) -> None:
     """A payload that is CDR but violates the rules is reported with its reason, as from any source."""
     serve()
     reports = raw.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
