@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from typing import Any, Final
 
 from nedbus.client import Sample
@@ -19,13 +18,9 @@ _STALLED: Final = 1000  # ns; timestamps closer together come from a stalled clo
 
 
 class LateFilter:
-    """Pass the current samples of each address, and count the late ones.
+    """Pass the current samples of each address, and count the late ones, and retained ones, whose age is unknown."""
 
-    `last`: the latest samples at start-up; they are held back because their age is unknown.
-    """
-
-    def __init__(self, last: Iterable[Sample[Any]] = ()) -> None:
-        self._last = {sample.address: (_publisher(sample), sample.sent) for sample in last}
+    def __init__(self) -> None:
         self._clocks: dict[Address, tuple[str, PublisherClock]] = {}
         self._held = Counter[Address]()
         self._latest = 0  # ns, greatest lateness among these
@@ -39,7 +34,7 @@ class LateFilter:
         if sent is None:
             return True
         known, clock = self._clocks.get(address, ("", None))
-        if clock is not None or (publisher, sent) != self._last.pop(address, None):
+        if not sample.retained:
             if clock is None or known != publisher:
                 clock = PublisherClock(sent, arrived)
                 self._clocks[address] = publisher, clock

@@ -32,7 +32,6 @@ from nedbus.transport import (
     while_open,
 )
 from nedbus_msgs import (
-    ANY,
     BY_TOPIC,
     DEFAULT,
     RELEASES,
@@ -123,8 +122,6 @@ class Ros2Bridge:
         try:
             if self._observer is not None:
                 self._require_visible(self._observer, key, stop)
-            # Messages from before the start must not reach ROS 2 as the current estimate.
-            self._late_filter = LateFilter(self._bus.latest(ANY))
             with self._bus.subscribe_to(self._selection, mode="every") as subscription:
                 self._forward(subscription, stop)
         finally:

@@ -138,6 +138,7 @@ class Bus:
         samples: list[Sample[Any]] = []
         answers = query(self._session, key_expr, timeout=timeout, newest=False)
         for raw, sample in decoder.read(answers):
+            sample.retained = True
             sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
             samples.append(sample)
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))

@@ -46,6 +46,8 @@ class Sample(Generic[M_co]):
     `stamp`: Zenoh's timestamp with its clock id; None if the publisher sent none, and in copies.
     `lost`: messages of this key lost in transit just before this one.
     `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
+    `retained`: True if it was published before the subscription, which begins with the last message of each publisher;
+    also from `bus.latest()`.
     `stored`: True if it came from a storage, as no publisher answered for the address; `bus.latest()` only.
     """
 
@@ -55,6 +57,7 @@ class Sample(Generic[M_co]):
     stamp: zenoh.Timestamp | None = None
     lost: int = 0
     provenance: Provenance = _UNKNOWN
+    retained: bool = False
     stored: bool = False
     _sent: int | None = None  # in copies, as Zenoh's timestamp cannot be pickled
 
@@ -108,7 +111,8 @@ class Sample(Generic[M_co]):
         return type(self), self._state()
 
     def _state(self) -> tuple[object, ...]:
-        return self.message, self.address, self.received, None, self.lost, self.provenance, self.stored, self.sent
+        flags = self.retained, self.stored
+        return self.message, self.address, self.received, None, self.lost, self.provenance, *flags, self.sent
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,6 @@ _MAX_WAITING: Final = 200  # queued messages that do not yet count as falling be
 _MAX_LAG: Final = 1.0  # s worth of queued messages that do not yet count as falling behind
 _MAX_PAUSE: Final = 2.5  # s between two polls; after a longer pause this process itself was stalled
 _SETTLING_TIME: Final = 3.0  # s after a reconnect until delayed messages have arrived
-_MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one belongs to a stream that has ended
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +54,11 @@ class Observer:
         self._lock = threading.Lock()  # while a sample is added, its stream is briefly missing from the monitor
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample just read; the account ignores the cached last sample of a stream that ended long ago."""
+        """Add a sample just read; a retained one is ignored, as its stream may have ended long ago."""
         with self._lock:
-            is_known = self.monitor.add(sample)
-        now = clock.steady()
-        if is_known or sample.sent is None or now - sample.sent / 1e9 <= _MAX_AGE:
-            missing = sample.provenance.missing
+            counts = self.monitor.add(sample)
+        if counts:
+            missing, now = sample.provenance.missing, clock.steady()
             self.account.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
 
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:

@@ -58,13 +58,14 @@ def raw(
     payload: Payload | None = None,
     encoding: str = SOURCE,
     stamp: object = None,
+    congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.DROP,
 ) -> RawSample:
     """Return a sample with a publisher's sequence number, None for a sample without one."""
     info = None if number is None else source_info(number, publisher)
     if payload is None:
         payload = VALID if timestamp == 1 else Payload(encode(message(timestamp)))
     read = {"payload": payload, "key_expr": key, "source_info": info, "encoding": encoding, "timestamp": stamp}
-    return cast("RawSample", Raw(**read, kind=zenoh.SampleKind.PUT))
+    return cast("RawSample", Raw(**read, kind=zenoh.SampleKind.PUT, congestion_control=congestion_control))
 
 
 def junk(payload: bytes, key: str = KEY) -> RawSample:

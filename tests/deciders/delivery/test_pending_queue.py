@@ -47,6 +47,18 @@ from .raw_samples import (
 STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 
 
+@pytest.mark.parametrize("mode", ["latest", "every"])
+def test_first_reply_of_a_publisher_is_retained(mode: Mode) -> None:
+    """A reply to the query for the last message is retained, a live message is not, whatever its congestion control."""
+    pending_queue, block, drop = make_queue(mode), zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
+    arriving = [(4, "a", block), (5, "a", block), (6, "a", drop), (1, "b", drop), (2, "b", block)]
+    seen = []
+    for number, publisher, control in arriving:
+        put(pending_queue, [raw(number, publisher=publisher, congestion_control=control)])
+        seen += [sample.retained for sample in drain(pending_queue)]
+    assert seen == [True, False, False, False, False]
+
+
 @pytest.mark.parametrize(
     ("mode", "arriving", "told", "counts"),
     [

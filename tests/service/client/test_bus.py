@@ -29,7 +29,7 @@ from nedbus_msgs import DEFAULT, Address, encode
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
 from tests.service.commands.answering import answering, reply_with
-from tests.service.delivery.downsampling import Link
+from tests.service.delivery.downsampling import Link, wait_for_demand
 from tests.service.delivery.publishing import publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
 
@@ -51,6 +51,22 @@ def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mo
     assert sample.sent is not None
     assert abs(sample.received - time.time_ns()) < 60e9
     assert sample.latency is not None
+
+
+@pytest.mark.parametrize("max_rate", [None, 50])
+@pytest.mark.parametrize("mode", BOTH)
+def test_retained_sample(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_rate: float | None) -> None:
+    """The message from before a subscription is retained, also in a pickle and from `latest`; the next one is not."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+    subscription = client.subscribe(mode=mode, max_rate=max_rate)
+    first = subscription.receive(DEADLINE)
+    wait_for_subscriber(publisher) if max_rate is None else wait_for_demand(publisher)
+    publish(publisher, 2)
+    second = subscription.receive(DEADLINE)
+    assert [(each.message.timestamp, each.retained) for each in (first, second)] == [(1, True), (2, False)]
+    assert pickle.loads(pickle.dumps(first)).retained
+    assert [each.retained for each in client.latest()] == [True]
 
 
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:

@@ -220,16 +220,25 @@ def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_monitor_is_bounded() -> None:
     """In a flood of keys the 4096 most recent streams are kept, and never displace one that is still sending."""
     monitor, real = Monitor(), sample("real")
-    monitor.add(real)
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
     for junk in flood:
-        assert not monitor.add(junk)
-        assert monitor.add(real)
-    assert list(monitor.snapshot()) == [real.address]
-    assert monitor.add(flood[-4095])
-    assert not monitor.add(flood[-4096])
+        monitor.add(junk)
+        monitor.add(real)
+    kept = monitor.snapshot()
+    assert (len(kept), kept[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
+    assert flood[-4095].address in kept
+    assert flood[-4096].address not in kept
     monitor.forget(real.address)
     assert real.address not in monitor.snapshot()
+
+
+def test_retained_sample_does_not_count() -> None:
+    """A retained sample may be of any age: the stream is measured from the next one on."""
+    monitor, first = Monitor(), sample("1")
+    assert not monitor.add(dataclasses.replace(first, retained=True))
+    assert monitor.snapshot() == {}
+    assert monitor.add(first)
+    assert monitor.snapshot()[first.address].messages == 1
 
 
 def test_states_have_reasons() -> None:

@@ -251,37 +251,35 @@ class StreamHealth:
 class Monitor:
     """Measure all streams of a subscription, at most 4096; beyond, the least recently updated one is evicted.
 
-    The first sample of each address does not count: it may be a last value sent on subscribing.
+    Retained samples do not count.
     `evicted`: the number of evicted streams.
     """
 
     def __init__(self) -> None:
         self.evicted = 0
-        self._streams: dict[Address, StreamHealth | None] = {}  # least recently updated first
+        self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
         """Add a sample received now, or at `received` [ns] of another clock; return True if it counts."""
-        address = sample.address
-        known = address in self._streams
+        if sample.retained:
+            return False
+        address, now = sample.address, time.monotonic_ns() if received is None else received
         stream = self._streams.pop(address, None)
-        if known:
-            stream = stream or StreamHealth(sample.topic)
-            now = time.monotonic_ns() if received is None else received
-            lacking = sample.provenance.missing
-            stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=lacking)
-        elif len(self._streams) >= _MAX_STREAMS:
+        if stream is None and len(self._streams) >= _MAX_STREAMS:
             if not self.evicted:
                 text = "more than %d streams: the health of those that are silent longest is forgotten"
                 _log.warning(text, _MAX_STREAMS, extra=about("incomplete"))
             self.evicted += 1
             del self._streams[next(iter(self._streams))]
-        self._streams[address] = stream
-        return known
+        self._streams[address] = stream = StreamHealth(sample.topic) if stream is None else stream
+        lacking = sample.provenance.missing
+        stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=lacking)
+        return True
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
         """Return the health of each stream, sorted by address, now or at `now` [ns] of the other clock."""
         streams = sorted(self._streams.items(), key=itemgetter(0))
-        return {address: stream.snapshot(now) for address, stream in streams if stream is not None}
+        return {address: stream.snapshot(now) for address, stream in streams}
 
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latency histogram of a stream since the start [s]; None for an unknown stream."""

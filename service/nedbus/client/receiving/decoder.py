@@ -83,6 +83,7 @@ class DetachedSample(NamedTuple):
     timestamp: zenoh.Timestamp | None
     source_info: zenoh.SourceInfo | None
     encoding: str
+    retained: bool
 
 
 Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int]
@@ -166,7 +167,8 @@ class Decoder:
         if known is not encoding:
             provenance = provenance_of(codec.definition, encoding)
             stream.provenance = encoding, provenance
-        return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, provenance)
+        retained = isinstance(raw, DetachedSample) and raw.retained
+        return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, provenance, retained)
 
     def count_invalid(self, count: int) -> None:
         """Add to the count of invalid samples."""
@@ -196,12 +198,22 @@ class Decoder:
             self._layouts.check(codec, payload)
 
 
-def detach(arrival: Arrival) -> Arrival:
-    """Return an arrival without a reference to Zenoh's receive buffer."""
+def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:
+    """Return an arrival without a reference to Zenoh's receive buffer; `retained`: it predates the subscription."""
     stream, payload, raw, lost = arrival
     if isinstance(raw, DetachedSample):
         return arrival
-    return stream, payload, DetachedSample(raw.timestamp, raw.source_info, encoding_of(stream, raw)), lost
+    return stream, payload, DetachedSample(raw.timestamp, raw.source_info, encoding_of(stream, raw), retained), lost
+
+
+def mark_retained(arrival: Arrival) -> Arrival:
+    """Return the first arrival of a publisher, marked as retained if Zenoh's history query returned it.
+
+    Only replies to queries have that congestion control: publishers of nedbus drop.
+    """
+    raw = arrival[2]
+    is_reply = not isinstance(raw, DetachedSample) and raw.congestion_control == zenoh.CongestionControl.BLOCK
+    return detach(arrival, retained=True) if is_reply else arrival
 
 
 def encoding_of(stream: KeyState, raw: RawSample | DetachedSample) -> str:

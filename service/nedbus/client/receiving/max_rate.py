@@ -22,7 +22,7 @@ from nedbus.log_event import about
 from nedbus.transport import AliveTokens, RawSample, Session, ask
 from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
 
-from .decoder import Arrival, Decoder
+from .decoder import Arrival, Decoder, detach
 from .pending_queue import PendingQueue
 from .receiver import Receiver
 
@@ -54,7 +54,7 @@ class MaxRateQueue(PendingQueue):
                 stream = self._stream(self._rate_key(arrival[0].address))
                 if arrival[1] and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
-                    self.account.delivered.append(arrival)
+                    self.account.delivered.append(detach(arrival, retained=True))
             super()._queue()
         self.wake()
 

@@ -24,7 +24,7 @@ from nedbus.log_event import about
 from nedbus.transport import RawSample, SourceInfo, entity_name
 from nedbus_msgs import AddressError, DecodeError, identity_of
 
-from .decoder import WAKE_UP, Arrival, Decoder, KeyState, detach, encoding_of
+from .decoder import WAKE_UP, Arrival, Decoder, KeyState, detach, encoding_of, mark_retained
 from .writer_proxy import NUMBERS, Account, WriterProxy
 
 if TYPE_CHECKING:
@@ -363,14 +363,17 @@ class PendingQueue:
             return
         now, recovers = self._clock(), not (self.newest_only or overflowed)
         delivered = self.account.delivered
-        for arrival in arrivals:
-            stream, payload, raw, _ = arrival
+        for admitted in arrivals:
+            stream, payload, raw, _ = arrival = admitted
             stream.heard = now
             info, writer = raw.source_info, stream.writer
             if info is not None:
                 source = info.source_id
                 if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than names
                     writer = self._writer_of(stream, info, recovers=recovers)
+                    if writer is not None:
+                        arrival = arrival if writer.eid is not None else mark_retained(arrival)
+                        writer.zid, writer.eid = source.zid, source.eid
             if info is None or writer is None:
                 if payload:
                     delivered.append(arrival)
@@ -411,8 +414,6 @@ class PendingQueue:
             first = 0 if recovers and self._settling else info.source_sn
             writer = self._add_writer(stream, name, first, history_end=info.source_sn)
         stream.writer = writer
-        if writer is not None:
-            writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
         return writer
 
     def _add_writer(self, stream: KeyState, name: str, expected: int, *, history_end: int) -> WriterProxy | None:
