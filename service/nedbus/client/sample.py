@@ -42,7 +42,7 @@ class Sample(Generic[M_co]):
 
     `message`: the validated message; from `rows()`, a Row with the same fields.
     `address`: vehicle, topic and instance, also available as attributes.
-    `received`: time of decoding, ns since the epoch.
+    `received`: time at which it left Zenoh's ring, ns since the epoch by this host's clock: not when it was read.
     `stamp`: Zenoh's timestamp with its clock id; None if the publisher sent none, and in copies.
     `lost`: messages of this key lost in transit just before this one.
     `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
@@ -96,7 +96,7 @@ class Sample(Generic[M_co]):
 
     @property
     def latency(self) -> float | None:
-        """Seconds from sending to receiving, None without a timestamp; includes the offset between the two clocks."""
+        """Seconds from `sent` to `received`, None without a timestamp; includes the offset between the two clocks."""
         sent = self.sent
         return None if sent is None else (self.received - sent) / 1e9
 

@@ -8,6 +8,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
+from nedbus import clock
 from nedbus.client import Batch, Subscription
 from nedbus.errors import ClosedError, NoDataError
 
@@ -67,13 +68,13 @@ class Recorder:
             raise NoDataError(self._subscription.name, time.monotonic() - start)
 
     def _write(self, batch: Batch) -> None:
-        received = batch.received
+        now = clock.utc_ns()  # messages recovered late keep their order
         addresses = (batch.addresses[index] for index in batch.address_index.tolist())
         self._writer.write(
             batch.messages,
             batch.message.DEFINITION,
             zip(addresses, batch.provenances, strict=True),
-            logged=repeat(received),
-            published=[time if time > 0 else received for time in batch.sent.tolist()],
+            logged=repeat(now),
+            published=[time if time > 0 else now for time in batch.sent.tolist()],
             sequence=batch.sequence.tolist(),
         )

@@ -69,6 +69,24 @@ def test_retained_sample(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_ra
     assert [each.retained for each in client.latest()] == [True]
 
 
+@pytest.mark.parametrize("mode", BOTH)
+def test_time_of_reading_does_not_count_as_latency(
+    client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`received` is when a sample left Zenoh's ring: a script that reads it late adds nothing to its latency."""
+    subscription, publisher = client.subscribe(mode=mode), bus.publisher(VLP, vehicle="1")
+    with suppress(nedbus.NoDataError):
+        subscription.receive(0.01)  # opens it, and starts the thread that empties the ring
+    wait_for_subscriber(publisher)
+    publish(publisher, 1)
+    wait_for(lambda: subscription.waiting, what="the message")
+    arrived = time.time_ns()
+    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: arrived + 3600 * 10**9)
+    sample = subscription.receive(DEADLINE)
+    assert sample.received <= arrived
+    assert sample.latency == (sample.received - (sample.sent or 0)) / 1e9
+
+
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
     """A publisher is known to the router before its first message, which a new reader else misses once in 300 times."""
     with nedbus.connect(endpoint) as other:

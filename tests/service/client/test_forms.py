@@ -67,7 +67,7 @@ def test_batches_hold_everything(subscription: nedbus.Subscription[Any], bus: ne
         own = np.concatenate([batch.of(Address(vehicle, VLP)) for batch in batches])
         assert own.tobytes() == messages.tobytes()
     for batch in batches:
-        assert len(batch) == len(batch.address_index) == len(batch.sent) == len(batch.sequence)
+        assert len(batch) == len(batch.address_index) == len(batch.sent) == len(batch.received) == len(batch.sequence)
         assert (batch.sent <= batch.received).all()
         assert (batch.sent > batch.received - 60e9).all()
         for place in range(len(batch.addresses)):

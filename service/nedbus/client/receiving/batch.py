@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from nedbus import clock
 from nedbus_msgs import DEFAULT, Address, Message, Provenance, codec_of, provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
@@ -23,7 +22,6 @@ class Batch:
     `messages`: structured array of shape (n,), one column per field: `messages["x"]`.
     `message`: type of the messages.
     `addresses`: distinct addresses. `address_index`: index into `addresses` for each message.
-    `received`: time of reading, ns since the epoch.
     `lost`: messages lost in transit before these, over all addresses.
     """
 
@@ -31,7 +29,6 @@ class Batch:
     message: type[Message]
     addresses: tuple[Address, ...]
     address_index: npt.NDArray[np.intp]
-    received: int
     lost: int
     _arrivals: Sequence[Arrival] = field(repr=False)
 
@@ -45,32 +42,36 @@ class Batch:
         return chosen
 
     @cached_property
+    def received(self) -> npt.NDArray[np.int64]:
+        """Time at which each message left Zenoh's ring, ns since the epoch by the clock of this host."""
+        return np.array([received for *_, received in self._arrivals], np.int64)
+
+    @cached_property
     def sent(self) -> npt.NDArray[np.int64]:
         """Time of sending of each message, ns since the epoch by the publisher's clock; 0 without a timestamp."""
-        stamps = (raw.timestamp for _, _, raw, _ in self._arrivals)
+        stamps = (raw.timestamp for _, _, raw, _, _ in self._arrivals)
         return np.array([stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps], np.int64)
 
     @cached_property
     def sequence(self) -> npt.NDArray[np.int64]:
         """Publisher's sequence number of each message; -1 without one."""
-        infos = (raw.source_info for _, _, raw, _ in self._arrivals)
+        infos = (raw.source_info for _, _, raw, _, _ in self._arrivals)
         return np.array([info.source_sn if info else -1 for info in infos], np.int64)
 
     @cached_property
     def provenances(self) -> list[Provenance]:
         """Provenance of each message: its source and the fields that the source did not provide."""
         definition = self.message.DEFINITION
-        return [provenance_of(definition, encoding_of(stream, raw)) for stream, _, raw, _ in self._arrivals]
+        return [provenance_of(definition, encoding_of(stream, raw)) for stream, _, raw, _, _ in self._arrivals]
 
 
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
-    received = clock.utc_ns()
     codec = decoder.codec(*arrivals[0][:3:2])  # may wait for a layout lookup
     definition = codec.definition if codec else DEFAULT
     blank = bytes(codec_of(definition).size)  # invalid stand-in for payloads of other layouts, decoded separately below
     own = codec.size if codec else -1
-    payloads = [payload if len(payload) == own else blank for _, payload, _, _ in arrivals]
+    payloads = [payload if len(payload) == own else blank for _, payload, _, _, _ in arrivals]
     arrays = arrays_of(definition)
     messages, valid = arrays.decode(b"".join(payloads))
     if not valid.all():
@@ -81,8 +82,8 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
                 valid[index] = True
         messages = messages[valid]
         arrivals = [arrivals[index] for index in np.flatnonzero(valid).tolist()]
-    keys = [stream.key for stream, _, _, _ in arrivals]
-    addresses = {stream.key: stream.address for stream, _, _, _ in arrivals}
+    keys = [stream.key for stream, *_ in arrivals]
+    addresses = {stream.key: stream.address for stream, *_ in arrivals}
     indices = {key: index for index, key in enumerate(addresses)}
     address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
-    return Batch(messages, definition.model, tuple(addresses.values()), address_index, received, lost, arrivals)
+    return Batch(messages, definition.model, tuple(addresses.values()), address_index, lost, arrivals)

@@ -86,8 +86,9 @@ class DetachedSample(NamedTuple):
     retained: bool
 
 
-Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int]
-"""An admitted message: its stream, its payload, empty if it was rejected, its metadata, and messages lost before it.
+Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int, int]
+"""An admitted message: its stream, its payload, empty if it was rejected, its metadata, messages lost before it, and
+the time at which it left Zenoh's ring [ns].
 
 A plain tuple: an object with names costs 0.1 us more per message, where a batch takes 0.3 us.
 """
@@ -114,6 +115,7 @@ class Decoder:
 
     def read(self, answers: Sequence[RawSample]) -> Iterator[tuple[RawSample, Sample[Any]]]:
         """Decode the valid samples of a query, each with its Zenoh sample; blocks for lookups of definitions."""
+        received = clock.utc_ns()
         opened = [(raw, str(raw.key_expr), raw.payload.to_bytes()) for raw in answers]
         for raw, key, payload in opened:
             with suppress(AddressError, DecodeError):
@@ -127,7 +129,7 @@ class Decoder:
             except (AddressError, DecodeError) as exc:
                 self.reject(key, exc, stream)
             else:
-                if sample := self.decode((stream, payload, raw, 0), rows=False):
+                if sample := self.decode((stream, payload, raw, 0, received), rows=False):
                     yield raw, sample
 
     def codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
@@ -146,7 +148,7 @@ class Decoder:
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
         """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
-        stream, payload, raw, _ = arrival
+        stream, payload, raw, _, received = arrival
         if not payload:
             return None
         codec = stream.codec or self.codec(stream, raw)
@@ -168,7 +170,7 @@ class Decoder:
             provenance = provenance_of(codec.definition, encoding)
             stream.provenance = encoding, provenance
         retained = isinstance(raw, DetachedSample) and raw.retained
-        return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, provenance, retained)
+        return Sample(message, stream.address, received, raw.timestamp, lost, provenance, retained)
 
     def count_invalid(self, count: int) -> None:
         """Add to the count of invalid samples."""
@@ -200,10 +202,11 @@ class Decoder:
 
 def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:
     """Return an arrival without a reference to Zenoh's receive buffer; `retained`: it predates the subscription."""
-    stream, payload, raw, lost = arrival
+    stream, payload, raw, lost, received = arrival
     if isinstance(raw, DetachedSample):
         return arrival
-    return stream, payload, DetachedSample(raw.timestamp, raw.source_info, encoding_of(stream, raw), retained), lost
+    detached = DetachedSample(raw.timestamp, raw.source_info, encoding_of(stream, raw), retained)
+    return stream, payload, detached, lost, received
 
 
 def mark_retained(arrival: Arrival) -> Arrival:

@@ -18,6 +18,7 @@ from heapq import heappop, heappush, heapreplace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, get_args
 
+from nedbus import clock
 from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.errors import ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
@@ -236,7 +237,7 @@ class PendingQueue:
                     arrival = self._newest.pop(next(iter(self._newest)))
                 else:
                     return None
-                stream, _, _, lost = arrival
+                stream, _, _, lost, _ = arrival
                 if stream.unreported:
                     lost, stream.unreported = lost + stream.unreported, 0
             if self._ack_requests:
@@ -254,8 +255,8 @@ class PendingQueue:
         while True:
             with self._lock:
                 taken = self._take_batch()
-                lost = sum(lost for _, _, _, lost in taken)
-                for stream in {stream for stream, _, _, _ in taken}:
+                lost = sum(lost for _, _, _, lost, _ in taken)
+                for stream in {stream for stream, *_ in taken}:
                     lost, stream.unreported = lost + stream.unreported, 0
             if self._ack_requests:
                 self.acknowledge(drained=False)
@@ -271,7 +272,7 @@ class PendingQueue:
         """Remove the messages of the same type as the first one; the rest stay queued in order."""
         every, newest = self._every, self._newest
         waiting = list(newest.values()) or [every.popleft() for _ in range(min(len(every), _MAX_BATCH))]
-        kinds = [stream.codec or identity_of(encoding_of(stream, raw)) for stream, _, raw, _ in waiting]
+        kinds = [stream.codec or identity_of(encoding_of(stream, raw)) for stream, _, raw, _, _ in waiting]
         taken = [arrival for arrival, kind in zip(waiting, kinds, strict=True) if kind == kinds[0]]
         rest = [arrival for arrival, kind in zip(waiting, kinds, strict=True) if kind != kinds[0]]
         if self.newest_only:
@@ -335,7 +336,7 @@ class PendingQueue:
         neither displace a valid sample nor use much memory.
         """
         admitted: list[Arrival] = []
-        known = self._streams.get
+        known, received = self._streams.get, clock.utc_ns()
         for raw in batch:
             key = str(raw.key_expr)
             stream = known(key)
@@ -352,7 +353,7 @@ class PendingQueue:
                     if stream is None:
                         continue
                     payload = b""
-            admitted.append((stream, payload, raw, 0))
+            admitted.append((stream, payload, raw, 0, received))
         return admitted
 
     def _accept(self, arrivals: list[Arrival], *, overflowed: bool) -> None:
@@ -364,7 +365,7 @@ class PendingQueue:
         now, recovers = self._clock(), not (self.newest_only or overflowed)
         delivered = self.account.delivered
         for admitted in arrivals:
-            stream, payload, raw, _ = arrival = admitted
+            stream, payload, raw, _, _ = arrival = admitted
             stream.heard = now
             info, writer = raw.source_info, stream.writer
             if info is not None:
@@ -399,7 +400,7 @@ class PendingQueue:
             return False
         if len({id(arrival[0]) for arrival in arrivals}) > 1 or not all(map(_PAYLOAD, arrivals)):
             return False
-        infos = [raw.source_info for _, _, raw, _ in arrivals]
+        infos = [raw.source_info for _, _, raw, _, _ in arrivals]
         if [info and info.source_sn for info in infos] != list(range(writer.expected, stop)):
             return False
         writer.expected = stop
@@ -451,17 +452,17 @@ class PendingQueue:
         return len(arrivals)
 
     def _supersede(self, arrival: Arrival) -> None:
-        stream, payload, raw, lost = arrival
+        stream, payload, raw, lost, received = arrival
         waiting = self._newest.get(stream.key)
         if waiting is not None:
             self.account.dropped += 1
-            arrival = stream, payload, raw, lost + waiting[3]
+            arrival = stream, payload, raw, lost + waiting[3], received
         elif len(self._newest) >= MAX_KEYS:
             self._drop(self._newest.pop(next(iter(self._newest))))
         self._newest[stream.key] = arrival
 
     def _drop(self, arrival: Arrival) -> None:
-        stream, _, _, lost = arrival
+        stream, _, _, lost, _ = arrival
         stream.unreported += lost
         self.account.dropped += 1
 

@@ -213,9 +213,9 @@ class WriterProxy:
     def _deliver(self, arrival: Arrival) -> None:
         self.expected = (self.expected + 1) % NUMBERS
         self.history_end = 0
-        stream, payload, raw, _ = arrival
+        stream, payload, raw, _, received = arrival
         if payload:
-            self.account.delivered.append((stream, payload, raw, stream.gap))
+            self.account.delivered.append((stream, payload, raw, stream.gap, received))
             stream.gap = 0
 
     def _release(self) -> None:
