@@ -17,7 +17,7 @@ from nedbus.transport import Tls
 from nedbus_msgs import ANY, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
 from .bus import Bus, connect_with
-from .publishing.publisher import Publisher
+from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
 
@@ -59,6 +59,11 @@ class AsyncBus:
         if self._bus is None:
             raise ClosedError
         return self._bus
+
+    @property
+    def closed(self) -> bool:
+        """True until the bus is opened, and once it is closed."""
+        return self._bus is None or self._bus.closed
 
     @property
     def connected(self) -> bool:
@@ -138,9 +143,11 @@ class AsyncBus:
         call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance, definition=definition)
         return AsyncPublisher(await self._in_thread(call, lossless=lossless, source=source))
 
-    async def close(self) -> None:
+    async def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Close the bus; see `Bus.close`. Cancelling it ends the wait for readers, and closes at once."""
-        await self.__aexit__(None)
+        if (bus := self._bus) is not None:  # in a new thread, as all others may wait
+            thread = ThreadPoolExecutor(1, "nedbus-close")
+            await _run(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
@@ -156,9 +163,7 @@ class AsyncBus:
         return self
 
     async def __aexit__(self, exc: object, *_: object) -> None:
-        if (bus := self._bus) is not None:  # in a new thread, as all others may wait
-            thread = ThreadPoolExecutor(1, "nedbus-close")
-            await _run(thread, partial(bus.__exit__, exc), cancel=partial(_stop_waiting, bus))
+        await self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(call, *args, **kwargs))
@@ -207,6 +212,11 @@ class AsyncPublisher:
         self.source, self.lossless = publisher.source, publisher.lossless
         self._blocking = publisher
         self._thread = ThreadPoolExecutor(1, "nedbus-async")
+
+    @property
+    def closed(self) -> bool:
+        """True once the publisher or its bus is closed."""
+        return self._blocking.closed
 
     @property
     def published(self) -> int:

@@ -30,7 +30,7 @@ from .discovery import (
     find_services,
 )
 from .protocol import LIVE
-from .publishing.publisher import Publisher
+from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .rate_gate import check_max_rate, rate_step
@@ -63,6 +63,11 @@ class Bus:
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
         self._finalizer = Finalizer(self, closing.close)
+
+    @property
+    def closed(self) -> bool:
+        """True once the bus is closed."""
+        return not self._finalizer.alive
 
     @property
     def connected(self) -> bool:
@@ -207,24 +212,25 @@ class Bus:
         """Open another Zenoh session, at the same routers or at `endpoint`; the caller closes it."""
         return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
 
-    def close(self) -> None:
+    def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Close the bus with its subscriptions and publishers. Idempotent.
 
-        Lossless publishers are flushed first, unless a `with` block ends with an exception.
+        Lossless publishers are flushed first, for at most `timeout` seconds, unless a `with` block ends with an
+        exception. Ctrl-C ends the wait, and closes.
         """
-        if self._finalizer.alive:
-            with suppress(NedbusError):
-                self._publishers.flush(each for each in self._publishers.publishers if each.lossless)
-        self._finalizer.close_now()
+        try:
+            if not self.closed and timeout > 0:
+                lossless = [each for each in self._publishers.publishers if each.lossless]
+                with suppress(NedbusError):
+                    self._publishers.flush(lossless, timeout=timeout)
+        finally:
+            self._finalizer.close_now()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, exc: object, *_: object) -> None:
-        if exc is None:
-            self.close()
-        else:
-            self._finalizer.close_now()
+        self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
     @property
     def _session(self) -> Session:
@@ -233,7 +239,7 @@ class Bus:
 
     def _require_open(self) -> None:
         require_unforked()
-        if not self._finalizer.alive:
+        if self.closed:
             raise ClosedError
 
     def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> PendingQueue:
@@ -255,7 +261,7 @@ class Bus:
         else:
             receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue)
         self._receivers.add(receiver)
-        if not self._finalizer.alive:  # closed by another thread
+        if self.closed:  # by another thread
             receiver.close()
             raise ClosedError
         return receiver

@@ -36,6 +36,11 @@ class _SubscriptionBase(Generic[M_co]):
         self._pop_row = partial(pending_queue.pop, rows=True)
 
     @property
+    def closed(self) -> bool:
+        """True once the subscription or its bus is closed, or receiving has failed."""
+        return self._queue.ended
+
+    @property
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far."""
         return self._queue.counts

@@ -144,6 +144,36 @@ def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(client: ned
     assert not client.vehicles()
 
 
+@pytest.mark.parametrize("whole_bus", [False, True])
+def test_close_with_a_timeout_gives_up(client: nedbus.Bus, raw: Session, whole_bus: bool) -> None:
+    """A reader that acknowledges nothing delays a close by its timeout at most, and with 0 not at all."""
+    asked: list[zenoh.Query] = []
+    with answering(raw, f"nedbus/*/{VLP}/@ack", asked.append):
+        for vehicle, timeout in (("1", 0.0), ("2", 0.05)):
+            publisher = client.publisher(VLP, vehicle=vehicle, lossless=True)
+            publisher.publish({"timestamp": 1})
+            before = len(asked)
+            (client if whole_bus and timeout else publisher).close(timeout=timeout)
+            assert publisher.closed
+            assert (len(asked) > before) == (timeout > 0)
+    assert client.closed == whole_bus
+
+
+@pytest.mark.parametrize("whole_bus", [False, True])
+def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool) -> None:
+    """Ctrl-C ends the wait of a close for readers, and everything is closed."""
+
+    def interrupt(*_: object) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(nedbus.Publisher, "flush", interrupt)
+    with nedbus.connect(endpoint) as bus:
+        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        with pytest.raises(KeyboardInterrupt):
+            (bus if whole_bus else publisher).close()
+        assert (publisher.closed, bus.closed) == (True, whole_bus)
+
+
 @pytest.mark.usefixtures("stuck")
 def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """One Ctrl-C ends a script of which six publishers wait for a reader."""

@@ -10,6 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import islice
 from typing import Any, Final, cast
 
@@ -174,8 +175,10 @@ def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, m
         reader.join(DEADLINE)
         assert not reader.is_alive()
     subscription = client.subscribe(VLP, mode=mode)
+    assert not subscription.closed
     subscription.close()
     subscription.close()
+    assert subscription.closed
     assert list(islice(subscription, 1)) == []
     with pytest.raises(nedbus.ClosedError):
         subscription.receive(1.0)
@@ -257,8 +260,12 @@ def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
     """Every call on a closed bus raises ClosedError, and its subscriptions end."""
     subscription = client.subscribe(VLP)
     publisher = client.publisher(VLP, vehicle="1")
+    with suppress(nedbus.NoDataError):
+        subscription.receive(0.0)  # opens it
+    assert not any(each.closed for each in (client, subscription, publisher))
     client.close()
     client.close()
+    assert all(each.closed for each in (client, subscription, publisher))
     assert list(islice(subscription, 1)) == []
     with pytest.raises(nedbus.ClosedError):
         publisher.publish(message())

@@ -73,6 +73,11 @@ class Publisher:
         """The number of messages published."""
         return self._writer.published
 
+    @property
+    def closed(self) -> bool:
+        """True once the publisher or its bus is closed."""
+        return self._writer.closed or self._writer.session.is_closed()
+
     def relabel(self, source: str) -> None:
         """Set the source of all further messages, which readers see in `sample.source`."""
         if source != self.source:
@@ -132,16 +137,22 @@ class Publisher:
         """
         return self._flow_control.wait(self.published, timeout=timeout)
 
-    def close(self) -> None:
+    def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Withdraw the address and free it for another publisher. Idempotent.
 
-        A lossless publisher is flushed first, unless a `with` block ends with an exception.
+        A lossless publisher is flushed first, for at most `timeout` seconds, unless a `with` block ends with an
+        exception. Ctrl-C ends the wait, and closes.
         """
         if self._writer.closed:
             return
-        if self.lossless:
-            with suppress(NedbusError):
-                self.flush()
+        try:
+            if self.lossless and timeout > 0:
+                with suppress(NedbusError):
+                    self.flush(timeout)
+        finally:
+            self._close()
+
+    def _close(self) -> None:
         self._writer.close()
         self._on_close()
         self._downsampler.close()
@@ -152,9 +163,7 @@ class Publisher:
         return self
 
     def __exit__(self, exc: object, *_: object) -> None:
-        if exc is not None:
-            self._flow_control.cancelled.set()
-        self.close()
+        self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
         """Put the payload of a message; `provided` are the names of its fields that were provided."""

@@ -134,13 +134,19 @@ class PublisherRegistry:
             # Zenoh's stubs declare the status as a bool, but it is an object, which is always true.
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
 
-    def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
-        """Wait until readers have received all messages of these publishers, or `stop` is set; at most 10 minutes."""
-        end = time.monotonic() + FLUSH_TIMEOUT
+    def flush(
+        self,
+        publishers: Iterable[Publisher],
+        *,
+        timeout: float = FLUSH_TIMEOUT,
+        stop: threading.Event | None = None,
+    ) -> None:
+        """Wait until readers have received all messages of these publishers, `timeout` seconds, or until `stop`."""
+        end = time.monotonic() + timeout
         for publisher in publishers:
             address, logged = publisher.address, False
-            while not publisher.flush(_FLUSH_POLL):
-                if (stop and stop.is_set()) or time.monotonic() > end:
+            while not publisher.flush(min(_FLUSH_POLL, max(0.0, end - time.monotonic()))):
+                if (stop and stop.is_set()) or time.monotonic() >= end:
                     text = "%s: a reader has not received all messages"
                     _log.warning(text, address, extra=about("slow-reader", address))
                     return
