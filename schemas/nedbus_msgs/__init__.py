@@ -5,6 +5,7 @@ from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
 from .errors import (
     AddressError,
+    ArgumentError,
     DecodeError,
     EncodeError,
     InvalidMessageError,
@@ -78,7 +79,7 @@ from .undeclared import define
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS",
     "FLAG_FIELDS", "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address",
-    "AddressError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
+    "AddressError", "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
     "GlobalPosition", "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError",
     "NedbusError", "NoOrigin", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic",
     "UnitQuaternion", "UnknownLayoutError", "Vector", "VehicleLocalPosition", "ack_key", "address_of_alive_key",

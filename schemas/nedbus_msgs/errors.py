@@ -23,12 +23,16 @@ def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict
     return error
 
 
-class AddressError(NedbusError, ValueError):
-    """Raised when a vehicle, topic, instance or key expression cannot name a stream."""
+class ArgumentError(NedbusError, ValueError):
+    """Raised for an invalid argument of a call, such as `mode`, `max_rate` or `on`; `given` is its value."""
 
     def __init__(self, what: str, given: object, expected: str, *, problem: str = "is not valid") -> None:
         super().__init__(f"{what} {given!r:.{_MAX_SHOWN}} {problem}: expected {expected}")
         self.given = given
+
+
+class AddressError(ArgumentError):
+    """Raised when a vehicle, topic, instance or key expression cannot name a stream."""
 
 
 class LayoutError(NedbusError, ValueError):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
-from .errors import AddressError
+from .errors import ArgumentError
 from .model.declaration import Layout, kept
 from .model.definition import MESSAGES, Definition
 from .model.px4_types import FieldType
@@ -41,7 +41,7 @@ class Provenance:
     `source`: the kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if unknown.
     `missing`: the fields that the source does not provide; they hold NaN, false or 0.
 
-    Raises AddressError for a source that is not 1 to 32 of a-z 0-9 _ -.
+    Raises ArgumentError for a source that is not 1 to 32 of a-z 0-9 _ -.
     """
 
     source: str | None = None
@@ -49,7 +49,7 @@ class Provenance:
 
     def __post_init__(self) -> None:
         if self.source is not None and not _SOURCE.fullmatch(self.source):
-            raise AddressError("source", self.source, "1 to 32 of a-z 0-9 _ -")
+            raise ArgumentError("source", self.source, "1 to 32 of a-z 0-9 _ -")
 
 
 @kept

@@ -76,6 +76,7 @@ if TYPE_CHECKING:
     from .errors import (
         AddressError,
         AddressInUseError,
+        ArgumentError,
         ClosedError,
         ConfigError,
         ConnectError,
@@ -100,7 +101,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "ANY", "DTYPE", "TOPICS", "AccountReport", "Address", "AddressError", "AddressInUseError", "AsyncBus",
+    "ANY", "DTYPE", "TOPICS", "AccountReport", "Address", "AddressError", "AddressInUseError", "ArgumentError",
+    "AsyncBus",
     "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "ClosedError", "Condition", "ConfigError", "ConnectError",
     "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition", "Health", "Histogram",
     "InvalidMessageError", "LayoutError", "ListenError", "LogStreamStatus", "MapProjection", "Message", "MessageArray",

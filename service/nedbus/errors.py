@@ -2,7 +2,8 @@
 
     NedbusError
     ├── the caller's arguments
-    │   ├── AddressError (ValueError)        an invalid vehicle, topic, instance, key or prefix
+    │   ├── ArgumentError (ValueError)       an invalid argument, such as mode, max_rate or on
+    │   │   └── AddressError                 ... a vehicle, topic, instance, key or prefix
     │   ├── LayoutError (ValueError)         field names that match no layout
     │   ├── InvalidMessageError (ValueError) a message to publish with an invalid field
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
@@ -34,6 +35,7 @@ from pathlib import Path
 from nedbus_msgs import (
     Address,
     AddressError,
+    ArgumentError,
     DecodeError,
     EncodeError,
     InvalidMessageError,
@@ -43,9 +45,9 @@ from nedbus_msgs import (
 )
 
 __all__ = [
-    "AddressError", "AddressInUseError", "ClosedError", "ConfigError", "ConnectError", "DecodeError", "EncodeError",
-    "ForkError", "InvalidMessageError", "LayoutError", "ListenError", "NedbusError", "NoDataError", "OutputError",
-    "PkiError", "ReceiveError", "SourceError", "UnknownLayoutError",
+    "AddressError", "AddressInUseError", "ArgumentError", "ClosedError", "ConfigError", "ConnectError", "DecodeError",
+    "EncodeError", "ForkError", "InvalidMessageError", "LayoutError", "ListenError", "NedbusError", "NoDataError",
+    "OutputError", "PkiError", "ReceiveError", "SourceError", "UnknownLayoutError",
 ]  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import AddressError, Provenance
+from nedbus_msgs import ArgumentError, Provenance
 from tests.flights.first_message import ENCODING, FIELD_TYPES, encoding_of, provenance_of
 
 
@@ -44,5 +44,5 @@ def test_bits_without_a_field_are_ignored() -> None:
 @pytest.mark.parametrize("source", ["", "A", "a b", "x" * 33, "a;b"])
 def test_source_is_a_plain_name(source: str) -> None:
     """A source that could not be written in an encoding is rejected."""
-    with pytest.raises(AddressError, match="1 to 32 of a-z"):
+    with pytest.raises(ArgumentError, match="1 to 32 of a-z"):
         Provenance(source)

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from nedbus.client import Bus, connect_with
-from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, NedbusError
+from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
@@ -106,7 +106,7 @@ def _exit_on_errors() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
-    except (ConfigError, AddressError, LayoutError) as exc:
+    except (ArgumentError, ConfigError, LayoutError) as exc:
         raise _exit_with(exc, 2) from exc
     except NedbusError as exc:
         raise _exit_with(exc, 1) from exc

@@ -104,7 +104,7 @@ class Bus:
         The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`; rates below 1 are
         downsampled further by the reader. Messages left out by downsampling count as neither lost nor dropped.
 
-        Raises ConfigError if `max_rate` is not a finite number above 0.
+        Raises ArgumentError for another `mode`, or if `max_rate` is not a finite number above 0.
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
         return self.subscribe_to(selection, mode=mode, max_rate=max_rate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from nedbus.errors import ConfigError
+from nedbus.errors import ArgumentError
 
 RATES: Final = (1, 2, 5, 10, 20, 50, 100)
 """Rates [Hz] to which publishers downsample a stream, each on its own key."""
@@ -37,9 +37,9 @@ class RateGate:
 
 
 def check_max_rate(max_rate: object) -> None:
-    """Raise ConfigError unless `max_rate` is a finite number above 0."""
+    """Raise ArgumentError unless `max_rate` is a finite number above 0."""
     if isinstance(max_rate, bool) or not isinstance(max_rate, int | float) or not 0 < max_rate < math.inf:
-        raise ConfigError("max_rate", f"{max_rate!r} is invalid: expected messages per second, a finite number above 0")
+        raise ArgumentError("max_rate", max_rate, "messages per second, a finite number above 0")
 
 
 def rate_step(max_rate: float) -> int:

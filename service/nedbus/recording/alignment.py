@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overlo
 import numpy as np
 import numpy.typing as npt
 
-from nedbus.errors import AddressError, ConfigError
+from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion, is_unix_time
 from nedbus_msgs.arrays import MessageArray
 
@@ -78,10 +78,11 @@ def align(
     rows are by default the positions of the first vehicle.
     `utc`: add a column `utc` with the UTC from `utc_of`, NaT if it has none.
 
-    Raises ConfigError if a stream spans several boots of a vehicle, which share no time base, and the errors of `read`.
+    Raises ArgumentError for an invalid `on`, `method` or `fields`, ConfigError if a stream spans several boots of a
+    vehicle, which share no time base, and the errors of `read`.
     """
     if method not in _METHODS:
-        raise ConfigError("method", f"{method!r} is not one of {', '.join(_METHODS)}")
+        raise ArgumentError("method", method, f"one of {', '.join(_METHODS)}")
     reference = [on] if isinstance(on, str) else []
     topics = [topics] if isinstance(topics, str) else topics
     names = [*reference, *(topics or ())]
@@ -132,21 +133,19 @@ def align(
 
 
 def _find_stream(on: str, streams: Streams) -> str:
-    """Return the stream of this name, of the first vehicle that has it; raise AddressError if there is none."""
+    """Return the stream of this name, of the first vehicle that has it; raise ArgumentError if there is none."""
     for name in streams:
         if f"/{name}".endswith(f"/{on}"):
             return name
     expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
-    raise AddressError("on", on, expected, problem="is not in this flight")
+    raise ArgumentError("on", on, expected, problem="is not in this flight")
 
 
 def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    """Return the columns that these fields select, and the times; raise ConfigError for a field that no stream has."""
+    """Return the columns that these fields select, and the times; raise ArgumentError for an unknown field."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):
-        raise ConfigError(
-            "fields", f"no stream has {', '.join(sorted(unknown))}: expected some of {', '.join(columns)}"
-        )
+        raise ArgumentError("fields", sorted(unknown), f"some of {', '.join(columns)}", problem="are in no stream")
     times = {"timestamp", "utc"}
     return {name: column for name, column in columns.items() if name in times or known[name] & {*fields}}
 
@@ -230,7 +229,7 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
     """
     given = np.asarray(on)
     if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):
-        raise ConfigError("on", f"{on!r:.60} is neither a stream, nor a rate above 0 [Hz], nor times [us]")
+        raise ArgumentError("on", on, "a stream, a rate above 0 [Hz], or times [us]")
     if given.ndim:
         return given.astype(np.int64)
     set_ones = {name: times[times > 0] for name, times in stamps.items() if times.any()}  # a timestamp of 0 is unset
@@ -242,6 +241,6 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
         ends = (
             f"{min(firsts, key=firsts.__getitem__)} begins at {first / 1e6:.0f} s, {max(lasts, key=lasts.__getitem__)}"
         )
-        advice = "choose topics on one clock, a lower rate, or times"
-        raise ConfigError("on", f"{rate:g} Hz has too many rows: {ends} ends at {last / 1e6:.0f} s: {advice}")
+        problem = f"Hz has too many rows: {ends} ends at {last / 1e6:.0f} s"
+        raise ArgumentError("on", rate, "topics on one clock, a lower rate, or times", problem=problem)
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from nedbus.errors import ConfigError, DecodeError
+from nedbus.errors import ArgumentError, DecodeError
 from nedbus.extras import needs
 from nedbus_msgs import TOPICS, Address, Definition, Message, decode_text, decode_with, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
@@ -219,7 +219,7 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
     if library is None:
         return messages
     if library not in ("pandas", "polars"):
-        raise ConfigError("dataframe", f"{library!r} is neither pandas nor polars")
+        raise ArgumentError("dataframe", library, "pandas or polars")
     package = needs(library, library)
     columns: dict[str, Any] = {}
     for name in messages.dtype.names or ():

@@ -13,7 +13,7 @@ from hypothesis import given
 from nedbus import Counts, Mode
 from nedbus.client.rate_gate import RATES, RateGate, check_max_rate, rate_step
 from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateQueue
-from nedbus.errors import ConfigError
+from nedbus.errors import ArgumentError
 from nedbus.transport import RawSample
 from nedbus_msgs import Address
 
@@ -173,7 +173,7 @@ def test_step_is_the_greatest_that_is_not_above() -> None:
 
 @pytest.mark.parametrize("value", [0, -1, -0.0, math.nan, math.inf, "5", True, None])
 def test_invalid_rate_is_refused(value: object) -> None:
-    """A rate that is not a finite number above 0 is a ConfigError, and a ValueError, that names the option."""
-    with pytest.raises(ConfigError, match="max_rate") as error:
+    """A rate that is not a finite number above 0 is an ArgumentError, and a ValueError, that names the option."""
+    with pytest.raises(ArgumentError, match="max_rate") as error:
         check_max_rate(value)
     assert isinstance(error.value, ValueError)

@@ -246,7 +246,7 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
         (["list", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["get", "-t", VLP, "-i", "0"], "instance 0 is not valid: expected none"),
         (["list", "--connect", "nonsense"], "connect: 'nonsense' is not an endpoint"),
-        (["echo", "--wait", "--connect", "tcp/127.0.0.1:1", "--max-rate", "nan"], "max_rate: nan is invalid"),
+        (["echo", "--wait", "--connect", "tcp/127.0.0.1:1", "--max-rate", "nan"], "max_rate nan is not valid"),
     ],
 )
 def test_invalid_option_is_a_usage_error(endpoint: str, arguments: list[str], text: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.errors import AddressError, ConfigError
+from nedbus.errors import AddressError, ArgumentError, ConfigError
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
@@ -135,7 +135,7 @@ def test_fields_choose_the_columns() -> None:
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
     assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
     assert np.array_equal(table[f"{VLP}.z"], nedbus.align(flight)[f"{VLP}.z"], equal_nan=True)
-    with pytest.raises(ConfigError, match=f"fields: no stream has zz: expected some of timestamp, {VLP}.age, "):
+    with pytest.raises(ArgumentError, match=rf"fields \['zz'\] are in no stream: expected some of .*, {VLP}.age, "):
         nedbus.align(flight, fields=["zz"])
 
 
@@ -145,7 +145,7 @@ def test_rate_covers_the_flight() -> None:
     assert table["timestamp"].tolist() == list(range(1_000_000, 1_400_001, 50_000))
     late = array_of("home_position", {"timestamp": 2**63})
     for rate in (20, 0, -1, math.nan, math.inf, "*", None, [-1], [[1]], ["a"], np.int64(0)):
-        with pytest.raises((ConfigError, AddressError), match=r"^on[: ]"):
+        with pytest.raises(ArgumentError, match=r"^on "):
             nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate)  # type: ignore[arg-type] # these are the mistakes
 
 
@@ -176,7 +176,7 @@ def test_streams_on_two_clocks_are_an_error() -> None:
     """The error names the streams at both ends, and what to do."""
     unix = array_of(VLP, {"timestamp": BOOT}, {"timestamp": BOOT + 1_000_000})
     with pytest.raises(
-        ConfigError, match=f"home_position begins at 1 s, {VLP} ends at 1700000001 s: choose topics on one"
+        ArgumentError, match=f"home_position begins at 1 s, {VLP} ends at 1700000001 s: expected topics on one"
     ):
         nedbus.align({VLP: unix, "home_position": HOME}, on=50)
 
@@ -196,11 +196,11 @@ def test_odd_streams_are_aligned(tmp_path: Path) -> None:
     again = np.concatenate([POSITIONS, POSITIONS])
     with pytest.raises(ConfigError, match=f"^{VLP}: timestamps restart: align the messages of each boot"):
         nedbus.align({VLP: again})
-    with pytest.raises(ConfigError, match="'spline' is not one of last, nearest, linear"):
+    with pytest.raises(ArgumentError, match="method 'spline' is not valid: expected one of last, nearest, linear"):
         nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # that is the mistake
     with pytest.raises(AddressError, match=f"topic 'home_position' is not among these arrays: expected one of {VLP}"):
         nedbus.align({VLP: POSITIONS}, topics=["home_position"])
-    with pytest.raises(ConfigError, match="neither pandas nor polars"):
+    with pytest.raises(ArgumentError, match="expected pandas or polars"):
         nedbus.align({VLP: POSITIONS}, dataframe="foo")  # type: ignore[call-overload] # that is the mistake
 
 

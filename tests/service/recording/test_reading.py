@@ -16,7 +16,7 @@ import pytest
 
 import nedbus
 from nedbus import recording
-from nedbus.errors import AddressError, ConfigError, SourceError
+from nedbus.errors import AddressError, ArgumentError, ConfigError, SourceError
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import DEFAULT, MESSAGES, Address, MapProjection, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
@@ -138,7 +138,7 @@ def test_large_recording_is_not_loaded_whole(tmp_path: Path) -> None:
 
 def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pandas, or without mcap, the error names the package to install; a misspelt frame is none."""
-    with pytest.raises(ConfigError, match="'foo' is neither pandas nor polars"):
+    with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
         nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # that is the mistake
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed: pip install pandas"):

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 from nedbus import clock
 from nedbus.client.sample import Counts, Mode, Sample
-from nedbus.errors import ClosedError, NedbusError, ReceiveError
+from nedbus.errors import ArgumentError, ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
 from nedbus.transport import RawSample, SourceInfo, entity_name
 from nedbus_msgs import AddressError, DecodeError, identity_of
@@ -88,7 +88,7 @@ class PendingQueue:
         self, mode: Mode, decoder: Decoder, *, name: str = "", clock: Callable[[], float] = time.monotonic
     ) -> None:
         if mode not in get_args(Mode):
-            raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
+            raise ArgumentError("mode", mode, f"one of {', '.join(get_args(Mode))}")
         self.newest_only = mode == "latest"
         self.ended = False
         self._failure = ""  # reason of an end that the user did not cause
