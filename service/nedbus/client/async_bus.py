@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, overload
 
 from nedbus.errors import ClosedError
-from nedbus.settings import load_settings
+from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
 from nedbus_msgs import ANY, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
@@ -194,7 +194,7 @@ def connect_async(
     config: str | Path | None = None,
 ) -> AsyncBus:
     """Return a bus for asyncio, opened with `async with`; arguments and errors as in `connect`."""
-    load = partial(load_settings, config, connect=endpoint, prefix=prefix)
+    load = partial(load_client_settings, config, connect=endpoint, prefix=prefix, tls=tls)
     return AsyncBus(lambda stop: connect_with(load(), timeout=timeout, tls=tls, stop=stop))
 
 

@@ -14,7 +14,7 @@ from typing import Any, Self, Unpack, overload
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import AccountReport
-from nedbus.settings import Settings, load_settings
+from nedbus.settings import Settings, load_client_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
@@ -281,10 +281,12 @@ def connect(
     The default is NEDBUS_CONNECT, `connect` in nedbus.toml, or else the router of `nedbus serve` on this host.
     `timeout`: seconds to wait for a router; None waits until Ctrl-C. A broken link is reconnected automatically.
     `tls`: for tls/ endpoints, by default from the settings. `config`: the path of a file to use for nedbus.toml.
+    With an endpoint, only `prefix`, and for tls/ the files of TLS, are read from it, unless they are given.
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
-    return connect_with(load_settings(config, connect=endpoint, prefix=prefix), timeout=timeout, tls=tls)
+    settings = load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls)
+    return connect_with(settings, timeout=timeout, tls=tls)
 
 
 def connect_with(

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
+from nedbus.transport import Tls
 
 from .model import Settings, split_sources, split_values
 from .toml_file import find_key, find_source, read_text, read_toml
@@ -25,27 +26,44 @@ DEFAULT_FILE: Final = Path("nedbus.toml")
 _MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters from which a variable counts as the beginning of a setting's name
 
 
-def load_settings(file: str | Path | None = None, **given: object) -> Settings:
+def load_settings(
+    file: str | Path | None = None, needed: Collection[str] | None = None, /, **given: object
+) -> Settings:
     """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if it exists) and the environment.
 
-    Keyword arguments that are not None override both.
+    Keyword arguments that are not None override both. `needed`: the settings to read from the file; None for all.
 
     Raises ConfigError, with file, line and column, or with the name of the flag or variable.
     """
-    settings, mistakes = find_mistakes(file, **given)
+    settings, mistakes = find_mistakes(file, needed, **given)
     if mistakes:
         raise mistakes[0]
     return settings
 
 
-def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Settings, list[ConfigError]]:
+def load_client_settings(
+    file: str | Path | None, *, connect: str | Sequence[str] | None, prefix: str | None, tls: Tls | None
+) -> Settings:
+    """Return the settings of a client; with `connect`, those that it does not need may be wrong in the file."""
+    needed: set[str] | None = None
+    if connect is not None:
+        needed = {"prefix"} if prefix is None else set()
+        if tls is None and any(scheme in str(connect) for scheme in ("tls/", "quic/")):
+            needed |= {"tls_ca", "tls_certificate", "tls_key"}
+    return load_settings(file, needed, connect=connect, prefix=prefix)
+
+
+def find_mistakes(
+    file: str | Path | None = None, needed: Collection[str] | None = None, /, **given: object
+) -> tuple[Settings, list[ConfigError]]:
     """Return the settings as `load_settings` does, without invalid values, and the errors for those."""
     flags = {name: value for name, value in given.items() if value is not None}
     mistakes: list[ConfigError] = []
     path, content = None, dict[str, object]()
     try:
         path = _settings_file(file)
-        content = read_toml(path) if path else {}
+        content = read_toml(path) if path and needed != set() else {}
+        content = {name: value for name, value in content.items() if needed is None or name in needed}
     except ConfigError as exc:
         mistakes.append(exc)
     is_read, wrong = not mistakes, set[str]()

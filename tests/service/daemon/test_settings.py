@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from pathlib import Path
 
@@ -38,6 +39,33 @@ def test_order_is_file_environment_flag(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("NEDBUS_LISTEN", "here")
     with pytest.raises(ConfigError, match=r"^NEDBUS_LISTEN: 'here' is not an endpoint"):
         load_settings()
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_script_with_an_endpoint_reads_what_it_needs(tmp_path: Path, endpoint: str, *, is_async: bool) -> None:
+    """With an endpoint only `prefix` and, for tls/, the files of TLS are read from ./nedbus.toml."""
+
+    async def connect_async(where: str | None, prefix: str | None) -> str:
+        async with nedbus.connect_async(where, prefix=prefix) as bus:
+            return bus.prefix
+
+    def connect(where: str | None = endpoint, prefix: str | None = None) -> str:
+        if is_async:
+            return asyncio.run(connect_async(where, prefix))
+        with nedbus.connect(where, prefix=prefix) as bus:
+            return bus.prefix
+
+    file = tmp_path / "nedbus.toml"
+    file.write_text('prefix = "fleet"\nlisten = "nowhere"\nconect = 1\ntls_ca = 7\n')
+    assert connect() == "fleet"
+    for where, prefix in ((None, None), ("tls/127.0.0.1:1", "fleet")):
+        with pytest.raises(ConfigError, match=r"nedbus\.toml"):
+            connect(where, prefix)
+    file.write_text("prefix = 7\n")
+    with pytest.raises(ConfigError, match="prefix"):
+        connect()
+    file.write_text("not TOML")
+    assert connect(prefix="other") == "other"
 
 
 def test_file_is_the_named_one_or_the_one_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
