@@ -17,7 +17,6 @@ from .flags import DOUBT_FLAGS, FLAG_FIELDS, describe_flags, message_doubts
 from .frames import (
     GlobalPosition,
     MapProjection,
-    NoOrigin,
     Vector,
     enu_to_ned,
     euler_to_quaternion,
@@ -81,7 +80,7 @@ __all__ = [
     "FLAG_FIELDS", "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address",
     "AddressError", "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
     "GlobalPosition", "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError",
-    "NedbusError", "NoOrigin", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic",
+    "NedbusError", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic",
     "UnitQuaternion", "UnknownLayoutError", "Vector", "VehicleLocalPosition", "ack_key", "address_of_alive_key",
     "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of", "dds_type",
     "decode", "decode_text", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",

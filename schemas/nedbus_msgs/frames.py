@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
@@ -144,40 +144,25 @@ class GlobalPosition(NamedTuple):
     altitude: float
 
 
-@dataclass(frozen=True, slots=True)
-class NoOrigin:
-    """Returned for a message without a global origin; falsy, for `if position := to_global(message):`.
-
-    `reason`: the missing part.
-    """
-
-    reason: str
-
-    def __bool__(self) -> Literal[False]:
-        return False
-
-
-def to_global(message: Message) -> GlobalPosition | NoOrigin:
-    """Return the global position of a message, or NoOrigin while it has no global origin.
+def to_global(message: Message) -> GlobalPosition | None:
+    """Return the global position of a message, None without a global origin (`xy_global` is false) or x and y.
 
     The altitude is NaN while only the horizontal origin is known.
     The position is that of x, y and z, valid or not: check `xy_valid` and `z_valid`.
     """
-    if not message.xy_global:
-        return NoOrigin("xy_global is false: x and y have no global origin yet")
-    if not math.isfinite(message.x + message.y):
-        return NoOrigin("x and y are not provided")
+    if not message.xy_global or not math.isfinite(message.x + message.y):
+        return None
     latitude, longitude = MapProjection(message.ref_lat, message.ref_lon).reproject(message.x, message.y)
     return GlobalPosition(latitude, longitude, message.ref_alt - message.z if message.z_global else math.nan)
 
 
-def to_local(position: GlobalPosition, origin: Message) -> Vector | NoOrigin:
-    """Return x, y and z of a global position in the local frame of a message, or NoOrigin while that has no origin.
+def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
+    """Return x, y and z of a global position in the local frame of a message, None while that has no origin.
 
     z is NaN while only the horizontal origin is known.
     """
     if not origin.xy_global:
-        return NoOrigin("xy_global is false: x and y have no global origin yet")
+        return None
     x, y = MapProjection(origin.ref_lat, origin.ref_lon).project(position.latitude, position.longitude)
     return x, y, origin.ref_alt - position.altitude if origin.z_global else math.nan
 

@@ -62,8 +62,9 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
 
 def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
     """A function that takes a message takes a row as well."""
-    assert_type(nedbus.to_global(sample.message), nedbus.GlobalPosition | nedbus.NoOrigin)
-    assert_type(nedbus.to_global(row.message), nedbus.GlobalPosition | nedbus.NoOrigin)
+    assert_type(nedbus.to_global(sample.message), nedbus.GlobalPosition | None)
+    assert_type(nedbus.to_global(row.message), nedbus.GlobalPosition | None)
+    nedbus.to_global(row.message).latitude  # type: ignore[union-attr] # None without a global origin
     assert_type(nedbus.ResetTracker().add(row.message), nedbus.Continuous)
     nedbus.Monitor().add(row)
     nedbus.Monitor().add(sample)
