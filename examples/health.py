@@ -6,7 +6,7 @@ from contextlib import suppress
 import nedbus
 
 with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe("*", mode="every") as subscription:
-    monitor = nedbus.Monitor()
+    monitor = nedbus.health.Monitor()
     shown = time.monotonic()
     for sample in subscription:
         monitor.add(sample)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import nedbus
+from nedbus_msgs import MESSAGES
 
 ROOT = Path(__file__).parents[1]
 OURS = {
@@ -25,7 +26,13 @@ OURS = {
 ALLOWED = {"Definition", "FieldType", "Layout", "Older", "Rule"}
 
 
-@pytest.mark.parametrize("name", ["nedbus", "nedbus_msgs"])
+MODULES = {
+    name: importlib.import_module(name) for name in ("nedbus", "nedbus.frames", "nedbus.health", "nedbus.errors")
+}
+PUBLIC = {name: module for module in MODULES.values() for name in module.__all__}
+
+
+@pytest.mark.parametrize("name", [*MODULES, "nedbus_msgs"])
 def test_public_interface_is_complete(name: str) -> None:
     """Each name of __all__ is there, once and documented, and nothing public is missing."""
     module = importlib.import_module(name)
@@ -34,9 +41,19 @@ def test_public_interface_is_complete(name: str) -> None:
         public = getattr(module, word)
         ours = (inspect.isclass(public) or inspect.isfunction(public)) and public.__module__.startswith("nedbus")
         assert not ours or public.__doc__, word
-    public = {word for word in vars(module) if not word.startswith("_")}
-    submodules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
-    assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
+    if hasattr(module, "__path__"):
+        public = {word for word in vars(module) if not word.startswith("_")}
+        submodules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
+        assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
+
+
+def test_completion_shows_what_scripts_use() -> None:
+    """`dir(nedbus)` has fewer than 70 names: its own, the messages, and the modules that have the rest."""
+    shown = {name for name in dir(nedbus) if not name.startswith("__")}
+    assert shown == {*nedbus.__all__, *MESSAGES, "errors", "frames", "health"}
+    assert len(shown) < 70
+    assert all(hasattr(nedbus, name) for name in shown)
+    assert [nedbus.frames, nedbus.health, nedbus.errors] == list(MODULES.values())[1:]
 
 
 def annotations_of(public: object) -> typing.Iterator[str]:
@@ -53,13 +70,13 @@ def annotations_of(public: object) -> typing.Iterator[str]:
                 yield from map(str, inspect.get_annotations(function).values())
 
 
-@pytest.mark.parametrize("name", nedbus.__all__)
+@pytest.mark.parametrize("name", PUBLIC)
 def test_public_signatures_mention_public_names_only(name: str) -> None:
-    """A script can import from nedbus whatever it gets from nedbus, or gives to it."""
-    for annotation in annotations_of(getattr(nedbus, name)):
+    """A script can import from nedbus and its public modules whatever it gets from them, or gives to them."""
+    for annotation in annotations_of(getattr(PUBLIC[name], name)):
         expression = annotation.removeprefix("<class '").removesuffix("'>")
         mentioned = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
-        assert mentioned & OURS <= {*nedbus.__all__, *ALLOWED}, annotation
+        assert mentioned & OURS <= {*PUBLIC, *ALLOWED}, annotation
 
 
 def test_error_tree_is_drawn() -> None:

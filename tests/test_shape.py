@@ -24,7 +24,7 @@ def parse(path: Path) -> ast.Module:
 
 
 def test_packages_are_imported_through_their_doors() -> None:
-    """A floor imports another one through its __init__; the contract has a second door, for arrays of NumPy."""
+    """A floor imports another one through its __init__; the contract has doors for arrays, frames and messages, too."""
     for path in PRODUCT:
         package, floor, *_ = path.relative_to(ROOT).parts[1:]
         for node in ast.walk(parse(path)):
@@ -32,7 +32,7 @@ def test_packages_are_imported_through_their_doors() -> None:
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             for top, *inner in (name.split(".") for name in names):
                 if top == "nedbus_msgs" and package == "nedbus":
-                    assert inner in ([], ["arrays"], ["messages"]), f"{path}: import from nedbus_msgs"
+                    assert inner in ([], ["arrays"], ["frames"], ["messages"]), f"{path}: import from nedbus_msgs"
                 if top == "nedbus" and inner and floor != "__init__.py":
                     assert inner[0] == floor or len(inner) == 1, f"{path}: import from nedbus.{inner[0]}"
 

@@ -27,14 +27,17 @@ _CONSTANTS: Final = {  # of which no line of the code says more
     "ANY": "Any topic, or any vehicle",
     "Mode": "A slow reader gets the newest message of each key, or every message",
     "Quantity": "What an estimator resets",
-    "Vector": "Three components",
+    "frames.Vector": "Three components",
     "Session": "Zenoh's own session, for what nedbus does not do",
 }
 
 
 def api_page() -> str:
-    """Return the page of `nedbus.__all__`."""
+    """Return the page of what `nedbus` and its public modules have, each name as scripts write it after `nedbus.`."""
     named = {name: getattr(nedbus, name) for name in nedbus.__all__}
+    for module in (nedbus.frames, nedbus.health, nedbus.errors):
+        short = module.__name__.removeprefix("nedbus.")
+        named |= {f"{short}.{name}": getattr(module, name) for name in module.__all__ if name not in named}
     constants = {name: each for name, each in named.items() if not (inspect.isclass(each) or inspect.isroutine(each))}
     constants["Session"] = named["Session"]
     parts = []
@@ -46,7 +49,8 @@ def api_page() -> str:
         assert own, packages
     return page(
         "Python API",
-        "Everything is imported from `nedbus`; units are SI and the frame is NED unless a line says otherwise.",
+        "Everything is in `nedbus`, or in its modules `frames`, `health` and `errors`.",
+        "Units are SI and the frame is NED unless a line says otherwise.",
         "The classes of messages have [a page each](../messages.md).",
         *parts,
         section("Constants and types", table(["name", "is", "meaning"], map(_constant, constants.items()))),

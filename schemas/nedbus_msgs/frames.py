@@ -14,6 +14,12 @@ from typing import Final, NamedTuple
 
 from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
+__all__ = [
+    "GlobalPosition", "MapProjection", "Vector", "enu_to_ned", "euler_to_quaternion", "flu_to_frd", "frd_to_flu",
+    "ned_to_enu", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "quaternion_to_euler", "to_global", "to_local",
+    "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
+]  # fmt: skip
+
 EARTH_RADIUS: Final = 6_371_000.0
 """Radius of PX4's sphere [m]."""
 

@@ -5,6 +5,8 @@ import nedbus
 with nedbus.connect() as bus:
     for sample in bus.subscribe():
         print(sample.vehicle, sample.message.x, sample.message.y, sample.message.z)
+
+More is in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
 """
 
 from __future__ import annotations
@@ -18,8 +20,6 @@ if TYPE_CHECKING:
         TOPICS,
         Address,
         Continuous,
-        GlobalPosition,
-        MapProjection,
         Message,
         Provenance,
         Quantity,
@@ -27,25 +27,15 @@ if TYPE_CHECKING:
         Row,
         Selection,
         Topic,
-        Vector,
         VehicleLocalPosition,
         define_msg,
-        enu_to_ned,
-        flu_to_frd,
-        frd_to_flu,
-        ned_to_enu,
-        quaternion_enu_to_ned,
-        quaternion_ned_to_enu,
-        to_global,
-        to_local,
-        variances_enu_to_ned,
-        variances_ned_to_enu,
-        yaw_enu_to_ned,
-        yaw_ned_to_enu,
     )
     from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, to_array, to_message
     from nedbus_msgs.messages import *  # noqa: F403 - each by its name
 
+    from . import errors as errors
+    from . import frames as frames
+    from . import health as health
     from .client import (
         AsyncBus,
         AsyncPublisher,
@@ -53,78 +43,48 @@ if TYPE_CHECKING:
         Batch,
         Bus,
         Counts,
-        Health,
-        Histogram,
-        LogStreamStatus,
         Mode,
-        Monitor,
         Publisher,
-        Publishers,
-        RejectionReport,
-        Rejections,
         Sample,
-        ServiceStatus,
-        SourceStatus,
-        StreamHealth,
-        StreamStatus,
         Subscription,
-        Vehicles,
         connect,
         connect_async,
     )
     from .errors import (
         AddressError,
-        AddressInUseError,
         ArgumentError,
         ClosedError,
         ConfigError,
         ConnectError,
-        DecodeError,
-        EncodeError,
-        ForkError,
         InvalidMessageError,
-        LayoutError,
-        ListenError,
         NedbusError,
         NoDataError,
-        OutputError,
-        PkiError,
         ReceiveError,
         SourceError,
-        UnknownLayoutError,
     )
-    from .events import AccountReport, Condition, Event, VehicleReport
     from .recording import UtcOffset, addresses_of, align, missing_of, read, utc_of
     from .transport import Session, Tls
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "ANY", "DTYPE", "TOPICS", "AccountReport", "Address", "AddressError", "AddressInUseError", "ArgumentError",
-    "AsyncBus",
-    "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "ClosedError", "Condition", "ConfigError", "ConnectError",
-    "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition", "Health", "Histogram",
-    "InvalidMessageError", "LayoutError", "ListenError", "LogStreamStatus", "MapProjection", "Message", "MessageArray",
-    "Mode", "Monitor", "NedbusError", "NoDataError", "OutputError", "PkiError", "Provenance", "Publisher",
-    "Publishers", "Quantity", "ReceiveError", "RejectionReport", "Rejections", "ResetTracker", "Row", "Sample",
-    "Selection", "ServiceStatus", "Session", "SourceError", "SourceStatus", "StreamHealth", "StreamStatus",
-    "Subscription", "Tls", "Topic", "UnknownLayoutError", "UtcOffset", "Vector", "VehicleLocalPosition",
-    "VehicleReport", "Vehicles", "addresses_of", "align", "connect", "connect_async", "define_msg", "dtype_of",
-    "enu_to_ned", "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu", "quaternion_enu_to_ned",
-    "quaternion_ned_to_enu", "read", "to_array", "to_global", "to_local", "to_message", "utc_of",
-    "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
+    "ANY", "DTYPE", "TOPICS", "Address", "AddressError", "ArgumentError", "AsyncBus", "AsyncPublisher",
+    "AsyncSubscription", "Batch", "Bus", "ClosedError", "ConfigError", "ConnectError", "Continuous", "Counts",
+    "InvalidMessageError", "Message", "MessageArray", "Mode", "NedbusError", "NoDataError", "Provenance", "Publisher",
+    "Quantity", "ReceiveError", "ResetTracker", "Row", "Sample", "Selection", "Session", "SourceError", "Subscription",
+    "Tls", "Topic", "UtcOffset", "VehicleLocalPosition", "addresses_of", "align", "connect", "connect_async",
+    "define_msg", "dtype_of", "missing_of", "read", "to_array", "to_message", "utc_of",
 ]  # fmt: skip
 
 # Imported on first use of a name: `nedbus --version` needs none of them, and only the last two load NumPy.
-_MODULES = (
-    "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.events", "nedbus.client", "nedbus_msgs.arrays",
-    "nedbus.recording",
-)  # fmt: skip
+_MODULES = "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client", "nedbus_msgs.arrays", "nedbus.recording"
+_SUBMODULES = "errors", "frames", "health"
 
 
 def __dir__() -> list[str]:
     """Return the public names, loaded or not, for completion."""
-    return [*__all__, *(name for name in globals() if name.startswith("__"))]
+    messages = _import_module("nedbus_msgs").MESSAGES
+    return sorted({*__all__, *messages, *_SUBMODULES, *(name for name in globals() if name.startswith("__"))})
 
 
 if not TYPE_CHECKING:  # otherwise type checkers would accept any name
@@ -134,6 +94,8 @@ if not TYPE_CHECKING:  # otherwise type checkers would accept any name
         if name in __all__:
             module = next(each for each in map(_import_module, _MODULES) if name in each.__all__)
             return globals().setdefault(name, getattr(module, name))
+        if name in _SUBMODULES:
+            return _import_module(f"{__name__}.{name}")
         if name in _import_module("nedbus_msgs").MESSAGES:
             return getattr(_import_module("nedbus_msgs.messages"), name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

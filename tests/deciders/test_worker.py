@@ -9,12 +9,12 @@ from typing import Any, cast
 
 import pytest
 
-from nedbus import SourceStatus
 from nedbus.client import PublisherRegistry
 from nedbus.daemon import Planned
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.events import Account
+from nedbus.health import SourceStatus
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition, decode

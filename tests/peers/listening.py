@@ -59,7 +59,7 @@ class Listener:
         self._events.close()
 
 
-def status_of_source(bus: nedbus.Bus) -> nedbus.SourceStatus:
+def status_of_source(bus: nedbus.Bus) -> nedbus.health.SourceStatus:
     """Return the status of the service's only source, or an empty one before there is one."""
     services = bus.services()
-    return services[0].sources[0] if services else nedbus.SourceStatus()
+    return services[0].sources[0] if services else nedbus.health.SourceStatus()

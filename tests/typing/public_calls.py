@@ -51,6 +51,7 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
     assert_type(bus.subscribe(nedbus.SensorGps, mode="every").receive().message.fix_type, int)
     gps = bus.subscribe(nedbus.SensorGps, topic="vehicle_gps_position", vehicle=7, max_rate=5)
     assert_type(gps, nedbus.Subscription[nedbus.SensorGps])
+    assert_type(bus.subscribe(topic="estimator_local_position").receive().message.x, float)
     assert_type(bus.subscribe(WheelEncoders).receive().message.wheel_speed, float)
     assert_type(bus.subscribe("*"), nedbus.Subscription[nedbus.Message])
     assert_type(bus.subscribe(any_topic).receive().message.timestamp, int)
@@ -62,12 +63,12 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
 
 def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
     """A function that takes a message takes a row as well."""
-    assert_type(nedbus.to_global(sample.message), nedbus.GlobalPosition | None)
-    assert_type(nedbus.to_global(row.message), nedbus.GlobalPosition | None)
-    nedbus.to_global(row.message).latitude  # type: ignore[union-attr] # None without a global origin
+    assert_type(nedbus.frames.to_global(sample.message), nedbus.frames.GlobalPosition | None)
+    assert_type(nedbus.frames.to_global(row.message), nedbus.frames.GlobalPosition | None)
+    nedbus.frames.to_global(row.message).latitude  # type: ignore[union-attr] # None without a global origin
     assert_type(nedbus.ResetTracker().add(row.message), nedbus.Continuous)
-    nedbus.Monitor().add(row)
-    nedbus.Monitor().add(sample)
+    nedbus.health.Monitor().add(row)
+    nedbus.health.Monitor().add(sample)
     sample.message.x = 1.0  # type: ignore[misc] # messages are frozen
     assert_type(sample.sent, int | None)
 

@@ -82,12 +82,10 @@ class AsyncBus:
 
     @overload
     def subscribe(
-        self, message: type[M_co], *, topic: str = ..., **options: Unpack[Subscribe]
+        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Subscribe]
     ) -> AsyncSubscription[M_co]: ...
     @overload
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
-    @overload
-    def subscribe(self, **options: Unpack[Subscribe]) -> AsyncSubscription[VehicleLocalPosition]: ...
     def subscribe(
         self,
         message: type[Message] | str = VehicleLocalPosition,
@@ -113,12 +111,10 @@ class AsyncBus:
 
     @overload
     async def latest(
-        self, message: type[M_co], *, topic: str = ..., **options: Unpack[Query]
+        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Query]
     ) -> list[Sample[M_co]]: ...
     @overload
     async def latest(self, message: str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
-    @overload
-    async def latest(self, **options: Unpack[Query]) -> list[Sample[VehicleLocalPosition]]: ...
     async def latest(self, *message: Any, **options: Any) -> Any:
         """Query the last sample of each key; see `Bus.latest`."""
         return await self._in_thread(self._blocking.latest, *message, **options)

@@ -76,12 +76,10 @@ class Bus:
 
     @overload
     def subscribe(
-        self, message: type[M_co], *, topic: str = ..., **options: Unpack[Subscribe]
+        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Subscribe]
     ) -> Subscription[M_co]: ...
     @overload
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> Subscription[Message]: ...
-    @overload
-    def subscribe(self, **options: Unpack[Subscribe]) -> Subscription[VehicleLocalPosition]: ...
     def subscribe(
         self,
         message: type[Message] | str = VehicleLocalPosition,
@@ -118,11 +116,11 @@ class Bus:
         return Subscription(receiver, pending_queue, owner=self)
 
     @overload
-    def latest(self, message: type[M_co], *, topic: str = ..., **options: Unpack[Query]) -> list[Sample[M_co]]: ...
+    def latest(
+        self, message: type[M_co] = ..., *, topic: str = ..., **options: Unpack[Query]
+    ) -> list[Sample[M_co]]: ...
     @overload
     def latest(self, message: str, **options: Unpack[Query]) -> list[Sample[Message]]: ...
-    @overload
-    def latest(self, **options: Unpack[Query]) -> list[Sample[VehicleLocalPosition]]: ...
     def latest(
         self,
         message: type[Message] | str = VehicleLocalPosition,

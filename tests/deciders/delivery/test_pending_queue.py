@@ -222,7 +222,7 @@ def test_loss_of_a_long_outage_is_counted() -> None:
 def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
     """Look up the unknown layouts of these samples, and wait for the replies."""
     for payload in payloads:
-        with suppress(nedbus.DecodeError):
+        with suppress(nedbus.errors.DecodeError):
             lookup.check(codec_of(DEFAULT), payload)
     lookup.wait()
 
@@ -272,7 +272,7 @@ def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
         return {("VehicleLocalPosition", 9): {"timestamp": "uint64", "x": "float32"}}
 
     lookup = LayoutLookup(find)
-    with pytest.raises(nedbus.UnknownLayoutError):
+    with pytest.raises(nedbus.errors.UnknownLayoutError):
         lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
     assert asked.wait(DEADLINE)
     assert not lookup.newer(DEFAULT)

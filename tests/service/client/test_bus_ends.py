@@ -355,7 +355,7 @@ publish, receive = lambda: publisher.publish({"timestamp": 2}), lambda: next(sub
 for ask in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
     try:
         ask()
-    except nedbus.ForkError as exc:
+    except nedbus.errors.ForkError as exc:
         print(exc)
 sys.exit(7)
 """

@@ -47,10 +47,10 @@ def serve(run_nedbus: Start) -> Iterator[Serve]:
         yield start_service
 
 
-def source_of(bus: nedbus.Bus, number: int = 0) -> nedbus.SourceStatus:
+def source_of(bus: nedbus.Bus, number: int = 0) -> nedbus.health.SourceStatus:
     """Return what the service says of a source; an empty status while it does not answer."""
     sources = [status.sources for status in bus.services()]
-    return sources[0][number] if sources and sources[0] else nedbus.SourceStatus()
+    return sources[0][number] if sources and sources[0] else nedbus.health.SourceStatus()
 
 
 def has_state(bus: nedbus.Bus, state: str, number: int = 0) -> Callable[[], bool]:

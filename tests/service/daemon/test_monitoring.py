@@ -18,12 +18,13 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus import SourceStatus, StreamHealth, StreamStatus, clock
+from nedbus import clock
 from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.worker import State
 from nedbus.events import Account, AccountReport, VehicleReport
+from nedbus.health import SourceStatus, StreamHealth, StreamStatus
 from nedbus.monitoring import Exporter, HttpServer, Page, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page, stream_metrics
 from nedbus.monitoring.pages import vehicles_page

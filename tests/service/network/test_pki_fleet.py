@@ -224,9 +224,9 @@ def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path) -> N
     before = sorted(pki.iterdir())
     (tmp_path / "taken").mkdir()
     for vehicle, output, router, error, reason in (
-        ("7", tmp_path / "taken", routers[0], nedbus.PkiError, "exists: it is not overwritten"),
-        ("1", tmp_path / "new", routers[0], nedbus.PkiError, "exists: it is not overwritten"),
-        ("7", Path("/proc/nowhere/new"), routers[0], nedbus.PkiError, "cannot create"),
+        ("7", tmp_path / "taken", routers[0], nedbus.errors.PkiError, "exists: it is not overwritten"),
+        ("1", tmp_path / "new", routers[0], nedbus.errors.PkiError, "exists: it is not overwritten"),
+        ("7", Path("/proc/nowhere/new"), routers[0], nedbus.errors.PkiError, "cannot create"),
         ("7", tmp_path / "new", "tcp/10.0.0.1:7447", nedbus.ConfigError, "does not use TLS"),
         ("../7", tmp_path / "new", routers[0], AddressError, "vehicle"),
         ("x" * 60, tmp_path / "new", routers[0], AddressError, "vehicle"),
