@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import re
 import shutil
 import struct
 from collections.abc import Iterator, Mapping
@@ -18,7 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+import nedbus_msgs.messages
 from docs.generator import committed
+from docs.generator.messages import module_of
 from nedbus_msgs import (
     ALL,
     MESSAGES,
@@ -372,3 +375,10 @@ def test_thirteenth_message_is_one_file(tmp_path: Path, start: Start, endpoint: 
     process = start("-c", program, str(log), endpoint, measured=False, fresh=True)
     assert process.wait() == 0, process.err
     assert process.out == "used 20 WheelEncoders\n"
+
+
+def test_type_checkers_know_each_message() -> None:
+    """`messages/__init__.py` has a line for each file: without one a type checker rejects its class."""
+    lines = Path(str(nedbus_msgs.messages.__file__)).read_text()
+    shown = set(re.findall(r"^    from \.(\w+) import (\w+) as \2$", lines, re.MULTILINE))
+    assert shown == {(module_of(definition), name) for name, definition in MESSAGES.items()}
