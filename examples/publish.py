@@ -10,14 +10,6 @@ with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     publisher = bus.publisher("external_ins_local_position", vehicle="mine")
     while True:
         now = time.monotonic()
-        publisher.publish(
-            nedbus.VehicleLocalPosition(
-                timestamp=int(now * 1e6),
-                xy_valid=True,
-                z_valid=True,
-                x=10 * math.cos(now),
-                y=10 * math.sin(now),
-                z=-5.0,
-            )
-        )
+        position = {"x": 10 * math.cos(now), "y": 10 * math.sin(now), "z": -5.0}
+        publisher.publish({**position, "xy_valid": True, "z_valid": True})  # its timestamp is the time since boot
         time.sleep(0.02)

@@ -139,6 +139,7 @@ class SourceOutput:
         start = time.perf_counter()
         try:
             fields = upgrade_fields(stream.publisher.definition, message.fields)
+            fields.setdefault("timestamp", None)  # else invalid: it is never this host's
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
             self._reject_invalid(message, _rule_of(exc), exc.reason)

@@ -334,6 +334,16 @@ def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) 
     assert publisher.published == 1
 
 
+def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """Fields without a timestamp get the clock of PX4's own messages, in us, and it does not count as missing."""
+    publisher, before = client.publisher(VLP, vehicle="1"), time.monotonic_ns() // 1000
+    publisher.publish({"x": 2.0})
+    wait_for(bus.latest, what="the message")
+    [last] = bus.latest()
+    assert before <= last.message.timestamp <= time.monotonic_ns() // 1000
+    assert "timestamp" not in last.missing
+
+
 def test_two_publishers_of_one_address_are_refused(client: nedbus.Bus) -> None:
     """A second publisher of an address is refused, as it would mix two flights."""
     publisher = client.publisher(VLP, vehicle="1")

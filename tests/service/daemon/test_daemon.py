@@ -18,6 +18,9 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus.daemon.output import SourceOutput
+from nedbus.events import Account
+from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition
 from tests.flights.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
@@ -112,6 +115,13 @@ def take(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[zenoh.Sample]
 
     wait_for(are_there, what=f"{count} samples")
     return samples
+
+
+def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
+    """A source's message never gets the time of this host, as a script's does."""
+    output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, Account())
+    output.publish_live(SourceMessage(0.0, Address("1", VLP), {"x": 1.0}))
+    assert (output.published, output.rejected) == (0, 1)
 
 
 def test_replay_at_full_speed_loses_nothing_to_a_slow_reader(tmp_path: Path, serve: Serve) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from functools import partial
@@ -88,6 +89,7 @@ class Publisher:
         """Publish a message, or validate a dict of fields and publish them as a message.
 
         A Message was validated when it was created, and is not validated again.
+        A dict without `timestamp` gets the time since this host booted, as PX4's own messages have that of theirs.
         Readers see the fields that were not provided in `sample.missing`.
 
         Raises TypeError for another type of message, InvalidMessageError for invalid fields, EncodeError for a message
@@ -96,6 +98,8 @@ class Publisher:
         if isinstance(message, self.definition.model):
             self._put(self._codec.encode(message), message.__pydantic_fields_set__)
         elif isinstance(message, (dict, Mapping)):  # dict first, which is faster
+            if "timestamp" not in message:
+                message = {"timestamp": time.monotonic_ns() // 1000, **message}
             self._put(self._codec.encode_fields(message), message.keys())
         else:
             name, given = self.definition.name, type(message).__name__
