@@ -21,7 +21,7 @@ from pathlib import Path
 from pyulog import ULog
 from tests.flights.ulogs import LOGS
 
-from nedbus.recording import read_ulog
+from nedbus.recording import Flight
 
 REPLAY = """
 import resource, sys, time
@@ -48,7 +48,7 @@ def main() -> None:
     for path in logs:
         ours, theirs = [], []
         for _ in range(options.repeat):
-            ours.append(seconds(partial(read_ulog, path, topics=None)))
+            ours.append(seconds(partial(Flight, path, topics=None)))
             theirs.append(seconds(partial(ULog, str(path))))
         medians = [statistics.median(ours), statistics.median(theirs)]
         total = [so_far + median for so_far, median in zip(total, medians, strict=True)]

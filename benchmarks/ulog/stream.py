@@ -11,6 +11,7 @@ import argparse
 import json
 import struct
 import time
+from functools import cache, partial
 
 from pymavlink.dialects.v20 import common as dialect
 from tests.peers.px4_log_stream import (  # fmt: skip
@@ -23,7 +24,7 @@ from tests.peers.px4_log_stream import (  # fmt: skip
 )
 
 from benchmarks.processes import cpu_seconds, end, expect, free_port, nedbus_process, start, tell
-from nedbus.ulog import Data, UlogParser, address_of
+from nedbus.ulog import Data, LoggedStream, UlogParser
 
 RATE = 200_000  # bytes of ULog per second
 NATURAL = 69_800  # that of the recording in real time
@@ -48,6 +49,7 @@ class Arrivals:
     def __init__(self) -> None:
         self.times: dict[Key, float] = {}
         self._parser = UlogParser(verify=False)
+        self._stream_of = cache(partial(LoggedStream, "1"))
 
     def add(self, frame: bytes) -> None:
         """Take a frame before it is sent."""
@@ -55,9 +57,8 @@ class Arrivals:
         if message := stream_message(frame):
             for record in self._parser.feed(message.data):
                 if isinstance(record, Data):
-                    timestamp = record.subscription.decode(record.payload)["timestamp"]
-                    assert isinstance(timestamp, int)
-                    self.times[str(address_of("1", record.subscription)), timestamp] = time.monotonic()
+                    stream = self._stream_of(record.subscription)
+                    self.times[str(stream.address), stream.decode(record.payload)["timestamp"]] = time.monotonic()
         elif number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
             (boot_ms,) = struct.unpack_from("<I", payload)
             self.times["1/vehicle_local_position", boot_ms * 1000] = time.monotonic()

@@ -25,8 +25,9 @@ def said_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, in
     parser = UlogParser(verify=True)
     records = [*parser.feed(log if isinstance(log, bytes) else log.read_bytes()), *parser.close()]
     messages = (texts or Texts()).merge(records)
-    found = [SPOKEN.decode(each.payload) for each in messages if isinstance(each, Data) and each.subscription is SPOKEN]
-    return [tuple(fields.values()) for fields in found]  # type: ignore[misc] # three values
+    spoken = (each for each in messages if isinstance(each, Data) and each.subscription is SPOKEN)
+    found = [SPOKEN.layout.decode(each.payload) for each in spoken]
+    return [tuple(fields.values()) for fields in found]
 
 
 class UlogWriter:

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from .plot import MAX_STREAMS, draw
     from .reading import read
     from .recorder import Recorder
-    from .ulog import UlogTopic, UlogTopics, read_ulog
-    from .ulog_reader import UlogReader, UlogStream
+    from .ulog_reader import UlogReader
     from .utc import UtcOffset, utc_of
 else:
     # No submodule may share the name of an export: importing it would replace the export.
@@ -28,8 +27,7 @@ else:
         ("", "arrays"): "Flight addresses_of missing_of",
         ("", "reading"): "read",
         ("", "flight_files"): "check_recording distinct_names find_format format_of matching open_flight",
-        ("", "ulog"): "UlogTopic UlogTopics read_ulog",
-        ("", "ulog_reader"): "UlogReader UlogStream",
+        ("", "ulog_reader"): "UlogReader",
         ("", "utc"): "UtcOffset utc_of",
         ("mcap", "mcap_reader"): "RecordedMessage RecordedStream RecordingReader",
         ("mcap", "recorder"): "Recorder",
@@ -40,7 +38,6 @@ else:
 
 __all__ = [
     "MAX_STREAMS", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader", "RecordingWriter",
-    "UlogReader", "UlogStream", "UlogTopic", "UlogTopics", "UtcOffset", "addresses_of", "align", "check_recording",
-    "distinct_names", "draw", "find_format", "format_of", "matching", "missing_of", "open_flight", "read", "read_ulog",
-    "utc_of",
+    "UlogReader", "UtcOffset", "addresses_of", "align", "check_recording", "distinct_names", "draw", "find_format",
+    "format_of", "matching", "missing_of", "open_flight", "read", "utc_of",
 ]  # fmt: skip

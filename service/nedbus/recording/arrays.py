@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
@@ -14,11 +15,11 @@ from pydantic import ValidationError
 
 from nedbus.errors import ArgumentError, DecodeError
 from nedbus.extras import needs
+from nedbus.ulog import LoggedStream
 from nedbus_msgs import TOPICS, Address, Definition, Message, decode_text, decode_with, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .flight_files import find_format
-from .ulog import UlogTopic, read_ulog
 from .ulog_reader import UlogReader
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class Flight:
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
         self.definitions: dict[Address, Definition[Any]]
         self._file: Any
-        self._topics: dict[Address, UlogTopic] = {}
+        self._payloads = defaultdict[LoggedStream, bytearray](bytearray)  # of a log
         self._invalid: list[str] = []
         self._decode: Callable[[Definition[Any], Sequence[Any]], _Decoded] = _decode_cdr
         self.start = 0
@@ -75,10 +76,11 @@ class Flight:
             reader = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
             self._file, self._decode, self.definitions = reader, _decode_fields, reader.find_definitions()
         else:
-            log = read_ulog(path, topics=topics)
-            self._file, self._topics = log.reader, log.topics
-            self.start = log.reader.start
-            self.definitions = {each: topic.definition for each, topic in log.topics.items()}
+            log = self._file = UlogReader(path, topics=topics, vehicle=None, default_vehicle="1")
+            for stream, payload in log.messages():
+                self._payloads[stream] += payload
+            self.start = log.start
+            self.definitions = {address: stream.definition for address, stream in log.streams.items()}
         self.addresses = sorted(self.definitions)
 
     def __enter__(self) -> Self:
@@ -106,7 +108,8 @@ class Flight:
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
         if isinstance(self._file, UlogReader):
-            return {address: self._valid(address, _decode_ulog(self._topics[address])) for address in addresses}
+            streams, payloads = self._file.streams, self._payloads
+            return {each: self._valid(each, _decode_ulog(streams[each], payloads[streams[each]])) for each in addresses}
         parts = {address: [self._decode(self.definitions[address], [])] for address in addresses}
         recorded, logged, ages = self._file.messages(parts.keys()), list[int](), list[npt.NDArray[np.float64]]()
         while chunk := list(islice(recorded, _CHUNK)):
@@ -154,10 +157,20 @@ class _Decoded(NamedTuple):
         return cls(arrays_of(definition).absent(count), np.zeros(count, bool), absent)
 
 
-def _decode_ulog(topic: UlogTopic) -> _Decoded:
-    definition, columns = topic.definition, topic.columns
-    decoded, plan = _Decoded.empty(definition, len(columns["timestamp"])), definition.plan(columns)
+def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
+    """Decode the messages of a log vectorized; decode those with fields of another type one by one."""
+    table: npt.NDArray[np.void] = np.frombuffer(payloads, np.dtype(stream.subscription.layout.dtype))
+    definition, columns = stream.definition, {name: table[name] for name in stream.names}
+    decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(columns)
     messages = decoded.messages
+    for name in definition.all_fields - plan.provided:
+        decoded.absent[name] = True
+    rows = [stream.decode(row.tobytes()) for row in table] if stream.converted else []
+    for name, kind in stream.converted.items():
+        values = np.array([row.get(name, kind.absent) for row in rows], str if kind.is_text else kind.form[-1])
+        columns[name] = np.char.encode(values, "utf-8") if kind.is_text else values
+        if name in plan.names:
+            decoded.absent[name] = [name not in row for row in rows]
     for name, old in plan.names.items():
         messages[name] = columns[old]
     for name, (old, convert) in plan.converted.items():
@@ -170,10 +183,6 @@ def _decode_ulog(topic: UlogTopic) -> _Decoded:
         if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
             wrong = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1 is invalid
             decoded.valid[wrong.reshape(len(messages), -1).any(axis=1)] = False
-    for name in definition.all_fields - plan.provided:
-        decoded.absent[name] = True
-    for name in plan.names.keys() & topic.absent.keys():
-        decoded.absent[name] = topic.absent[name]
     return decoded
 
 

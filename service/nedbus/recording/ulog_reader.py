@@ -4,48 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from zlib import crc32
 
 from nedbus import ulog
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import TOPICS, Address, Definition
+from nedbus_msgs import TOPICS, Address
 
 from .flight_files import open_flight
 
 _CHUNK: Final = 2**17  # bytes read at a time
 _MAX_NAMED: Final = 5  # damaged places in the warnings
 _MAX_TOPICS: Final = 10  # in an error
-
-
-@dataclass(slots=True, eq=False)
-class UlogStream:
-    """The messages of one subscription.
-
-    `fitting`: for its fields of another type than the message has.
-    `first`: the stream that has its address already, as PX4 can log a topic twice. `checksum`: of the messages so far,
-    if the topic has several subscriptions.
-    """
-
-    address: Address
-    definition: Definition[Any]
-    subscription: ulog.Subscription
-    fitting: ulog.Fitting
-    first: UlogStream | None
-    checksum: int | None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Its fields."""
-        return tuple(field.name for field in self.subscription.fields)
-
-    def decode(self, payload: bytes) -> dict[str, object]:
-        """Return the fields of a message."""
-        fields = self.subscription.decode(payload)
-        self.fitting.apply(fields)
-        return fields
 
 
 class UlogReader:
@@ -66,10 +37,11 @@ class UlogReader:
         self._parser, self._texts = ulog.UlogParser(verify=True), ulog.Texts()
         self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
-        self._by_id: dict[int, UlogStream | None] = {}
-        self._seconds: list[UlogStream] = []
+        self._by_id: dict[int, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
-        self.streams: dict[Address, UlogStream] = {}
+        self._checksums: dict[ulog.LoggedStream, int] = {}  # of the messages so far, for topics with several
+        self._firsts: dict[ulog.LoggedStream, ulog.LoggedStream] = {}  # by the second, as PX4 can log a topic twice
+        self.streams: dict[Address, ulog.LoggedStream] = {}
         self.dropout = 0.0
         self.damaged = False
 
@@ -80,15 +52,15 @@ class UlogReader:
         ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
         ends |= {f"left out: {self._texts.limit.omitted} texts beyond 100 a second": self._texts.limit.omitted > 0}
         ends |= {self._texts.problem: bool(self._texts.problem)}
-        reasons = [reason for stream in self.streams.values() for reason in stream.fitting.unfit.values()]
+        reasons = [reason for stream in self.streams.values() for reason in stream.unfit.values()]
         return self._warnings + reasons + [text for text, holds in ends.items() if holds]
 
-    def messages(self) -> Iterator[tuple[UlogStream, bytes]]:
+    def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:
         """Yield each message as its stream and payload.
 
         Raises SourceError if the file is not a ULog file, or has none of the topics.
         """
-        streams, data = self._by_id, ulog.Data
+        streams, checksums, firsts, data = self._by_id, self._checksums, self._firsts, ulog.Data
         for records in self._records():
             for record in self._texts.merge(records):
                 if not isinstance(record, data):
@@ -100,12 +72,12 @@ class UlogReader:
                 except KeyError:
                     stream = streams[subscription.message_id] = self._open(subscription)
                 if stream is not None:
-                    if stream.checksum is not None:
-                        stream.checksum = crc32(payload, stream.checksum)
-                    if stream.first is None:
+                    if stream in checksums:
+                        checksums[stream] = crc32(payload, checksums[stream])
+                    if stream not in firsts:
                         yield stream, payload
-        for second in self._seconds:
-            if second.first is not None and second.checksum != second.first.checksum:
+        for second, first in firsts.items():
+            if checksums.get(second) != checksums.get(first):
                 number = second.subscription.multi_id
                 self._warnings.append(f"skipped a second {second.address.topic} [{number}] with other messages")
                 self.damaged |= second.address.instance is not None or number == 0
@@ -152,27 +124,26 @@ class UlogReader:
             if self._places <= _MAX_NAMED:
                 self._warnings.append(f"{'truncated' if record.is_end else 'damaged'}: {record.reason}")
 
-    def _open(self, subscription: ulog.Subscription) -> UlogStream | None:
+    def _open(self, subscription: ulog.Subscription) -> ulog.LoggedStream | None:
         """Return the stream of a subscription with its first message; None if it is not wanted, or cannot be used."""
-        topic, names = subscription.name, {field.name for field in subscription.fields}
+        topic = subscription.name
         if self._topics is not None and topic not in self._topics:
             return None
         self._vehicle = self._vehicle or self._system_id
         try:
-            definition, address = ulog.definition_of(subscription), ulog.address_of(self._vehicle, subscription)
+            stream = ulog.LoggedStream(self._vehicle, subscription)
         except ValueError as exc:
             self._warnings.append(f"skipped {topic}: {exc}")
             self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
             return None
-        if lacking := ", ".join(sorted(definition.always - names)):
+        if lacking := ", ".join(sorted(stream.definition.always.difference(stream.names))):
             self._warnings.append(f"{topic} [{subscription.multi_id}]: the definition of {lacking} is damaged")
             self.damaged = True
-        if "timestamp" not in names:
+        if "timestamp" not in stream.names:
             return None
-        fitting, checksum = ulog.Fitting(definition, subscription), 0 if self._subscribed[topic] > 1 else None
-        stream = UlogStream(address, definition, subscription, fitting, self.streams.get(address), checksum)
-        if stream.first is None:
-            self.streams[address] = stream
-        else:
-            self._seconds.append(stream)
+        if self._subscribed[topic] > 1:
+            self._checksums[stream] = 0
+        first = self.streams.setdefault(stream.address, stream)
+        if first is not stream:
+            self._firsts[stream] = first
         return stream

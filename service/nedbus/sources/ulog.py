@@ -8,8 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Final, cast
 
-from nedbus.recording import UlogReader, UlogStream
-from nedbus.ulog import SPOKEN
+from nedbus.recording import UlogReader
+from nedbus.ulog import SPOKEN, LoggedStream
 from nedbus_msgs import ALL, DEFAULT, Address
 
 from .options import RecordedOptions
@@ -78,10 +78,10 @@ class _Clock:
         self._now = self._due = self._behind = 0  # us; messages
         self._is_running = False
 
-    def pace(self, reader: UlogReader) -> Iterator[tuple[float, UlogStream, dict[str, object]]]:
+    def pace(self, reader: UlogReader) -> Iterator[tuple[float, LoggedStream, dict[str, object]]]:
         """Yield due time [s since the start], stream and fields of each message; due times do not decrease."""
-        newest: dict[UlogStream, int] = {}
-        held: tuple[int, UlogStream, dict[str, object]] | None = None
+        newest: dict[LoggedStream, int] = {}
+        held: tuple[int, LoggedStream, dict[str, object]] | None = None
         for stream, payload in reader.messages():
             fields = stream.decode(payload)
             time = cast("int", fields["timestamp"])
@@ -129,12 +129,12 @@ def _warnings_of(reader: UlogReader) -> list[str]:
     return warnings
 
 
-def _is_newer(stream: UlogStream) -> bool:
+def _is_newer(stream: LoggedStream) -> bool:
     """Return whether a log may be newer than this version: it has all fields of the newest known layout."""
     newest = [layout for layout in stream.definition.layouts.values() if layout.name != ALL][-1]
     return newest.types.keys() <= set(stream.names)
 
 
-def _layout_name(stream: UlogStream) -> str:
+def _layout_name(stream: LoggedStream) -> str:
     layout = stream.definition.find_layout(stream.names)
     return layout.name if layout else "newer than 1.16" if _is_newer(stream) else "1.12 or older"

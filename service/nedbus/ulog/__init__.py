@@ -1,6 +1,6 @@
 """ULog, PX4's log format: an incremental parser for files and streams, and the definitions of logged messages."""
 
-from .definitions import Fitting, address_of, definition_of
+from .definitions import LoggedStream
 from .layout import PayloadField, PayloadLayout
 from .parser import UlogParser
 from .records import (
@@ -24,8 +24,7 @@ from .records import (
 from .texts import SPOKEN, TextLimit, Texts, to_statement
 
 __all__ = [
-    "SPOKEN", "Damage", "Data", "Dropout", "Fitting", "Format", "Header", "Information", "LoggedText",
+    "SPOKEN", "Damage", "Data", "Dropout", "Format", "Header", "Information", "LoggedStream", "LoggedText",
     "MultiInformation", "Parameter", "ParameterDefault", "PayloadField", "PayloadLayout", "Record", "Subscription",
-    "Sync", "TextLimit", "Texts", "UlogError", "UlogParser", "Unsubscription", "Value", "address_of", "definition_of",
-    "to_statement",
+    "Sync", "TextLimit", "Texts", "UlogError", "UlogParser", "Unsubscription", "Value", "to_statement",
 ]  # fmt: skip

@@ -52,7 +52,7 @@ class PayloadLayout:
             end, count = offset + kind.count * kind.size, count + kind.count
         self._unpack = struct.Struct(form).unpack_from
 
-    def decode(self, payload: bytes) -> dict[str, object]:
+    def decode(self, payload: bytes) -> dict[str, Any]:
         """Return the fields of a payload of at least `size` bytes: int, float, bool, str, or tuples of numbers."""
         values = self._unpack(payload)
         fields: dict[str, Any] = {name: values[place] for name, place in self._places}

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Mapping
 from enum import Enum, auto
 from itertools import islice
-from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from .layout import Formats
@@ -63,6 +61,7 @@ class UlogParser:
 
     `verify`: for a file, which has no checksums: messages are returned only if the next record follows them, and after
     damage the next records are searched. Without, lengths are trusted, as those of a transport with checksums.
+    `subscriptions`: those whose data can be decoded, by message id.
     `undecodable`: number of messages without a subscription that fits them.
     """
 
@@ -70,7 +69,7 @@ class UlogParser:
         self.undecodable = 0
         self._verify = verify
         self._formats = Formats()
-        self._subscriptions: dict[int, Subscription] = {}
+        self.subscriptions: dict[int, Subscription] = {}
         self._known: dict[bytes, tuple[Subscription, int, int]] = {}
         """By the first five bytes of a record: its subscription, its length, and the length without padding."""
         self._buffer = b""
@@ -78,11 +77,6 @@ class UlogParser:
         self._boundaries: list[int] | None = None  # offsets of appended data; None before the first record
         self._damage: int | None = None  # offset at which the search for records began
         self._records: list[Record] = []
-
-    @property
-    def subscriptions(self) -> Mapping[int, Subscription]:
-        """The subscriptions whose data can be decoded, by message id."""
-        return MappingProxyType(self._subscriptions)
 
     def feed(self, data: bytes) -> list[Record]:
         """Return the records that these bytes complete; raise UlogError if it is no ULog, or one of a newer version."""
@@ -288,24 +282,25 @@ class UlogParser:
     def _apply(self, record: Record) -> list[Record]:
         """Store a definition, and return it if it is new; raise ValueError if it cannot be used."""
         if isinstance(record, Subscription):
-            old = self._subscriptions.get(record.message_id)
+            old = self.subscriptions.get(record.message_id)
             if old is not None:
                 if (old.multi_id, old.name) != (record.multi_id, record.name):
                     raise ValueError(f"the message id of {old.name} is also that of {record.name}, which is ignored")
                 return []
             try:
-                if len(self._subscriptions) == _MAX_SUBSCRIPTIONS:
+                if len(self.subscriptions) == _MAX_SUBSCRIPTIONS:
                     raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
                 record = record._replace(layout=self._formats.layout(record.name))
             except ValueError as exc:
                 raise ValueError(f"{record.name} cannot be decoded: {exc}") from exc
-            self._subscriptions[record.message_id] = record
-            for size in range(record.size, record.size + min(record.layout.padding, _MAX_PADDING) + 1):
+            self.subscriptions[record.message_id] = record
+            used = record.layout.size
+            for size in range(used, used + min(record.layout.padding, _MAX_PADDING) + 1):
                 head = struct.pack("<HBH", size + 2, ord("D"), record.message_id)
-                self._known[head] = record, size + _DATA_HEADER, record.size + _DATA_HEADER
+                self._known[head] = record, size + _DATA_HEADER, used + _DATA_HEADER
         elif isinstance(record, Format):
             self._formats.add(record.name, record.fields)
         elif isinstance(record, Unsubscription):
-            old = self._subscriptions.pop(record.message_id, None)
+            old = self.subscriptions.pop(record.message_id, None)
             self._known = {head: known for head, known in self._known.items() if known[0] is not old}
         return [record]

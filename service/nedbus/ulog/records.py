@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from nedbus_msgs import BASES
 
-from .layout import BASIC_TYPES, FIELD, PayloadField, PayloadLayout
+from .layout import BASIC_TYPES, FIELD, PayloadLayout
 
 SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 """Content of a sync record."""
@@ -81,20 +81,6 @@ class Subscription(NamedTuple):
     multi_id: int
     name: str
     layout: PayloadLayout
-
-    @property
-    def fields(self) -> tuple[PayloadField, ...]:
-        """The fields of its messages, without padding."""
-        return self.layout.fields
-
-    @property
-    def size(self) -> int:
-        """Bytes of a payload."""
-        return self.layout.size
-
-    def decode(self, payload: bytes) -> dict[str, object]:
-        """Return the fields of a payload of at least `size` bytes: int, float, bool, or tuples of them."""
-        return self.layout.decode(payload)
 
 
 class Unsubscription(NamedTuple):

@@ -97,9 +97,9 @@ class Texts:
             if self._metadata is None and not self.problem:  # the first metadata hold
                 self._packed = ((self._packed if record.continued else b"") + record.value)[:MAX_PACKED]
         elif isinstance(record, Data) and record.subscription.name == "event":
-            return self._read_event(record.subscription.decode(record.payload))
+            return self._read_event(record.subscription.layout.decode(record.payload))
         elif isinstance(record, Data) and record.subscription.name == "vehicle_status":
-            self._nav_state = int(record.subscription.decode(record.payload)["nav_state"])  # type: ignore[call-overload]
+            self._nav_state = int(record.subscription.layout.decode(record.payload)["nav_state"])
         return None
 
     def _read_event(self, fields: dict[str, Any]) -> LoggedText | None:

@@ -14,7 +14,7 @@ import pytest
 
 import nedbus
 from nedbus.client import LogStreamStatus
-from nedbus.recording import read_ulog
+from nedbus.recording import Flight
 from tests.peers.command_line import run_command
 from tests.peers.http_pages import Pages
 from tests.peers.ports import free_endpoint, free_port
@@ -63,7 +63,8 @@ def test_stream_in_another_process(run_nedbus: Start, tmp_path: Path) -> None:
         service.signal(signal.SIGTERM)
         assert service.wait() == 0, service.err
         assert [each for each in peer.commands if each in (START, STOP)][-1] == STOP
-    assert {address.topic for address in read_ulog(saved, topics=None).topics} >= {"vehicle_local_position", "event"}
+    with Flight(saved, topics=None) as flight:
+        assert {address.topic for address in flight.addresses} >= {"vehicle_local_position", "event"}
 
 
 @pytest.mark.process

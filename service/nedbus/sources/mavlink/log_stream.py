@@ -10,11 +10,11 @@ from typing import Any, Final
 
 from nedbus import ulog
 from nedbus.client import LogStreamStatus
-from nedbus.errors import AddressError, OutputError
+from nedbus.errors import OutputError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus_msgs import DEFAULT_TOPIC, Address, Definition
+from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .log_client import LogStatus, LogStreamClient
 from .log_file import LogFile
@@ -29,8 +29,6 @@ _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _PIECE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
-
-_Route = tuple[ulog.Subscription, Address, Definition[Any], ulog.Fitting]
 
 
 class LogStream:
@@ -49,7 +47,6 @@ class LogStream:
         self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
         self._last_piece: float | None = None
         self._owed = 0  # losses that the next message reports
-        self._unsynchronised = 0  # pieces since the last gap
         self._clock: tuple[float, float] | None = None  # the vehicle's minus ours [s], and when it was measured
         self._round_trip = math.inf
         self._window_start = self._rate = self._delays = 0.0
@@ -60,7 +57,7 @@ class LogStream:
     def _restart(self) -> None:
         """Forget the definitions: those of the next stream may differ."""
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.Texts()
-        self._routes: dict[int, _Route | None] = {}
+        self._streams: dict[int, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
 
@@ -97,16 +94,15 @@ class LogStream:
         self._undecodable += known.undecodable - before
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
-                route = self._routes.get(record.subscription.message_id)
-                if route is None or route[0] is not record.subscription:
-                    route = yield from self._find_route(record.subscription)
-                if route is not None:
-                    fields = record.subscription.decode(record.payload)
-                    told = len(route[3].unfit)
-                    route[3].apply(fields)
-                    for name, reason in [*route[3].unfit.items()][told:]:
+                stream = self._streams.get(record.subscription.message_id)
+                if stream is None or stream.subscription is not record.subscription:
+                    stream = yield from self._open_stream(record.subscription)
+                if stream is not None:
+                    told = len(stream.unfit)
+                    fields = stream.decode(record.payload)
+                    for name, reason in [*stream.unfit.items()][told:]:
                         yield Rejection(f"{self._name} {name}", reason, count=0)
-                    yield self._message(fields, route[1], route[2], now)
+                    yield self._message(stream, fields, now)
             elif isinstance(record, ulog.Dropout):
                 self._dropout += record.duration / 1e3
             elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
@@ -159,28 +155,26 @@ class LogStream:
             self._file.close()
             self._file = None
 
-    def _find_route(self, subscription: ulog.Subscription) -> Generator[Rejection, None, _Route | None]:
-        """Find address and definition of a subscription; None if it is not selected, or cannot be published."""
-        route: _Route | None = None
+    def _open_stream(self, subscription: ulog.Subscription) -> Generator[Rejection, None, ulog.LoggedStream | None]:
+        """Return the stream of a subscription; None if it is not selected, or cannot be published."""
+        stream: ulog.LoggedStream | None = None
         if self._topics is None or subscription.name in self._topics:
             try:
-                address, definition = ulog.address_of(self._name, subscription), ulog.definition_of(subscription)
-                route = subscription, address, definition, ulog.Fitting(definition, subscription)
-            except (AddressError, ValueError) as exc:
+                stream = ulog.LoggedStream(self._name, subscription)
+            except ValueError as exc:  # such as AddressError
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
-        self._routes[subscription.message_id] = route
-        return route
+        self._streams[subscription.message_id] = stream
+        return stream
 
-    def _message(
-        self, fields: dict[str, Any], address: Address, definition: Definition[Any], now: float
-    ) -> SourceMessage:
+    def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
         timestamp = fields.get("timestamp")
         if self._clock is not None and isinstance(timestamp, int):
             self._delays += now + self._clock[0] - timestamp / 1e6
             self._delayed += 1
-        self._carried.add(address)
+        self._carried.add(stream.address)
         lost, self._owed, dropout, self._dropout = self._owed, 0, self._dropout, 0.0
-        return SourceMessage(0.0, address, fields, lost, definition=definition, source=SOURCE, dropout=dropout)
+        definition = stream.definition
+        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int, now: float) -> None:
         """Count a gap; bounds are those of records of all kinds, by their least and greatest size."""

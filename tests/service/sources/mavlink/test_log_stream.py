@@ -122,7 +122,7 @@ def sent_messages() -> list[tuple[str, str]]:
     records = UlogParser(verify=True).feed(b"".join(each.data for each in (*recording.header, *plain)))
     records = list(Texts().merge(records))
     return [
-        (each.subscription.name, repr(each.subscription.decode(each.payload)))
+        (each.subscription.name, repr(each.subscription.layout.decode(each.payload)))
         for each in records
         if isinstance(each, Data)
     ]
