@@ -12,7 +12,9 @@ from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
-_COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
+COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
+"""MAV_CMD by kind of command."""
+
 _TRIES: Final = 3  # of a command without an answer
 _RESTARTS: Final = 2  # after a START that was accepted without data
 _JUDGED: Final = 32  # messages of a header after which its duration is estimated
@@ -106,7 +108,6 @@ class LogStreamClient:
     `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
     Without "take", a rejected client stops only a stream that arrives for its own ids: that of an earlier process.
     `system`, `component`: the MAVLink ids of this client.
-    `rejected`: number of messages that were for other ids, or not requested.
     `header_seconds`: duration of the last header; None before its end.
     """
 
@@ -120,7 +121,6 @@ class LogStreamClient:
     ) -> None:
         self._log, self._ids, self._times = log, (system, component), times
         self._owner = "another client"
-        self.rejected = 0
         self.header_seconds: float | None = None
         self._is_px4 = self._armed = False
         self._reset()
@@ -145,7 +145,6 @@ class LogStreamClient:
             self._owner = f"system {target_system} component {target_component}"
             if self.status.reason == "taken":
                 self.status = self.status._replace(text=_TEXTS["taken"].format(self._owner))
-        self.rejected += not (self._asked and is_for_us)
         return self._asked and is_for_us
 
     def on_heartbeat(self, autopilot: int, now: float, *, armed: bool) -> list[Command]:
@@ -197,7 +196,7 @@ class LogStreamClient:
     ) -> list[Command]:
         """Take a COMMAND_ACK of the autopilot; others than those to this client's commands are ignored."""
         is_for_us = (target_system, target_component) in (self._ids, (0, 0))  # zeros: without ids
-        if not is_for_us or self._awaited is None or command != _COMMANDS.get(self._awaited):
+        if not is_for_us or self._awaited is None or command != COMMANDS.get(self._awaited):
             return []
         if result == dialect.MAV_RESULT_IN_PROGRESS:
             self._due = now + self._times.answer

@@ -20,14 +20,13 @@ _MAX_SAME_NAME: Final = 100
 class LogFile:
     """One stream of one boot in a new file of a folder: `<vehicle>_<UTC>.ulg`.
 
-    `path`: of the file. `written`: bytes so far.
+    `path`: of the file.
 
     Raises OutputError if the file cannot be created or written, for example on a full disk.
     """
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)
-        self.written = 0
         self._partial = bytearray()  # the last record, until it is complete
         self._begins = True
 
@@ -58,7 +57,7 @@ class LogFile:
 
     def _append(self, data: bytes) -> None:
         try:
-            self.written += self._file.write(data)
+            self._file.write(data)
         except OSError as exc:
             raise OutputError(self.path, exc) from exc
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
@@ -30,7 +29,7 @@ class Piece(NamedTuple):
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
     `begins`: a new stream begins with `data`: it needs a new parser.
     `gap`: messages were lost before this one: the parser discards its incomplete record, before it takes `data`.
-    `lost`: the number of those messages.
+    `lost`: the number of those messages, exact unless 65,536 or more are lost in one gap: a lower bound then.
     """
 
     verdict: Verdict
@@ -43,17 +42,10 @@ class Piece(NamedTuple):
 class Reassembly:
     """The ULog streams of one vehicle, one after the other.
 
-    Totals over all of them:
-    `counts`: messages by verdict.
-    `lost`: LOGGING_DATA lost, exact unless 65,536 or more are lost in one gap: a lower bound then.
-    `bytes`: delivered. `skipped`: received after a gap and discarded, as their record began in the gap.
-
-    At most 249 * `lost` bytes are lost. The number of ULog records lost is not known: it is at least one for each gap.
+    At most 249 bytes are lost with a message. The number of ULog records lost is at least one for each gap.
     """
 
     def __init__(self) -> None:
-        self.counts = Counter[Verdict]()
-        self.lost = self.bytes = self.skipped = 0
         self._old_next = self._old_run = 0
         self.reset()
 
@@ -67,28 +59,19 @@ class Reassembly:
         """Take the fields of the next message; `data` may lack trailing zeros, which MAVLink 2 does not transmit."""
         content = bytes(data[:length]).ljust(length, b"\0")
         if length > _MAX_LENGTH or (first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS):
-            piece = Piece("malformed")
-        elif sequence == 0 and content.startswith(_MAGIC) and content != self._first:
+            return Piece("malformed")
+        if sequence == 0 and content.startswith(_MAGIC) and content != self._first:
             self._first, self._last, self._synchronised, self._old_run = content, 0, True, 0
-            piece = Piece("delivered", content, begins=True)
-        elif self._last is None:
-            piece = Piece("no_definitions")
-        else:
-            piece = self._continue(self._last, sequence, first_message_offset, content)
-        self.counts[piece.verdict] += 1
-        self.lost += piece.lost
-        self.bytes += len(piece.data)
-        return piece
-
-    def _continue(self, last: int, sequence: int, first_message_offset: int, content: bytes) -> Piece:
-        step = (sequence - last) % _MODULUS
+            return Piece("delivered", content, begins=True)
+        if self._last is None:
+            return Piece("no_definitions")
+        step = (sequence - self._last) % _MODULUS
         if step == 0 or (step > _MAX_STEP and not self._is_ahead(sequence)):
             return Piece("duplicate")
         self._last, self._old_run, lost = sequence, 0, step - 1
         is_contiguous = self._synchronised and not lost
         self._synchronised = is_contiguous or first_message_offset != _NO_RECORD_BEGINS
         skipped = 0 if is_contiguous else min(first_message_offset, len(content))
-        self.skipped += skipped
         verdict: Verdict = "delivered" if self._synchronised else "unsynchronised"
         return Piece(verdict, content[skipped:], gap=lost > 0, lost=lost)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -187,10 +188,8 @@ class LogStream:
         self._at_most += self._most_records(_PIECE * (lost + 1)) + 1  # the end of the gap, and the record that it cut
         self._parser.gap()
         if self._file is not None:
-            try:
+            with self._saving():
                 self._file.mark_gap(now - (self._last_piece or now))
-            except OutputError as exc:
-                self._end_file(exc)
 
     def _most_records(self, size: int) -> int:
         sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
@@ -198,21 +197,22 @@ class LogStream:
 
     def _open_file(self) -> None:
         self.close()
-        if self._folder is not None:
-            try:
-                self._file = LogFile(self._folder, self._name)
-                _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log-stream"))
-            except OutputError as exc:
-                self._end_file(exc)
+        if self._folder is None:
+            return
+        with self._saving():
+            self._file = LogFile(self._folder, self._name)
+            _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log-stream"))
 
     def _save(self, data: bytes) -> None:
         if self._file is not None:
-            try:
+            with self._saving():
                 self._file.write(data)
-            except OutputError as exc:
-                self._end_file(exc)
 
-    def _end_file(self, error: OutputError) -> None:
-        """Give up saving this stream; publishing goes on."""
-        self.close()
-        _log.error("%s: the ULog stream is no longer saved: %s", self._name, error, extra=about("log-stream"))
+    @contextmanager
+    def _saving(self) -> Iterator[None]:
+        """Give up saving this stream after an error in the block; publishing goes on."""
+        try:
+            yield
+        except OutputError as exc:
+            self.close()
+            _log.error("%s: the ULog stream is no longer saved: %s", self._name, exc, extra=about("log-stream"))

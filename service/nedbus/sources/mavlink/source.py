@@ -24,7 +24,7 @@ from .fields import CONVERSIONS
 from .link import Link, open_link, parse_link
 from .log_receiver import LogReceiver
 from .log_stream import LogStream
-from .reader import LinkReader, ReadAhead, Received
+from .reader import LinkReader, Received
 from .senders import AUTOPILOT, Peer, Senders
 from .vehicle import Vehicle
 
@@ -77,10 +77,11 @@ class _LinkSession:
         self._peers: dict[int, Peer] = {}
         self._senders = Senders()
         self._logs: dict[int, LogStream] = {}
-        self._receiver = LogReceiver(options, name, self._send, system=_SYSTEM, component=_COMPONENT)
         reader = LinkReader(link, name=name)
-        self._ahead = ReadAhead(reader, self._receiver) if options.log else None
-        self._read = self._ahead.read if self._ahead else reader.read
+        self._receiver: LogReceiver | None = None
+        if options.log:
+            self._receiver = LogReceiver(reader, options, self._send, system=_SYSTEM, component=_COMPONENT)
+        self._read = (self._receiver or reader).read
 
     def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
         next_requests = next_heartbeat = next_status = 0.0
@@ -112,8 +113,8 @@ class _LinkSession:
 
     def close(self) -> None:
         """End the ULog streams."""
-        if self._ahead is not None:
-            self._ahead.close()
+        if self._receiver is not None:
+            self._receiver.close()
         for log in self._logs.values():
             log.close()
 
@@ -139,10 +140,9 @@ class _LinkSession:
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
-        log = self._logs.get(system)
-        if log is None and (client := self._receiver.client(system)) is not None:
-            log = self._logs[system] = LogStream(self._name_of(system), self._options, client)
-        return log
+        if system not in self._logs and self._receiver and (client := self._receiver.client(system)):
+            self._logs[system] = LogStream(self._name_of(system), self._options, client)
+        return self._logs.get(system)
 
     def _name_of(self, system: int) -> str:
         configured = self._options.vehicles

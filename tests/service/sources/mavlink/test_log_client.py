@@ -10,8 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources.mavlink.log_client import Command, LogReason, LogState, LogStreamClient, LogStreamTimes
-from nedbus.sources.mavlink.log_reassembly import Reassembly
 from tests.peers.px4_log_stream import START, STOP, STREAMS, datagrams
+
+from .counted import CountedReassembly
 
 OURS: Final = (245, 191)
 OTHERS: Final = (246, 190)
@@ -120,7 +121,6 @@ def test_messages_for_other_ids_are_rejected(session: Session) -> None:
     assert session.client.accepts(*OURS)
     assert not session.client.accepts(*OTHERS)
     assert not session.client.accepts(0, 0)
-    assert session.client.rejected == 3
 
 
 def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
@@ -592,7 +592,7 @@ class Replay:
 
     def __init__(self, name: str, begin: float, end: float, ids: tuple[int, int], *log: Log) -> None:
         self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1])
-        self.reassembly = Reassembly()
+        self.reassembly = CountedReassembly()
         self.states: list[Reason] = [("idle", None)]
         self.acknowledged: list[int] = []
         self.recorded: list[int] = []

@@ -35,7 +35,7 @@ for folder in sys.stdin:
         file = LogFile(Path(folder.strip()), "1")
         for start in range(0, len(log), {PIECE}):
             file.write(log[start : start + {PIECE}])
-            print(file.written, flush=True)
+            print(file.path.stat().st_size, flush=True)
         time.sleep(3600)
     os.waitpid(pid, 0)
     print("killed", flush=True)

@@ -14,8 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus.sources.mavlink.log_reassembly import Piece, Reassembly
+from nedbus.sources.mavlink.log_reassembly import Piece
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
+
+from .counted import CountedReassembly
 
 HEADER: Final = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 3_000_000)
 SIZE: Final = 249
@@ -26,11 +28,11 @@ needs_recordings = [
 ]
 
 
-def add(reassembly: Reassembly, message: Message) -> Piece:
+def add(reassembly: CountedReassembly, message: Message) -> Piece:
     return reassembly.add(message.sequence, len(message.data), message.offset, message.data)
 
 
-def begin(reassembly: Reassembly, content: bytes = bytes(SIZE - 16)) -> None:
+def begin(reassembly: CountedReassembly, content: bytes = bytes(SIZE - 16)) -> None:
     """Begin a stream."""
     assert add(reassembly, Message(True, 0, 0, HEADER + content)).begins
 
@@ -41,7 +43,7 @@ def plain(sequence: int, data: bytes = b"data", offset: int = 0) -> Message:
 
 def test_first_message_begins_a_stream_and_its_repetition_does_not() -> None:
     """Sequence 0 with ULog's magic begins a stream; the same bytes again are a repetition, others a new stream."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly, b"a")
     assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Piece("duplicate")
     add(reassembly, plain(1))
@@ -52,7 +54,7 @@ def test_first_message_begins_a_stream_and_its_repetition_does_not() -> None:
 
 def test_same_first_message_begins_a_stream_after_reset() -> None:
     """After a reboot the header may have the same bytes: it begins a stream all the same."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     reassembly.reset()
     begin(reassembly)
@@ -60,7 +62,7 @@ def test_same_first_message_begins_a_stream_after_reset() -> None:
 
 def test_stream_joined_in_the_middle_has_no_definitions() -> None:
     """Without its header a stream cannot be decoded: nothing is delivered or counted as lost until one begins."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     for sequence in (0, 70, 3):
         assert add(reassembly, plain(sequence)) == Piece("no_definitions")
     assert (reassembly.lost, reassembly.counts["no_definitions"]) == (0, 3)
@@ -69,7 +71,7 @@ def test_stream_joined_in_the_middle_has_no_definitions() -> None:
 
 def test_trailing_zeros_are_restored() -> None:
     """MAVLink 2 does not transmit zeros at the end of a payload."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     assert reassembly.add(1, 6, 0, b"ab").data == b"ab\0\0\0\0"
     assert reassembly.add(2, 3, 0, [1, 2, 3, 0, 0]).data == b"\1\2\3"
@@ -77,7 +79,7 @@ def test_trailing_zeros_are_restored() -> None:
 
 def test_gap_delivers_from_the_next_record_on() -> None:
     """After a gap, bytes before the first record are skipped, and messages in which none begins."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised", gap=True, lost=2)
     assert add(reassembly, plain(4, offset=255)) == Piece("unsynchronised")
@@ -88,7 +90,7 @@ def test_gap_delivers_from_the_next_record_on() -> None:
 
 def test_empty_message_after_a_gap_does_not_synchronise() -> None:
     """A message without data in which no record begins is no place to go on."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     add(reassembly, plain(2, b"", offset=255))
     assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised")
@@ -96,7 +98,7 @@ def test_empty_message_after_a_gap_does_not_synchronise() -> None:
 
 def test_late_message_is_lost_and_not_used() -> None:
     """A late message cannot be told from a repetition: it stays lost."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2)).lost == 1
     assert add(reassembly, plain(1)) == Piece("duplicate")
@@ -107,7 +109,7 @@ def test_late_message_is_lost_and_not_used() -> None:
 @pytest.mark.parametrize(("length", "offset"), [(250, 0), (255, 255), (10, 10), (10, 254), (0, 0)])
 def test_malformed_message_is_rejected(length: int, offset: int) -> None:
     """A length or an offset that cannot be is counted, and leaves a gap."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     assert reassembly.add(1, length, offset, bytes(SIZE)) == Piece("malformed")
     assert add(reassembly, plain(2)).lost == 1
@@ -115,7 +117,7 @@ def test_malformed_message_is_rejected(length: int, offset: int) -> None:
 
 def test_sequence_wraps() -> None:
     """The sequence goes on with 0 after 65535, with losses or without."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     for sequence in range(1, 2**16):
         assert not add(reassembly, plain(sequence)).gap
@@ -126,17 +128,17 @@ def test_sequence_wraps() -> None:
 
 def test_jump_counts_at_most_half_of_the_sequence() -> None:
     """A step of 32,768 is the largest loss; a larger one is a late message, unless the next ones continue it."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2**15)).lost == 2**15 - 1
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2**15 + 1)) == Piece("duplicate")
 
 
 def test_stream_resumes_after_an_outage_of_more_than_half_of_the_sequence() -> None:
     """A long run of successive old numbers is the stream itself, which went on meanwhile: all between is lost."""
-    reassembly = Reassembly()
+    reassembly = CountedReassembly()
     begin(reassembly)
     pieces = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
     first = next(index for index, piece in enumerate(pieces) if piece.verdict == "delivered")
@@ -159,9 +161,9 @@ def to_messages(records: Iterable[bytes], size: int = SIZE) -> list[Message]:
     return messages
 
 
-def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], Reassembly]:
+def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], CountedReassembly]:
     """Return the records of the reassembled stream, which a parser splits that trusts all lengths."""
-    reassembly, data = Reassembly(), bytearray()
+    reassembly, data = CountedReassembly(), bytearray()
     records: list[tuple[str, bytes]] = []
     for message in messages:
         piece = add(reassembly, message)

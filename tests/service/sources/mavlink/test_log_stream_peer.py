@@ -15,10 +15,10 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources.mavlink.log_client import Command, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Reassembly
 from tests.peers.px4_log_stream import START, STOP, STREAMS, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
+from .counted import CountedReassembly
 from .test_log_client import OTHERS, OURS, Log, Reason
 
 STARTED: Final[list[Reason]] = [("starting", None), ("header", None), ("streaming", None)]
@@ -43,9 +43,9 @@ class Link:
 
     def __init__(self, *log: Log, acknowledges: bool = True) -> None:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
-        self.reassembly = Reassembly()
+        self.reassembly = CountedReassembly()
         self.states: list[Reason] = [("idle", None)]
-        self.bytes = 0
+        self.bytes = self.rejected = 0
         self.peer: Px4LogStream
         self._acknowledges = acknowledges
         self._mav = dialect.MAVLink(None, *OURS)
@@ -101,7 +101,10 @@ class Link:
         if kind == "COMMAND_ACK":
             ids = message.target_system, message.target_component
             return client.on_command_ack(message.command, message.result, *ids, now)
-        if kind.startswith("LOGGING_DATA") and client.accepts(message.target_system, message.target_component):
+        if kind.startswith("LOGGING_DATA"):
+            if not client.accepts(message.target_system, message.target_component):
+                self.rejected += 1
+                return []
             fields = message.sequence, message.length, message.first_message_offset, message.data
             piece = self.reassembly.add(*fields)
             return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=piece.begins)
@@ -145,7 +148,7 @@ def test_refusal_is_reported() -> None:
 def test_stream_of_another_client_is_not_used() -> None:
     """Its data arrive on the same link, and are rejected."""
     with Link().to("default_topics", owner=OTHERS, is_owner_heard=True) as link:
-        link.run(lambda: link.client.rejected > 20)
+        link.run(lambda: link.rejected > 20)
     assert link.states[1:] == [("starting", None), ("refused", "taken")]
     assert set(link.peer.commands) == {START}
 

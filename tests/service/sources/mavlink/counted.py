@@ -1,0 +1,27 @@
+"""Reassembly with totals over all streams."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from nedbus.sources.mavlink.log_reassembly import Piece, Reassembly, Verdict
+
+
+class CountedReassembly(Reassembly):
+    """Count messages by verdict, lost messages, delivered bytes, and bytes that are skipped after a gap."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts = Counter[Verdict]()
+        self.lost = self.bytes = self.skipped = 0
+
+    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Piece:
+        """Take the fields of the next message."""
+        piece = super().add(sequence, length, first_message_offset, data)
+        self.counts[piece.verdict] += 1
+        self.lost += piece.lost
+        self.bytes += len(piece.data)
+        if piece.verdict in ("delivered", "unsynchronised"):
+            self.skipped += length - len(piece.data)
+        return piece
