@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
@@ -65,16 +65,20 @@ class Flight:
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
         self.definitions: dict[Address, Definition[Any]]
         self._file: Any
+        self._opened = ExitStack()
         self._payloads = defaultdict[LoggedStream, bytearray](bytearray)  # of a log
+        self._converted = defaultdict[Address, list[_Decoded]](list)  # of a .tlog
         self._invalid: list[str] = []
-        self._decode: Callable[[Definition[Any], Sequence[Any]], _Decoded] = _decode_cdr
         self.start = 0
         if (form := find_format(path)) == "mcap":
             reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
-            self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
+            self._file = self._opened.enter_context(reader)
+            self.definitions = {stream.address: stream.definition for stream in reader.counts}
         elif form == "tlog":  # converted by the source, which is above this package
-            reader = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
-            self._file, self._decode, self.definitions = reader, _decode_fields, reader.find_definitions()
+            self._file = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
+            self.definitions = self._file.definitions
+            for address, own in _by_address(self._file.messages()):
+                self._converted[address].append(_decode_fields(self.definitions[address], own))
         else:
             log = self._file = UlogReader(path, topics=topics, vehicle=None, default_vehicle="1")
             for stream, payload in log.messages():
@@ -87,8 +91,7 @@ class Flight:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if not isinstance(self._file, UlogReader):
-            self._file.close()
+        self._opened.close()
 
     @property
     def boot_utc(self) -> int:
@@ -107,28 +110,29 @@ class Flight:
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
+        return {address: self._valid(address, decoded) for address, decoded in self._decode(addresses)}
+
+    def _decode(self, addresses: Collection[Address]) -> Iterator[tuple[Address, _Decoded]]:
         if isinstance(self._file, UlogReader):
-            streams, payloads = self._file.streams, self._payloads
-            return {each: self._valid(each, _decode_ulog(streams[each], payloads[streams[each]])) for each in addresses}
-        parts = {address: [self._decode(self.definitions[address], [])] for address in addresses}
-        recorded, logged, ages = self._file.messages(parts.keys()), list[int](), list[npt.NDArray[np.float64]]()
-        while chunk := list(islice(recorded, _CHUNK)):
-            by_address: dict[Address, list[Any]] = {}
-            for each in chunk:
-                by_address.setdefault(each.address, []).append(each)
-            for address, own in by_address.items():
-                parts[address].append(self._decode(self.definitions[address], own))
-                if self._decode is _decode_fields:
-                    continue
-                times = [each.logged // 1000 for each in own]
-                logged.append(min(times))
-                ages.append(times - parts[address][-1].messages["timestamp"].astype(float))
+            for stream in map(self._file.streams.__getitem__, addresses):
+                yield stream.address, _decode_ulog(stream, self._payloads[stream])
+            return
+        parts = self._converted or self._decode_recording(addresses)
+        for address in addresses:
+            yield address, _Decoded(*map(np.concatenate, zip(*parts[address], strict=True)))
+
+    def _decode_recording(self, addresses: Collection[Address]) -> dict[Address, list[_Decoded]]:
+        parts = {address: [_Decoded.empty(self.definitions[address], 0)] for address in addresses}
+        logged, ages = list[int](), list[npt.NDArray[np.float64]]()
+        for address, own in _by_address(self._file.messages(parts.keys())):
+            decoded = _decode_cdr(self.definitions[address], own)
+            parts[address].append(decoded)
+            times = [each.logged // 1000 for each in own]
+            logged.append(min(times))
+            ages.append(times - decoded.messages["timestamp"].astype(float))
         if ages:
             self.start = max(0, min(logged) - round(np.median(np.concatenate(ages))))
-        return {
-            address: self._valid(address, _Decoded(*map(np.concatenate, zip(*own, strict=True))))
-            for address, own in parts.items()
-        }
+        return parts
 
     def _valid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
         """Drop the invalid messages, and store the names of missing fields in the dtype."""
@@ -141,6 +145,16 @@ class Flight:
             types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
             messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
         return messages, masks
+
+
+def _by_address(messages: Iterable[Any]) -> Iterator[tuple[Address, list[Any]]]:
+    """Yield the messages of each address, chunk by chunk."""
+    remaining = iter(messages)
+    while chunk := list(islice(remaining, _CHUNK)):
+        by_address = defaultdict[Address, list[Any]](list)
+        for each in chunk:
+            by_address[each.address].append(each)
+        yield from by_address.items()
 
 
 class _Decoded(NamedTuple):

@@ -55,24 +55,8 @@ class TlogReader:
         """Damage so far."""
         return [f"damaged: {self._damaged_bytes} bytes that are not MAVLink"] if self.damaged else []
 
-    def find_definitions(self) -> dict[Address, Definition[Any]]:
-        """Read the file, and return its addresses and their definitions; raise SourceError if there are none."""
-        for _ in self.messages():
-            pass
-        if not self.definitions:
-            raise SourceError(
-                str(self._path), "; ".join(["no message of an autopilot for these topics", *self.warnings])
-            )
-        return {address: definition for address, definition in self.definitions.items() if definition}
-
-    def close(self) -> None:
-        """Do nothing: the file is open only while it is read."""
-
-    def messages(self, only: Collection[Address] | None = None) -> Iterator[SourceMessage]:
-        """Yield the messages of these addresses, or of all."""
-        self._damaged_bytes = self.position = 0
-        self._boots.clear()
-        self.definitions.clear()
+    def messages(self) -> Iterator[SourceMessage]:
+        """Yield the messages, once; raise SourceError if there are none."""
         vehicles: dict[int, Vehicle] = {}
         parser, due, last = new_parser(), 0, 0
         for stamp, frame in self._frames():
@@ -93,8 +77,10 @@ class TlogReader:
                 elif found.rebooted or found.address.vehicle not in {each.vehicle for each in self.definitions}:
                     self._boots.add(stamp - cast("int", found.fields["timestamp"]))
                 self.definitions.setdefault(found.address, BY_TOPIC[found.address.topic])
-                if only is None or found.address in only:
-                    yield replace(found, due=item.time)
+                yield replace(found, due=item.time)
+        if not self.definitions:
+            reason = "no message of an autopilot for these topics"
+            raise SourceError(str(self._path), "; ".join([reason, *self.warnings]))
 
     def _frames(self) -> Iterator[tuple[int, bytes]]:
         """Yield each frame with its time [us]; behind damage, search for one that another one follows."""
@@ -125,9 +111,6 @@ class TlogSource:
         run = ReplayRun(iter(()), reader.definitions, None, "", position=0)
         messages = self._read(reader, run)
         ahead = list(islice(messages, _AHEAD))
-        if not ahead:
-            problem = "; ".join(["no message of an autopilot for these topics", *reader.warnings])
-            raise SourceError(str(self._path), problem)
         vehicles = sorted({address.vehicle for address in reader.definitions})
         run.messages = (message for part in (ahead, messages) for message in part)
         run.total = self._path.stat().st_size
