@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -164,9 +164,9 @@ def _label_times(axes: Iterable[Any], streams: Iterable[_Stream], start: float, 
 
 def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
     """Plot the tracks, with a circle at the start and a square at the end of each."""
-    _draw_lines(axes, streams, "xy_valid", lambda each: (each.messages["y"], each.messages["x"]), width=1.2)
-    for stream, line in zip(streams, axes.lines[-len(streams) :], strict=True):
-        line.set_label(str(stream.address))
+    tracks = [(each.messages["y"], each.messages["x"]) for each in streams]
+    _draw_lines(axes, streams, "xy_valid", tracks, width=1.2)
+    for stream in streams:
         track = stream.messages[stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])]
         if len(track):
             axes.plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
@@ -177,7 +177,7 @@ def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
 
 
 def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
-    _draw_lines(axes, streams, "z_valid", lambda each: (each.seconds, -each.messages["z"]), width=1.0)
+    _draw_lines(axes, streams, "z_valid", [(each.seconds, -each.messages["z"]) for each in streams], width=1.0)
     for stream in streams:
         for time in np.unique(np.concatenate([stream.resets(each) for each in _HEIGHT_COUNTERS])):
             axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
@@ -186,25 +186,23 @@ def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
 
 
 def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
-    def line_of(stream: _Stream) -> tuple[Any, Any]:
-        return stream.seconds, np.hypot(stream.messages["vx"], stream.messages["vy"])
-
-    _draw_lines(axes, streams, "v_xy_valid", line_of, width=0.9)
+    speed = [(each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams]
+    _draw_lines(axes, streams, "v_xy_valid", speed, width=0.9)
     axes.set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
 
 
 def _draw_lines(
-    axes: Any, streams: Sequence[_Stream], flag: str, line_of: Callable[[_Stream], tuple[Any, Any]], *, width: float
+    axes: Any, streams: Sequence[_Stream], flag: str, lines: Sequence[tuple[Any, Any]], *, width: float
 ) -> None:
     """Plot a line per stream, thin where its flag is not set; thin parts scale the axes only if no part is valid."""
-    lines = [(stream, *line_of(stream)) for stream in streams]
-    in_scale = not any(np.any(stream.messages[flag] & np.isfinite(y)) for stream, _, y in lines)
-    for stream, x, y in lines:
+    valid = [stream.messages[flag] for stream in streams]
+    in_scale = not any(np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True))
+    for stream, (x, y) in zip(streams, lines, strict=True):
         thin = Line2D(x, y, color=stream.color, linewidth=0.5, alpha=0.6)
         (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
-    for stream, x, y in lines:
-        valid = stream.messages[flag]
-        axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=stream.color, linewidth=width)
+    for stream, each, line in zip(streams, valid, lines, strict=True):
+        x, y = (np.where(each, values, np.nan) for values in line)
+        axes.plot(x, y, color=stream.color, linewidth=width, label=str(stream.address))
 
 
 def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:

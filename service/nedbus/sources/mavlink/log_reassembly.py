@@ -28,14 +28,13 @@ class Piece(NamedTuple):
 
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
     `begins`: a new stream begins with `data`: it needs a new parser.
-    `gap`: messages were lost before this one: the parser discards its incomplete record, before it takes `data`.
-    `lost`: the number of those messages, exact unless 65,536 or more are lost in one gap: a lower bound then.
+    `lost`: number of messages lost before this one: the parser discards its incomplete record, before it takes `data`.
+    It is exact unless 65,536 or more are lost in one gap: a lower bound then.
     """
 
     verdict: Verdict
     data: bytes = b""
     begins: bool = False
-    gap: bool = False
     lost: int = 0
 
 
@@ -73,7 +72,7 @@ class Reassembly:
         self._synchronised = is_contiguous or first_message_offset != _NO_RECORD_BEGINS
         skipped = 0 if is_contiguous else min(first_message_offset, len(content))
         verdict: Verdict = "delivered" if self._synchronised else "unsynchronised"
-        return Piece(verdict, content[skipped:], gap=lost > 0, lost=lost)
+        return Piece(verdict, content[skipped:], lost=lost)
 
     def _is_ahead(self, sequence: int) -> bool:
         """Return whether a long run of old numbers ends here: more than 32,768 messages were lost at once."""

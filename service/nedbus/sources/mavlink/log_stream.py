@@ -76,7 +76,7 @@ class LogStream:
         if piece.begins:
             self._restart()
             self._open_file()
-        if piece.gap:
+        if piece.lost:
             self._count_gap(piece.lost, now)
         if piece.verdict == "unsynchronised":
             self._at_most += self._most_records(_PIECE)

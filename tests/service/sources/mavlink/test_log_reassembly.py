@@ -81,9 +81,9 @@ def test_gap_delivers_from_the_next_record_on() -> None:
     """After a gap, bytes before the first record are skipped, and messages in which none begins."""
     reassembly = CountedReassembly()
     begin(reassembly)
-    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised", gap=True, lost=2)
+    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised", lost=2)
     assert add(reassembly, plain(4, offset=255)) == Piece("unsynchronised")
-    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Piece("delivered", b"begin", gap=True, lost=1)
+    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Piece("delivered", b"begin", lost=1)
     assert add(reassembly, plain(7, offset=255)) == Piece("delivered", b"data")
     assert (reassembly.lost, reassembly.skipped, reassembly.bytes) == (3, 12, SIZE + 9)
 
@@ -120,7 +120,7 @@ def test_sequence_wraps() -> None:
     reassembly = CountedReassembly()
     begin(reassembly)
     for sequence in range(1, 2**16):
-        assert not add(reassembly, plain(sequence)).gap
+        assert not add(reassembly, plain(sequence)).lost
     assert add(reassembly, plain(0)) == Piece("delivered", b"data")
     assert add(reassembly, plain(2)).lost == 1
     assert reassembly.counts.total() == 2**16 + 2
@@ -167,7 +167,7 @@ def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], Count
     records: list[tuple[str, bytes]] = []
     for message in messages:
         piece = add(reassembly, message)
-        if piece.gap or piece.begins:
+        if piece.lost or piece.begins:
             data.clear()
         data += piece.data[16:] if piece.begins else piece.data
         records += split_records(data)
