@@ -33,7 +33,7 @@ from nedbus.transport import (
 )
 from nedbus_msgs import Address, decode_with
 
-from .streams import Form, NotAcceptedError, NotCarriedError, Px4Stream, StreamRegistry
+from .streams import Form, NotAcceptedError, Px4Stream, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
@@ -111,7 +111,9 @@ class Px4ZenohNode:
         try:
             stream = self._streams.hear(key, now)
             if stream.not_carried is not None:
-                return None
+                is_unexpected = stream.not_carried and not stream.tokens and not is_bridged  # else an absence, or none
+                reason = f"{stream.not_carried}: not selected by topics= or msg="
+                return Rejection(key, reason) if is_unexpected else None
             definition, layout, unknown = stream.form or self._find_form(stream)
             address = stream.address
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
@@ -123,8 +125,6 @@ class Px4ZenohNode:
                 return None
             fields = decode_with(definition, sample.payload.to_bytes(), layout)
             lost, rebooted = self._streams.accept(stream, attachment, now)
-        except NotCarriedError as exc:
-            return Rejection(key, f"{exc}: not selected by topics= or msg=") if str(exc) and not is_bridged else None
         except (AddressError, DecodeError, NotAcceptedError) as exc:
             return Rejection(key, exc.reason if isinstance(exc, DecodeError) else str(exc), address)
         for name in unknown:

@@ -46,10 +46,6 @@ class NotAcceptedError(Exception):
     """Raised for a message that may be valid, but whose vehicle or layout is not certain."""
 
 
-class NotCarriedError(Exception):
-    """Raised for a key that no option selects; its text names the message, or is empty if `topics=` excludes it."""
-
-
 class Form(NamedTuple):
     """Format of a stream's messages; `unknown`: fields of a newer layout, by name or type."""
 
@@ -144,13 +140,10 @@ class StreamRegistry:
     def hear(self, key: str, now: float) -> Px4Stream:
         """Return the stream of a key, and note that a message arrived on it.
 
-        Raises DecodeError or AddressError for a key that is not of a PX4 topic, NotAcceptedError beyond the limit of
-        keys, NotCarriedError for a key that no option selects and no publisher announces.
+        Raises DecodeError or AddressError for a key that is not of a PX4 topic, NotAcceptedError beyond the limit.
         """
         stream = self._streams.get(key) or self._find(TopicKey.parse(key))
         stream.heard = now
-        if stream.not_carried is not None and not stream.tokens:
-            raise NotCarriedError(stream.not_carried)
         return stream
 
     def form_of(self, stream: Px4Stream) -> Form:
