@@ -298,39 +298,26 @@ def flags_detector(instance: int, used: Callable[[], int]) -> ChangeDetector:
     return ChangeDetector([*(flag for kind in _EKF for flag in kind.flags), *rules.FAKE_AIDING], detect)
 
 
-class EstimateDetector(ChangeDetector):
-    """Detector of an estimator_local_position, to find the EKF in use where no selector names it.
+def estimate_detector(
+    instance: int, position: Callable[[], ChangeDetector | None], equal: dict[int, bool], used: Callable[[], int]
+) -> ChangeDetector:
+    """Return a detector of an estimator_local_position, to find the EKF in use where no selector names it.
 
     `position` returns the detector of vehicle_local_position, which follows the estimate that it equals.
     `equal`: by instance, if the last estimate of the same sample equalled it; shared by all instances.
     `used` returns the instance in use.
     """
+    read = FieldReader(("timestamp_sample", "x", "y", "z"))
 
-    def __init__(
-        self, instance: int, position: Callable[[], ChangeDetector | None], equal: dict[int, bool],
-        used: Callable[[], int],
-    ) -> None:  # fmt: skip
-        self._read_estimate = FieldReader(("timestamp", "timestamp_sample", "x", "y", "z"))
-        self._instance, self._position, self._equal, self._used = instance, position, equal, used
-        self._estimate: tuple[object, ...] = (0, None)
-        self.stamp = self.earlier = 0
+    def detect(before: Fields, _: Fields) -> Iterator[Finding]:
+        known = position()
+        vehicle = read(None if known is None else known.last)
+        if before and before["timestamp_sample"] == vehicle[0]:
+            equal[instance] = tuple(map(before.get, read.names)) == vehicle
+        if equal.get(instance) and not equal.get(used(), True):
+            yield _selected(instance, None)
 
-    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return a finding if this EKF is in use, and the one that was taken to be is not."""
-        (_, *estimate), self._estimate = self._estimate, self._read_estimate(message)
-        self.earlier, self.stamp = self.stamp, cast("int", self._estimate[0])
-        position = self._position()
-        vehicle = self._estimate if position is None else self._read_estimate(position.last)
-        if estimate[0] == vehicle[1]:
-            self._equal[self._instance] = estimate[1:] == [*vehicle[2:]]
-        if not self._equal.get(self._instance) or self._equal.get(self._used(), True):
-            return None
-        return iter([_selected(self._instance, None)])
-
-    def reset(self) -> None:
-        """Discard the state after a reboot of the vehicle."""
-        self._estimate = (0, None)
-        self.stamp = self.earlier = 0
+    return ChangeDetector(read.names, detect)
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Final
 
 from nedbus_msgs import RESET_COUNTERS, MapProjection, Quantity, wrap
@@ -17,16 +18,6 @@ _COMPARED: Final = (
     "xy_valid", *(flag for kind in _KINDS for flag in kind.flags if flag != "xy_valid"), *RESET_COUNTERS.values(),
     "ref_timestamp",
 )  # fmt: skip
-# Fields read when a compared one changes, with their values for messages that lack them.
-_CONTEXT: Final[Mapping[str, object]] = {
-    **dict.fromkeys(
-        (
-            "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "delta_z", "delta_vz",
-            "delta_heading", "ref_lat", "ref_lon", "ref_alt", "z_deriv",
-        ), math.nan,
-    ),
-    **dict.fromkeys(("delta_xy", "delta_vxy"), (math.nan, math.nan)),
-}  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; a smaller step cannot be a jump at any velocity
 _MAX_INTERVAL: Final = 0.5  # s between two messages; longer intervals are not checked for jumps
 _SURE_INTERVAL: Final = 0.1  # s; over a longer one, motion by the rates at its ends is less certain
@@ -38,6 +29,12 @@ _STEPS: Final[Mapping[Quantity, tuple[tuple[str, ...], tuple[tuple[str, ...], ..
     "vz": (("vz",), (("az",),), "delta_vz"),
     "heading": (("heading",), ((),), "delta_heading"),
 }
+_ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
+# Fields read when a compared one changes.
+_CONTEXT: Final = (
+    *dict.fromkeys(name for values, rates, delta in _STEPS.values() for name in (*values, *chain(*rates), delta)),
+    *_ORIGIN,
+)
 
 Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
@@ -46,7 +43,7 @@ class PositionDetector(ChangeDetector):
     """Detector of a VehicleLocalPosition, or of another estimate with the same fields."""
 
     def __init__(self) -> None:
-        super().__init__(_COMPARED, self._detect_position, context=tuple(_CONTEXT))
+        super().__init__(_COMPARED, self._detect_position, context=_CONTEXT)
         self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
@@ -185,7 +182,7 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
 
 def _origin(fields: Fields) -> list[float | None]:
     """Return the origin with None for NaN, which makes two missing origins equal."""
-    return [each if math.isfinite(each) else None for each in (fields["ref_lat"], fields["ref_lon"], fields["ref_alt"])]
+    return [fields[name] if math.isfinite(fields[name]) else None for name in _ORIGIN]
 
 
 def _signed(value: float, digits: int = 1) -> str:
@@ -193,4 +190,5 @@ def _signed(value: float, digits: int = 1) -> str:
 
 
 def _fill_missing(fields: Fields) -> Fields:
-    return {name: _CONTEXT.get(name, 0) if value is None else value for name, value in fields.items()}
+    absent = dict.fromkeys(_CONTEXT, math.nan)
+    return {name: absent.get(name, 0) if value is None else value for name, value in fields.items()}

@@ -15,10 +15,10 @@ from .detectors import (
     EKF_SELECTOR,
     HEALTHY,
     ChangeDetector,
-    EstimateDetector,
     Finding,
     TextDetector,
     detect_selection,
+    estimate_detector,
     flags_detector,
     make_detector,
 )
@@ -241,8 +241,8 @@ class Vehicle:
         self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
         if topic == EKF_SELECTOR:
-            sought = [each for each, known in self._detectors.items() if isinstance(known, EstimateDetector)]
-            self._detectors |= dict.fromkeys(sought)
+            unused = [each for each in self._detectors if each.topic == _POSITIONS[-1] and each != self.main]
+            self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], detect_selection)
         if topic == _EKF:
             return flags_detector(instance, lambda: self._ekf)
@@ -253,7 +253,7 @@ class Vehicle:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
                 is_sought = topic == _POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
-                equals = EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
+                equals = estimate_detector(instance, self._position, self._equal, lambda: self._ekf)
                 return equals if is_sought else None
             if current is not None:
                 self._supersede(current, address)

@@ -260,6 +260,18 @@ def test_ekf_in_use_without_a_selector(sent: Sent) -> None:
     assert [each.kind for each in sent.account.vehicles["1"].state(100.0).conditions] == ["estimator_fault"]
 
 
+def test_selector_that_arrives_late_names_the_ekf_in_use(sent: Sent) -> None:
+    """From the first selector on, estimates that equal the vehicle's are not compared."""
+    for time in (0.0, 1.0, 2.0, 3.0):
+        for instance in (0, 1):
+            sent(time, "estimator_local_position", instance, timestamp_sample=round(1e6 * time), x=time * instance)
+        sent(time, timestamp_sample=round(1e6 * time), x=time, vx=1.0)
+        sent(time, "estimator_status_flags", 0, cs_mag_fault=time == 3.0)
+        if time >= 1.0:
+            sent(time, "estimator_selector_status", primary_instance=0)
+    assert [each.text for each in sent.account.events] == ["EKF fault: magnetometer"]
+
+
 @pytest.mark.parametrize("gnss", [False, True])
 def test_fake_position_that_ends_is_evidence(sent: Sent, gnss: bool) -> None:
     """A fake position that nothing replaces precedes an invalid position; one that GNSS replaces is no event."""
