@@ -117,7 +117,7 @@ class Account:
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:
-            self._update_link(time, link)
+            self._common.switch(Finding("link_down", "begin" if link else "end", link or "link is back"), "", time)
             self._update_reader(time, dropped, is_behind=is_behind)
             if present is not None:
                 for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
@@ -204,21 +204,13 @@ class Account:
             if not self._numbers[name]:
                 del self._numbers[name]
 
-    def _update_link(self, time: float, link: str) -> None:
-        is_down = ("link_down", "") in self._common.conditions
-        if link and not is_down:
-            self._common.emit(Finding("link_down", "begin", link), "", time)
-        elif is_down and not link:
-            self._common.emit(Finding("link_down", "end", "link is back"), "", time)
-
     def _update_reader(self, time: float, dropped: int, *, is_behind: bool) -> None:
         if dropped > self._dropped or is_behind:
             self._last_overload = time
-            if self.overload is None:
-                text = "the reader is slower than the data: messages are dropped"
-                self._common.emit(Finding("overload", "begin", text), "", time)
-        elif self.overload is not None and time - self._last_overload > PAUSE:
+            text = "the reader is slower than the data: messages are dropped"
+            self._common.switch(Finding("overload", "begin", text), "", time)
+        elif time - self._last_overload > PAUSE:
             text = f"the reader keeps up again: {dropped} messages were dropped"
             ended = Finding("overload", "end", text, numbers={"messages": dropped})
-            self._common.emit(ended, "", time, changed=self._last_overload)
+            self._common.switch(ended, "", time, changed=self._last_overload)
         self._dropped = dropped

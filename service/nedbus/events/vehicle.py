@@ -160,12 +160,11 @@ class Vehicle:
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
         """Update from the state of the position's stream: "stale", "gone", "duplicate" or another, None if unknown."""
         self.settle(time)
-        is_mixed, was_mixed = state == "duplicate", ("duplicate", "") in self.conditions
-        if self.main is not None and is_mixed != was_mixed and state not in (None, "unknown"):
+        if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
             begin = Finding("duplicate", "begin", f"several publishers of {stream}: readers receive a mixture")
             end = Finding("duplicate", "end", f"one publisher of {stream} is left")
-            self.emit(begin if is_mixed else end, stream, time)
+            self.switch(begin if state == "duplicate" else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
             silent = "silent"
@@ -190,6 +189,11 @@ class Vehicle:
                 text = f"{event.text} (flapping)"
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
         return state_of(dict.fromkeys(found))  # a condition with several flags counts once
+
+    def switch(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
+        """Emit the begin of a condition that is not active, or the end of one that is."""
+        if (found.change == "begin") != ((found.kind, "") in self.conditions):
+            self.emit(found, topic, time, changed=changed)
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
         """Begin or end the conditions of a finding, and report its event unless it is initial or flapping.
