@@ -255,13 +255,14 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
     return topic or topics[0]
 
 
-def check_vehicle(vehicle: object) -> None:
-    """Raise AddressError for an invalid vehicle name."""
+def check_vehicle(vehicle: object) -> str:
+    """Return a valid vehicle name; raise AddressError for any other."""
     if not isinstance(vehicle, str):
         expected = 'one name, such as "7": make a call for each of several vehicles, or give "*" to read all'
         raise AddressError("vehicle", vehicle, expected)
     if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
+    return vehicle
 
 
 def _check_instance(topic: str, instance: int | None) -> None:

@@ -18,6 +18,7 @@ ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
 
 _MAX_TOPICS: Final = 30  # per vehicle
+_Vehicle = Annotated[str, AfterValidator(check_vehicle)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +50,6 @@ class VehicleReport:
         return self.is_silent and self.since is not None and now - self.since >= FORGOTTEN
 
 
-def _checked(vehicle: str) -> str:
-    check_vehicle(vehicle)
-    return vehicle
-
-
-_Name = Annotated[str, AfterValidator(_checked)]
-
-
 @dataclass(frozen=True, slots=True)
 class AccountReport:
     """The account of one service; times are seconds since the epoch by the clock of its host."""
@@ -64,7 +57,7 @@ class AccountReport:
     service: str
     host: str
     now: Seconds
-    vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=MAX_VEHICLES)]
+    vehicles: Annotated[Mapping[_Vehicle, VehicleReport], Field(max_length=MAX_VEHICLES)]
     events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
 
     def split(self, number: int) -> list[AccountReport]:

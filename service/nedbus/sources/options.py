@@ -10,11 +10,6 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from nedbus_msgs import ANY, DEFAULT, MESSAGES, RELEASES, TOPICS, check_vehicle, get_topic
 
 
-def _check_vehicle(name: str) -> str:
-    check_vehicle(name)
-    return name
-
-
 def _parse_vehicles(text: object) -> object:
     """Parse `NAME:VEHICLE,NAME:VEHICLE`."""
     if not isinstance(text, str):
@@ -62,7 +57,7 @@ _Origin = tuple[
     Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
     Annotated[float, Field(ge=-500, le=1e4)],
 ]  # fmt: skip
-Vehicle = Annotated[str, AfterValidator(_check_vehicle)]
+Vehicle = Annotated[str, AfterValidator(check_vehicle)]
 Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
 

@@ -47,7 +47,6 @@ class Style:
     grades: Mapping[str, str]
     fills: Mapping[str, str]
     vehicles: tuple[str, ...]
-    lines: tuple[str, str, str]
     truth: str
     chosen: str
 
@@ -90,13 +89,11 @@ DARK: Final = Style(
     "dark", "#0f1419", "#182028", "#26303a", "#d8dee6", "#94a1ae",
     {"bad": "#ff8a80", "watch": "#ffb74d", "ok": "#66d17a", "info": "#94a1ae"},
     {"bad": "#5c1a1a", "watch": "#553a08", "ok": "#123a1d"},
-    ("#6cb6ff", "#c9a0ff", "#5ad1d1", "#ff9ed2", "#9fb4ff", "#c5b38a", "#8fa8b8", "#e0e0ff"),
-    ("#6cb6ff", "#c9a0ff", "#5ad1d1"), "#8b98a5", "#1d3650",
+    ("#6cb6ff", "#c9a0ff", "#5ad1d1", "#ff9ed2", "#9fb4ff", "#c5b38a", "#8fa8b8", "#e0e0ff"), "#8b98a5", "#1d3650",
 )  # fmt: skip
 LIGHT: Final = Style(
     "light", "#ffffff", "#eef2f5", "#d5dce2", "#17202a", "#55626f",
     {"bad": "#b3261e", "watch": "#8a5000", "ok": "#1b6e2c", "info": "#55626f"},
     {"bad": "#fbdcda", "watch": "#fbe8c8", "ok": "#d9f2de"},
-    ("#0b5cad", "#7b3fb5", "#0a7a7a", "#b0357f", "#3949ab", "#6b5a2a", "#4a6272", "#5c5c9e"),
-    ("#0b5cad", "#7b3fb5", "#0a7a7a"), "#6b7885", "#cfe3f7",
+    ("#0b5cad", "#7b3fb5", "#0a7a7a", "#b0357f", "#3949ab", "#6b5a2a", "#4a6272", "#5c5c9e"), "#6b7885", "#cfe3f7",
 )  # fmt: skip

@@ -147,7 +147,7 @@ class Plots:
     def _draw(self, title: str, names: tuple[str, ...]) -> figure:
         plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
         plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
-        for name, colour in zip(names, self._style.lines, strict=False):
+        for name, colour in zip(names, self._style.vehicles, strict=False):
             legend: dict[str, Any] = {"legend_label": name} if len(names) > 1 else {}
             plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
             if name in _OF_TRUTH:

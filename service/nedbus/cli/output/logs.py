@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 import threading
+from dataclasses import asdict
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Final, Literal, TextIO
@@ -21,7 +22,6 @@ from .streams import MAX_TEXT, STRUCTURED, printable, to_text
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
 _MAX_TRACEBACK: Final = 20_000  # characters, the last ones: they name the error
-_KEYS: Final = ("vehicle", "topic", "instance", "source", "reason", "count", "of")
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
 LogFormat = Literal["text", "json"]
@@ -58,12 +58,11 @@ class JsonFormatter(TextFormatter):
         fields: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
             "level": record.levelname.lower(),
-            "event": about.event if about else None,
+            "event": None,
             "message": to_text(record.getMessage(), MAX_TEXT),
             "logger": record.name,
         }
-        for key in _KEYS:
-            value = getattr(about, key, None)
+        for key, value in asdict(about).items() if about else ():
             if value is not None:
                 fields[key] = to_text(value, MAX_TEXT) if isinstance(value, str) else value
         if record.exc_info:
