@@ -13,7 +13,7 @@ from typing import Final
 from nedbus.log_event import about
 from nedbus_msgs import Address
 
-from .detectors import Finding
+from .detectors import Change, Finding
 from .event import ALL, Condition, Event, State, state_of
 from .kinds import SEVERITIES, Severity
 from .rules import MAX_SILENCE, PAUSE, RECENT
@@ -117,7 +117,8 @@ class Account:
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:
-            self._common.switch(Finding("link_down", "begin" if link else "end", link or "link is back"), "", time)
+            change: Change = "begin" if link else "end"
+            self._common.emit(Finding("link_down", change, link or "link is back", switch=True), "", time)
             self._update_reader(time, dropped, is_behind=is_behind)
             if present is not None:
                 for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
@@ -208,9 +209,9 @@ class Account:
         if dropped > self._dropped or is_behind:
             self._last_overload = time
             text = "the reader is slower than the data: messages are dropped"
-            self._common.switch(Finding("overload", "begin", text), "", time)
+            self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
         elif time - self._last_overload > PAUSE:
             text = f"the reader keeps up again: {dropped} messages were dropped"
-            ended = Finding("overload", "end", text, numbers={"messages": dropped})
-            self._common.switch(ended, "", time, changed=self._last_overload)
+            ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
+            self._common.emit(ended, "", time, changed=self._last_overload)
         self._dropped = dropped

@@ -15,6 +15,7 @@ Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
 _NONE: Final[frozenset[str]] = frozenset()
 _UNKNOWN_SATELLITES: Final = 255
+_INTERFERENCE: Final = ("jamming_indicator", "jamming_state", "spoofing_state")
 
 EKF_SELECTOR: Final = "estimator_selector_status"
 """The topic that names the EKF in use."""
@@ -35,6 +36,7 @@ class Finding:
     `first`: the text of an end if the condition has held since the first message.
     `initial`: it already held in the first message, and becomes a condition without an event.
     `age`: how long ago it began [s].
+    `switch`: without effect if the condition is active at its begin, or not active at its end.
     """
 
     kind: str
@@ -46,6 +48,7 @@ class Finding:
     first: str = ""
     initial: bool = False
     age: float = 0.0
+    switch: bool = False
 
 
 class FieldReader:
@@ -119,102 +122,30 @@ class ChangeDetector:
         return {name: None if name in missing else value for name, value in values}
 
 
-class GpsDetector(ChangeDetector):
-    """Detector of a GNSS receiver: fix, satellites, jamming and spoofing."""
-
-    _NAMES: Final = ("fix_type", "satellites_used", "jamming_state", "jamming_indicator", "spoofing_state")
-
-    def __init__(self) -> None:
-        super().__init__(self._NAMES, self._detect_gps)
-        self._active: dict[str, bool] = {}  # level conditions by kind
-
-    def reset(self) -> None:
-        """Discard the state after a reboot of the vehicle."""
-        super().reset()
-        self._active.clear()
-
-    def _detect_gps(self, before: Fields, after: Fields) -> Iterator[Finding]:
-        fix, was = after["fix_type"], before.get("fix_type")
-        satellites, earlier = after["satellites_used"], before.get("satellites_used")
-        if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
-            text = f"no GPS fix, {satellites} satellites" if satellites in range(_UNKNOWN_SATELLITES) else "no GPS fix"
-            yield Finding("gps_fix_lost", "begin", text, initial=True)
-        elif was is not None and fix is not None and was != fix:
-            names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
-            numbers = {"fix_before": was, "fix": fix}
-            text = f"GPS fix {names[0]} to {names[1]}"
-            if satellites is not None and earlier is not None and satellites != earlier:
-                numbers |= {"satellites_before": earlier, "satellites": satellites}
-                text += f", {earlier} satellites to {satellites}"
-            if was >= rules.MIN_FIX_TYPE > fix:
-                yield Finding("gps_fix_lost", "begin", text, names, numbers)
-            elif was < rules.MIN_FIX_TYPE <= fix:
-                yield Finding("gps_fix_lost", "end", text, names, numbers)
-            elif names[0] != names[1]:
-                yield Finding("gps_fix", "once", text, names, numbers)
-        if satellites is not None and satellites != _UNKNOWN_SATELLITES:
-            is_few, is_enough = satellites < rules.FEW_SATELLITES, satellites >= rules.ENOUGH_SATELLITES
-            text = f"{'only ' * is_few}{satellites} satellites"
-            yield from self._detect_level("few_satellites", is_few, is_enough, text, {"satellites": satellites})
-        indicator, state = after["jamming_indicator"] or 0, after["jamming_state"] or 0
-        begins, ends = indicator >= rules.JAMMING_BEGIN or state > 1, indicator < rules.JAMMING_END and state <= 1
-        text = f"GNSS jamming: indicator {indicator}" + (f", state {state}" if state > 1 else "")
-        yield from self._detect_level("jamming", begins, ends, text, {"indicator": indicator, "state": state})
-        spoofed = after["spoofing_state"] or 0
-        text = f"GNSS spoofing: state {spoofed}"
-        yield from self._detect_level("spoofing", spoofed > 1, spoofed <= 1, text, {"state": spoofed})
-
-    def _detect_level(self, kind: str, begins: bool, ends: bool, text: str, numbers: Fields) -> Iterator[Finding]:
-        """Yield the begin or end of a condition with hysteresis; it is initial if the first value begins it."""
-        initial, held = kind not in self._active, self._active.get(kind, False)
-        holds = self._active[kind] = begins or (held and not ends)
-        if holds and not held:
-            is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS at all
-            severity: Severity | None = "info" if is_info else None
-            yield Finding(kind, "begin", text, numbers=numbers, severity=severity, initial=initial)
-        elif held and not holds:
-            text = text if kind == "few_satellites" else f"{text}: over"
-            yield Finding(kind, "end", text, numbers=numbers)
-
-
 class TextDetector(ChangeDetector):
-    """Detector of PX4's own texts, each of which is an event with PX4's severity."""
-
-    def __init__(self) -> None:
-        super().__init__(("severity", "text"), self._detect_text)
+    """Detector of PX4's own texts, each of which is an event, even if it repeats the one before."""
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the finding of a message, which may repeat the one before."""
+        """Return the finding of a message."""
         self._state = ()
         return super().add(message, missing)
-
-    def _detect_text(self, _: Fields, after: Fields) -> Iterator[Finding]:
-        level, text = after["severity"], after["text"]
-        if level is not None and text:
-            severity: Severity = "bad" if level <= rules.CRITICAL else "watch" if level <= rules.WARNING else "info"
-            name = rules.LEVELS.get(level, str(level))
-            yield Finding("text", "once", text, (name,), {"level": level}, severity=severity)
 
 
 def make_detector(message: str) -> ChangeDetector | None:
     """Return a detector for a message type, None if it has no events; a PositionDetector is for the estimate in use."""
-    match message:
-        case "VehicleLocalPosition":
-            return None
-        case "SensorGps":
-            return GpsDetector()
-        case "LogMessage":
-            return TextDetector()
     kinds = flagged(message)
     fields, context, detect = _FURTHER.get(message, ((), (), None))
+    compared = [*fields, *(flag for kind in kinds for flag in kind.flags)]
+    if message == "VehicleLocalPosition" or not compared:
+        return None
 
     def detect_all(before: Fields, after: Fields) -> Iterator[Finding]:
         yield from detect_flags(kinds, before, after)
         if detect is not None:
             yield from detect(before, after)
 
-    compared = [*fields, *(flag for kind in kinds for flag in kind.flags)]
-    return ChangeDetector(compared, detect_all, context=context) if compared else None
+    make = TextDetector if message == "LogMessage" else ChangeDetector
+    return make(compared, detect_all, context=context)
 
 
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
@@ -234,6 +165,61 @@ def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterat
             text = (kind.begin if change == "begin" else kind.end).format(", ".join(map(kind.flags.__getitem__, flags)))
             names = tuple(flags)
             yield Finding(kind.name, change, text, names, severity=severity, first=kind.first, initial=not is_event)
+
+
+def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield a LogMessage with PX4's severity."""
+    level, text = after["severity"], after["text"]
+    if level is not None and text:
+        severity: Severity = "bad" if level <= rules.CRITICAL else "watch" if level <= rules.WARNING else "info"
+        yield Finding("text", "once", text, (rules.LEVELS.get(level, str(level)),), {"level": level}, severity=severity)
+
+
+def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the changes of fix, satellites, jamming and spoofing in a SensorGps."""
+    fix, was = after["fix_type"], before.get("fix_type")
+    satellites, earlier = after["satellites_used"], before.get("satellites_used")
+    if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
+        text = f"no GPS fix, {satellites} satellites" if satellites in range(_UNKNOWN_SATELLITES) else "no GPS fix"
+        yield Finding("gps_fix_lost", "begin", text, initial=True)
+    elif was is not None and fix is not None and was != fix:
+        names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
+        numbers = {"fix_before": was, "fix": fix}
+        text = f"GPS fix {names[0]} to {names[1]}"
+        if satellites is not None and earlier is not None and satellites != earlier:
+            numbers |= {"satellites_before": earlier, "satellites": satellites}
+            text += f", {earlier} satellites to {satellites}"
+        if was >= rules.MIN_FIX_TYPE > fix:
+            yield Finding("gps_fix_lost", "begin", text, names, numbers)
+        elif was < rules.MIN_FIX_TYPE <= fix:
+            yield Finding("gps_fix_lost", "end", text, names, numbers)
+        elif names[0] != names[1]:
+            yield Finding("gps_fix", "once", text, names, numbers)
+    last = _gps_levels(before)
+    for kind, (level, begin, end, numbers) in _gps_levels(after).items():
+        if level in (0, 2) and level != last[kind][0]:
+            initial = level == 2 and (last[kind][0] is None or not before)
+            is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS at all
+            severity: Severity | None = "info" if is_info else None
+            found = Finding(kind, "begin", begin, (), numbers, severity=severity, initial=initial, switch=True)
+            yield found if level else Finding(kind, "end", end, (), numbers, switch=True)
+
+
+def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
+    """Return conditions with level, texts and numbers; one begins at level 2 and ends at 0, None is unknown."""
+    satellites, few = gps.get("satellites_used"), None
+    if satellites is not None and satellites != _UNKNOWN_SATELLITES:
+        few = (satellites < rules.FEW_SATELLITES) + (satellites < rules.ENOUGH_SATELLITES)
+    indicator, jammed, spoofed = (gps.get(name) or 0 for name in _INTERFERENCE)
+    jamming = 2 if jammed > 1 else (indicator >= rules.JAMMING_BEGIN) + (indicator >= rules.JAMMING_END)
+    state = f", state {jammed}" if jammed > 1 else ""
+    count, jam = f"{satellites} satellites", f"GNSS jamming: indicator {indicator}"
+    spoof = f"GNSS spoofing: state {spoofed}"
+    return {
+        "few_satellites": (few, f"only {count}", count, {"satellites": satellites}),
+        "jamming": (jamming, f"{jam}{state}", f"{jam}: over", {"indicator": indicator, "state": jammed}),
+        "spoofing": (2 * (spoofed > 1), spoof, f"{spoof}: over", {"state": spoofed}),
+    }
 
 
 def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -343,6 +329,8 @@ def _detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Fin
 
 # Further detection in a message, beyond flags: the fields that it compares, and those that it needs besides.
 _FURTHER: Final[Mapping[str, tuple[Sequence[str], Sequence[str], Callable[[Fields, Fields], Iterator[Finding]]]]] = {
+    "LogMessage": (("severity", "text"), (), detect_text),
+    "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), detect_gps),
     "VehicleStatus": (("arming_state", "nav_state"), (), detect_status),
     "BatteryStatus": (("warning", "connected"), ("remaining",), detect_battery),
     "VehicleLandDetected": (("landed",), (), detect_landing),

@@ -162,9 +162,10 @@ class Vehicle:
         self.settle(time)
         if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
-            begin = Finding("duplicate", "begin", f"several publishers of {stream}: readers receive a mixture")
-            end = Finding("duplicate", "end", f"one publisher of {stream} is left")
-            self.switch(begin if state == "duplicate" else end, stream, time)
+            several = f"several publishers of {stream}: readers receive a mixture"
+            begin = Finding("duplicate", "begin", several, switch=True)
+            end = Finding("duplicate", "end", f"one publisher of {stream} is left", switch=True)
+            self.emit(begin if state == "duplicate" else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
             silent = "silent"
@@ -190,11 +191,6 @@ class Vehicle:
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
         return state_of(dict.fromkeys(found))  # a condition with several flags counts once
 
-    def switch(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
-        """Emit the begin of a condition that is not active, or the end of one that is."""
-        if (found.change == "begin") != ((found.kind, "") in self.conditions):
-            self.emit(found, topic, time, changed=changed)
-
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
         """Begin or end the conditions of a finding, and report its event unless it is initial or flapping.
 
@@ -206,6 +202,8 @@ class Vehicle:
         is_on_ground = kind.on_ground is not None and self.armed is False and in_air != "info"
         severity = (kind.on_ground if is_on_ground else None) or in_air
         keys = [(found.kind, flag) for flag in kind.conditions(found.names)]
+        if found.switch and (found.change == "begin") == (keys[0] in self.conditions):
+            return
         for key in keys:
             self._on_ground.pop(key, None)
         if found.change == "end":
