@@ -29,6 +29,14 @@ _STEPS: Final[Mapping[Quantity, tuple[tuple[str, ...], tuple[tuple[str, ...], ..
     "vz": (("vz",), (("az",),), "delta_vz"),
     "heading": (("heading",), ((),), "delta_heading"),
 }
+# The numbers of a reset, and its text.
+_RESETS: Final[Mapping[Quantity, tuple[tuple[str, ...], str]]] = {
+    "xy": (("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)"),
+    "z": (("up",), "height by {up:z.1f} m"),
+    "vxy": (("v_north", "v_east"), "vxy by {size:.1f} m/s"),
+    "vz": (("v_up",), "vz by {v_up:z.1f} m/s"),
+    "heading": (("heading",), "heading by {degrees:z.0f} deg"),
+}
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
 # Fields read when a compared one changes.
 _CONTEXT: Final = (
@@ -107,30 +115,20 @@ class PositionDetector(ChangeDetector):
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
     """Return the finding of a reset, with the size of each quantity that the data has."""
-    found = {name: _size_of_reset(name, before, after) for name in quantities}
-    sizes = {name: size for name, size in found.items() if size is not None}
     numbers: dict[str, float] = {}
-    words = []
-    if "xy" in sizes:
-        numbers |= zip(("north", "east"), sizes["xy"], strict=True)
-        size = math.hypot(*sizes["xy"])
-        words.append(f"xy by {size:.1f} m ({_signed(numbers['north'])} north, {_signed(numbers['east'])} east)")
-    if "z" in sizes:
-        numbers["up"] = -sizes["z"][0]
-        words.append(f"height by {_signed(numbers['up'])} m")
-    if "vxy" in sizes:
-        numbers |= zip(("v_north", "v_east"), sizes["vxy"], strict=True)
-        words.append(f"vxy by {math.hypot(*sizes['vxy']):.1f} m/s")
-    if "vz" in sizes:
-        numbers["v_up"] = -sizes["vz"][0]
-        words.append(f"vz by {_signed(numbers['v_up'])} m/s")
-    is_small = all(abs(each) < SMALL_RESET for each in numbers.values()) and len(sizes) == len(found)
-    if "heading" in sizes:
-        numbers["heading"] = sizes["heading"][0]
-        words.append(f"heading by {_signed(math.degrees(numbers['heading']), 0)} deg")
-    words += [f"{name} by an unknown amount" for name in quantities if name not in sizes]
+    known, unknown = [], []
+    for name in quantities:
+        if (size := _size_of_reset(name, before, after)) is None:
+            unknown.append(f"{name} by an unknown amount")
+            continue
+        names, text = _RESETS[name]
+        values = dict(zip(names, (-each if name in ("z", "vz") else each for each in size), strict=True))
+        numbers |= values
+        known.append(text.format(**values, size=math.hypot(*size), degrees=math.degrees(size[0])))
+    is_small = not unknown and all(abs(each) < SMALL_RESET for name, each in numbers.items() if name != "heading")
     severity: Severity | None = "info" if is_small else None
-    return Finding("reset", "once", f"reset of {', '.join(words)}", tuple(quantities), numbers, severity=severity)
+    text = f"reset of {', '.join(known + unknown)}"
+    return Finding("reset", "once", text, tuple(quantities), numbers, severity=severity)
 
 
 def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:
@@ -174,7 +172,7 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
         distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
         up = up if math.isfinite(up) else 0.0
         if distance >= 0.01 or abs(up) >= 0.01:
-            text = f"origin moved by {distance:.1f} m, {_signed(up)} m up"
+            text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
             severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
             numbers = {"distance": distance, "up": up}
             yield Finding("origin_moved", "once", text, numbers=numbers, severity=severity)
@@ -183,10 +181,6 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
 def _origin(fields: Fields) -> list[float | None]:
     """Return the origin with None for NaN, which makes two missing origins equal."""
     return [fields[name] if math.isfinite(fields[name]) else None for name in _ORIGIN]
-
-
-def _signed(value: float, digits: int = 1) -> str:
-    return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _fill_missing(fields: Fields) -> Fields:
