@@ -22,7 +22,7 @@ SILENCE_TIMEOUT: Final = 2.0
 def follow(
     bus: Bus,
     subscription: Subscription,
-    handle: Callable[[Sample], bool],
+    handle: Callable[[Sample], bool | None],
     *,
     count: int | None,
     duration: float | None,
@@ -30,7 +30,7 @@ def follow(
 ) -> None:
     """Handle samples until `count` are counted or `duration` [s] has passed.
 
-    `handle` returns True if a sample counts. The link is checked once a second, before `each_second` is called.
+    `handle` returns False if a sample does not count. Each second the link is checked, then `each_second` called.
 
     Raises NoDataError if no sample was counted.
     """
@@ -54,7 +54,7 @@ def follow(
             sample = subscription.receive(max(0.0, min(end, next_second) - now))
         except NoDataError:
             continue
-        seen += handle(sample)
+        seen += handle(sample) is not False
     if not seen:
         raise NoDataError(subscription.name, duration or 0.0)
     each_second()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
@@ -17,7 +17,7 @@ from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, Sample, to_age
+from nedbus.client import Bus, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import (
     CLOCKS,
@@ -231,12 +231,8 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
                 if initial := each.held_from_start:
                     write_stderr(f"{name}: {initial}, from the start")
 
-    def handle(sample: Sample[Any]) -> bool:
-        observer.add(sample)
-        return True
-
     with observer.subscription as subscription:
-        follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
+        follow(bus, subscription, observer.add, count=None, duration=duration, each_second=show_new)
 
 
 def _name(files: Sequence[Path]) -> str:
