@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from operator import attrgetter, itemgetter
 from typing import Any, Final, Literal, cast
 
+from nedbus_msgs.messages import LogMessage, VehicleStatus
+
 from . import rules
 from .kinds import Kind, Severity, flagged
 
@@ -15,6 +17,7 @@ Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
 _NONE: Final[frozenset[str]] = frozenset()
 _UNKNOWN_SATELLITES: Final = 255
+_ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _INTERFERENCE: Final = ("jamming_indicator", "jamming_state", "spoofing_state")
 
 EKF_SELECTOR: Final = "estimator_selector_status"
@@ -171,7 +174,8 @@ def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
     """Yield a LogMessage with PX4's severity."""
     level, text = after["severity"], after["text"]
     if level is not None and text:
-        severity: Severity = "bad" if level <= rules.CRITICAL else "watch" if level <= rules.WARNING else "info"
+        is_bad, is_watch = level <= LogMessage.CRITICAL, level <= LogMessage.WARNING
+        severity: Severity = "bad" if is_bad else "watch" if is_watch else "info"
         yield Finding("text", "once", text, (rules.LEVELS.get(level, str(level)),), {"level": level}, severity=severity)
 
 
@@ -233,8 +237,8 @@ def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
 def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the changes of arming and mode in a VehicleStatus."""
     was, now = before.get("arming_state"), after["arming_state"]
-    if now is not None and (was is None or (was == rules.ARMED) != (now == rules.ARMED)):
-        kind = "armed" if now == rules.ARMED else "disarmed"
+    if now is not None and (was is None or (was == _ARMED) != (now == _ARMED)):
+        kind = "armed" if now == _ARMED else "disarmed"
         yield Finding(kind, "once", kind, initial=was is None)
     was, now = before.get("nav_state"), after["nav_state"]
     if was is not None and now is not None and was != now:

@@ -79,7 +79,6 @@ FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of a kind of them, within
 MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; of further ones only the last
 PAUSE: Final = 5.0  # s without a further one after which flapping, losses, rejections or an overload have ended
 MAX_BURST: Final = 20.0  # s after which losses are reported even if they continue
-ARMED: Final = 2  # arming_state
 
 MODES: Final[Mapping[int, str]] = {
     0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 6: "Position Slow",
@@ -99,6 +98,3 @@ LEVELS: Final[Mapping[int, str]] = dict(
     enumerate(("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"))
 )
 """Names of LogMessage.severity, as in MAVLink."""
-
-CRITICAL: Final = 2
-WARNING: Final = 4

@@ -23,6 +23,7 @@ from nedbus.client import (
 )
 from nedbus.events import FIXES, MODES, State
 from nedbus_msgs import DEFAULT_TOPIC, Address
+from nedbus_msgs.messages import VehicleStatus
 
 from .stream import LONG, Origin, PageStream, is_position
 
@@ -34,7 +35,7 @@ MAX_STREAMS: Final = 1000
 
 _SILENT: Final = 60.0  # s without a message after which a stream makes room for another
 _MAX_REPORTS: Final = 100  # rejection reports kept
-_ARMED: Final = 2
+_ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _OK: Final = State("info", "ok", None, ())
 _DIGITS: Final = re.compile(r"\d+")
 _DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its details
