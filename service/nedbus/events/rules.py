@@ -53,6 +53,9 @@ FAILSAFE_FLAGS: Final[Mapping[str, str]] = {
     "fd_alt_loss": "uncommanded loss of altitude",
 }  # fmt: skip
 
+POSITIONS: Final = ("vehicle_local_position", "external_ins_local_position", "estimator_local_position")
+"""Topics with the validity of the position, in order of preference."""
+
 RECENT: Final = 60.0
 """Seconds during which a single event counts towards the state of a vehicle."""
 

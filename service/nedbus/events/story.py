@@ -14,9 +14,6 @@ from .times import Times
 
 TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
 _INVALID: Final = " not valid"
-POSITIONS: Final = frozenset({"vehicle_local_position", "external_ins_local_position", "estimator_local_position"})
-"""Topics with the validity of the position."""
-
 _GPS: Final = "vehicle_gps_position"
 _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
 """Topics with evidence about an invalid estimate."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
+from nedbus_msgs import BY_TOPIC, Address
 
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
 from .detectors import (
@@ -25,7 +25,7 @@ from .detectors import (
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
-from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, RECENT
+from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
 from .times import to_age
 
 _EKF: Final = "estimator_status_flags"
@@ -34,9 +34,8 @@ _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference: the best one that arrives gives the conditions of its message.
-_POSITIONS: Final = (DEFAULT_TOPIC, "external_ins_local_position", "estimator_local_position")
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
-_GROUPS: Final = (_POSITIONS, _RECEIVERS)
+_GROUPS: Final = (POSITIONS, _RECEIVERS)
 
 
 class Vehicle:
@@ -243,24 +242,24 @@ class Vehicle:
         self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
         if topic == EKF_SELECTOR:
-            unused = [each for each in self._detectors if each.topic == _POSITIONS[-1] and each != self.main]
+            unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], detect_selection)
         if topic == _EKF:
             return flags_detector(instance, lambda: self._ekf)
-        if instance and topic not in _POSITIONS:  # only the first sensor and battery
+        if instance and topic not in POSITIONS:  # only the first sensor and battery
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
-                is_sought = topic == _POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
+                is_sought = topic == POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
                 equals = estimate_detector(instance, self._position, self._equal, lambda: self._ekf)
                 return equals if is_sought else None
             if current is not None:
                 self._supersede(current, address)
             self._preferred[group] = address
-        if group is _POSITIONS:
+        if group is POSITIONS:
             self.main = address
             return PositionDetector()
         detector = make_detector(BY_TOPIC[topic].name) if topic in BY_TOPIC else None

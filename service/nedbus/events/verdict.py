@@ -11,8 +11,8 @@ from typing import Final
 
 from .event import ALL, WINDOW, Condition, Event
 from .kinds import KINDS, importance
-from .rules import LARGE_CORRECTION
-from .story import POSITIONS, TOGETHER, Story, stories_of
+from .rules import LARGE_CORRECTION, POSITIONS
+from .story import TOGETHER, Story, stories_of
 from .times import Times
 
 _WIDTH: Final = 97  # columns of a verdict beside a short name of the vehicle; it has at most three lines
@@ -64,7 +64,7 @@ def verdict_of(
         is_large = KINDS[kind].correction and _size(story) >= LARGE_CORRECTION
         return not story.is_bad, story.begin in parts, has_ended, not is_large, importance(kind), -_size(story)
 
-    known = None if POSITIONS.isdisjoint(topics) or "xy_valid" in unknown else True
+    known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
         length = "the history of the services" if times.is_live else f"{end:.0f} s"
         return Verdict(f"no faults in {length}{'' if known else '; the data has no validity of a position'}", known)
