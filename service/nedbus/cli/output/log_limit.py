@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from nedbus.log_event import EVENTS, About
@@ -32,29 +32,13 @@ class _TokenBucket:
     filled: float
     tokens: float = BURST
     left_out: int = 0
-    first: Mapping[str, object] | None = None  # not the record itself, which may keep a traceback alive
+    first: Mapping[str, object] = field(default_factory=dict)  # not the record itself, which may keep a traceback alive
 
     def fill(self, now: float) -> bool:
         """Add the tokens earned since the last call; return True if a line may be logged."""
         self.tokens = min(BURST, self.tokens + (now - self.filled) * PER_MINUTE / 60)
         self.filled = now
         return self.tokens >= 1
-
-    def take(self, record: logging.LogRecord, now: float) -> bool:
-        """Return True if a record may be logged, else count it."""
-        if self.fill(now):
-            self.tokens -= 1
-            return True
-        if not self.left_out:
-            text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
-            self.first = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
-        self.left_out += 1
-        return False
-
-    def take_report(self, event: str | None) -> logging.LogRecord:
-        count, self.left_out = self.left_out, 0
-        about = About("left-out", count=count, of=event)
-        return logging.makeLogRecord({**(self.first or {}), "args": (count,), "about": about})
 
 
 class RateLimit(logging.Filter):
@@ -85,16 +69,29 @@ class RateLimit(logging.Filter):
         with self._lock:
             if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
                 kind = "", None, ""  # all others
-            return self._buckets.setdefault(kind, _TokenBucket(now)).take(record, now)
+            bucket = self._buckets.setdefault(kind, _TokenBucket(now))
+            if bucket.fill(now):
+                bucket.tokens -= 1
+                return True
+            if not bucket.left_out:
+                text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
+                names = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname}
+                bucket.first = {**names, "msg": text}
+            bucket.left_out += 1
+            return False
 
     def flush(self) -> None:
         """Report all suppressed lines."""
         self._report(lambda _: True)
 
     def _report(self, is_due: Callable[[_TokenBucket], bool]) -> None:
+        reports = []
         with self._lock:
-            due = [(kind, each) for kind, each in self._buckets.items() if each.left_out and is_due(each)]
-            reports = [bucket.take_report(event) for (_, event, _), bucket in due]
+            for (_, event, _), bucket in self._buckets.items():
+                if bucket.left_out and is_due(bucket):
+                    about, args = About("left-out", count=bucket.left_out, of=event), (bucket.left_out,)
+                    reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
+                    bucket.left_out = 0
         for report in reports:
             self._handle(report)
 
