@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -44,7 +45,7 @@ class Chronicle:
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
-        self._stories: dict[tuple[str, Event | float | None], list[Story]] = {}
+        self._tell = functools.cache(self._find_stories)  # for all viewers, until the next event
         self._verdicts: dict[tuple[str, float | None], tuple[float, Verdict]] = {}
 
     @property
@@ -105,17 +106,14 @@ class Chronicle:
         stories = [(name, story) for name in self._by_vehicle for story in self._tell(name, None)]
         return sorted(stories, key=lambda each: each[1].since)
 
-    def _tell(self, vehicle: str, at: Event | float | None) -> list[Story]:
-        """Return the stories of an event, a time, or all times; cached for all viewers until the next event."""
-        if (vehicle, at) not in self._stories:
-            events, (topics, held) = self._by_vehicle.get(vehicle, []), self._known(vehicle)
-            if isinstance(at, Event):
-                story = story_of(at, events, held, topics=topics)
-                self._stories[vehicle, at] = [] if story is None else [story]
-            else:
-                moment = None if at is None else at + _TENTH
-                self._stories[vehicle, at] = stories_of(events[-_MAX_EVENTS:], held, topics=topics, at=moment)
-        return self._stories[vehicle, at]
+    def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:
+        """Return the stories of an event, a time, or all times."""
+        events, (topics, held) = self._by_vehicle.get(vehicle, []), self._known(vehicle)
+        if isinstance(at, Event):
+            story = story_of(at, events, held, topics=topics)
+            return [] if story is None else [story]
+        moment = None if at is None else at + _TENTH
+        return stories_of(events[-_MAX_EVENTS:], held, topics=topics, at=moment)
 
     def _known(self, vehicle: str) -> tuple[list[str], list[Condition]]:
         """Return the topics of a vehicle, and the conditions that began before the first event or are still active."""
@@ -127,7 +125,7 @@ class Chronicle:
             return
         events, self._taken = self.account.events_since(0)
         self._events = sorted([*self._before, *events], key=lambda event: event.time)
-        self._stories.clear()
+        self._tell.cache_clear()
         self._verdicts.clear()
         vehicles = dict(self.account.vehicles)
         self._by_vehicle = {name: [] for name in vehicles}
