@@ -277,8 +277,8 @@ class Viewer:
 
     def _lay_out(self, sheets: list[Any]) -> LayoutDOM:
         text = self._text
-        parts: list[LayoutDOM] = [text["head"], self._search, text["list"], text["tool"], self._map.figure]
-        parts += [self._timeline.figure, text["why"], text["nums"], self._grid, text["more"]]
+        parts: list[LayoutDOM] = [text["head"], self._search, text["list"], text["why"], text["tool"]]
+        parts += [self._map.figure, self._timeline.figure, text["nums"], self._grid, text["more"]]
         if self._player is not None:
             *controls, slider = self._player.controls
             for control in self._player.controls:
