@@ -71,8 +71,7 @@ class Vehicle:
         self._rebooted = -math.inf
         self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}  # of a condition, and of a kind
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
-        self._lost, self._rejected = _Burst(), _Burst()
-        self._dropouts = _Burst()  # in ms
+        self._bursts: dict[str, _Burst] = {}  # of messages lost or rejected, and ms of dropouts, by kind
         self._ekf = 0  # instance of the EKF in use
         self._comparison = Comparison(self._position)
         self._equal: dict[int, bool] = {}  # by EKF, if its estimate is the vehicle's
@@ -80,7 +79,7 @@ class Vehicle:
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
         """Add a message; `lost` is the number of messages lost before it."""
         if lost:
-            self._lost.add(time, lost, address.stream)
+            self._count("lost", time, lost, address.stream)
         try:
             detector = self._detectors[address]
         except KeyError:
@@ -116,34 +115,34 @@ class Vehicle:
 
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record that the logger recorded nothing from `time` on; the vehicle is not silent meanwhile."""
-        self._dropouts.add(time, round(1e3 * seconds), "")
+        self._count("dropout", time, round(1e3 * seconds))
         if self.main is not None:
             self._main_time = max(self._main_time, time + seconds)
 
     def reject(self, topic: str, reason: str, time: float) -> None:
         """Record a rejected message."""
-        if not self._rejected.count:
+        if "rejected" not in self._bursts:
             text = f"{topic} rejected: {reason}"
             self.emit(Finding("rejected", "begin", text, names=(topic, reason)), topic, time)
-        self._rejected.add(time, 1, topic)
+        self._count("rejected", time, 1, topic)
 
     def settle(self, time: float) -> None:
         """Report bursts of losses and rejections, and flapping, that have ended, and what a flight began without."""
-        lost, rejected, dropouts = self._lost, self._rejected, self._dropouts
-        if lost.is_over(time) or (lost.count and time - lost.begin > MAX_BURST):
-            names = tuple(sorted(lost.topics))
-            text = f"{lost.count} message{'s' * (lost.count > 1)} lost ({', '.join(names)})"
-            self.emit(Finding("lost", "once", text, names, {"messages": lost.count}), "", lost.begin)
-            self._lost = _Burst()
-        if dropouts.is_over(time):
-            duration = dropouts.count / 1e3
-            text = f"the logger recorded nothing for {to_age(duration)}"
-            self.emit(Finding("dropout", "once", text, numbers={"duration": duration}), "", dropouts.begin)
-            self._dropouts = _Burst()
-        if rejected.is_over(time):
-            text = f"rejections stopped ({rejected.count} message{'s' * (rejected.count > 1)})"
-            self.emit(Finding("rejected", "end", text, numbers={"messages": rejected.count}), "", rejected.end)
-            self._rejected = _Burst()
+        for kind, burst in list(self._bursts.items()):
+            if time - burst.end <= PAUSE and (kind != "lost" or time - burst.begin <= MAX_BURST):
+                continue
+            del self._bursts[kind]
+            messages, numbers = f"{burst.count} message{'s' * (burst.count > 1)}", {"messages": burst.count}
+            if kind == "lost":
+                names = tuple(sorted(burst.topics))
+                text = f"{messages} lost ({', '.join(names)})"
+                self.emit(Finding(kind, "once", text, names, numbers), "", burst.begin)
+            elif kind == "rejected":
+                self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
+            else:
+                duration = burst.count / 1e3
+                text = f"the logger recorded nothing for {to_age(duration)}"
+                self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
         if self._on_ground and time - self._armed_at >= PAUSE:
             self.conditions |= self._on_ground
             self.initial += dict.fromkeys(self._on_ground.values())
@@ -236,6 +235,12 @@ class Vehicle:
         """The texts of faults that held in the first message and have not ended, "" if there are none."""
         held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
         return ", ".join(dict.fromkeys(held))
+
+    def _count(self, kind: str, time: float, count: int, topic: str = "") -> None:
+        burst = self._bursts.setdefault(kind, _Burst(time, time))
+        burst.end, burst.count = time, burst.count + count
+        if len(burst.topics) < _MAX_TOPICS:
+            burst.topics.add(topic)
 
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
@@ -335,21 +340,12 @@ class Vehicle:
 
 @dataclass(slots=True)
 class _Burst:
-    """A burst of losses or rejections, reported once."""
+    """Losses, rejections or dropouts in close succession, reported once."""
 
-    begin: float = 0.0
-    end: float = 0.0
+    begin: float
+    end: float
     count: int = 0
     topics: set[str] = field(default_factory=set)
-
-    def add(self, time: float, count: int, topic: str) -> None:
-        self.begin = self.begin if self.count else time
-        self.end, self.count = time, self.count + count
-        if len(self.topics) < _MAX_TOPICS:
-            self.topics.add(topic)
-
-    def is_over(self, time: float) -> bool:
-        return self.count > 0 and time - self.end > PAUSE
 
 
 def _rank(topics: tuple[str, ...], address: Address) -> tuple[int, int]:
