@@ -288,26 +288,31 @@ def flags_detector(instance: int, used: Callable[[], int]) -> ChangeDetector:
     return ChangeDetector([*(flag for kind in _EKF for flag in kind.flags), *rules.FAKE_AIDING], detect)
 
 
-def estimate_detector(
-    instance: int, position: Callable[[], ChangeDetector | None], equal: dict[int, bool], used: Callable[[], int]
-) -> ChangeDetector:
-    """Return a detector of an estimator_local_position, to find the EKF in use where no selector names it.
+class EstimateDetector(ChangeDetector):
+    """Detector of an estimator_local_position, to find the EKF in use where no selector names it.
 
     `position` returns the detector of vehicle_local_position, which follows the estimate that it equals.
     `equal`: by instance, if the last estimate of the same sample equalled it; shared by all instances.
     `used` returns the instance in use.
     """
-    read = FieldReader(("timestamp_sample", "x", "y", "z"))
 
-    def detect(before: Fields, _: Fields) -> Iterator[Finding]:
-        known = position()
-        vehicle = read(None if known is None else known.last)
-        if before and before["timestamp_sample"] == vehicle[0]:
-            equal[instance] = tuple(map(before.get, read.names)) == vehicle
-        if equal.get(instance) and not equal.get(used(), True):
-            yield _selected(instance, None)
+    def __init__(
+        self, instance: int, position: Callable[[], ChangeDetector | None], equal: dict[int, bool],
+        used: Callable[[], int],
+    ) -> None:  # fmt: skip
+        super().__init__(("timestamp_sample", "x", "y", "z"), lambda _, __: iter(()))
+        self._instance, self._position, self._equal, self._used = instance, position, equal, used
 
-    return ChangeDetector(read.names, detect)
+    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
+        """Return a finding if this EKF is in use, and the one that was taken to be is not."""
+        values, before, position = self._read(message), self._state, self._position()
+        self.earlier, self.stamp, self._state = self.stamp, values[0], values[1:]
+        vehicle = self._read(None if position is None else position.last)[1:]
+        if before and before[0] == vehicle[0]:
+            self._equal[self._instance] = before == vehicle
+        if not self._equal.get(self._instance) or self._equal.get(self._used(), True):
+            return None
+        return iter([_selected(self._instance, None)])
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:

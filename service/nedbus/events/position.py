@@ -43,6 +43,7 @@ _CONTEXT: Final = (
     *dict.fromkeys(name for values, rates, delta in _STEPS.values() for name in (*values, *chain(*rates), delta)),
     *_ORIGIN,
 )
+_ABSENT: Final = dict.fromkeys(_CONTEXT, math.nan)
 
 Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
@@ -184,5 +185,4 @@ def _origin(fields: Fields) -> list[float | None]:
 
 
 def _fill_missing(fields: Fields) -> Fields:
-    absent = dict.fromkeys(_CONTEXT, math.nan)
-    return {name: absent.get(name, 0) if value is None else value for name, value in fields.items()}
+    return {name: _ABSENT.get(name, 0) if value is None else value for name, value in fields.items()}

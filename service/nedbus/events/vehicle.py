@@ -15,10 +15,10 @@ from .detectors import (
     EKF_SELECTOR,
     HEALTHY,
     ChangeDetector,
+    EstimateDetector,
     Finding,
     TextDetector,
     detect_selection,
-    estimate_detector,
     flags_detector,
     make_detector,
 )
@@ -259,7 +259,7 @@ class Vehicle:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
                 is_sought = topic == POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
-                equals = estimate_detector(instance, self._position, self._equal, lambda: self._ekf)
+                equals = EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
                 return equals if is_sought else None
             if current is not None:
                 self._supersede(current, address)
