@@ -9,7 +9,7 @@ import nedbus
 with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
     for batch in subscription.batches():
         for address in batch.addresses:
-            own = batch.of(address)
-            own = own[own["v_xy_valid"]]
-            if len(own):
-                print(address.vehicle, len(own), f"{np.hypot(own['vx'], own['vy']).mean():.2f} m/s", flush=True)
+            own = nedbus.mask_invalid(batch.of(address))  # NaN while v_xy_valid is false
+            speeds = np.hypot(own["vx"], own["vy"])
+            if not np.isnan(speeds).all():
+                print(address.vehicle, len(own), f"{np.nanmean(speeds):.2f} m/s", flush=True)

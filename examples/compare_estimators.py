@@ -5,14 +5,14 @@ from contextlib import suppress
 
 import nedbus
 
-truth: nedbus.VehicleLocalPosition | None = None
+truth: nedbus.frames.Ned | None = None
 with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     for sample in bus.subscribe("*", vehicle="1", mode="every"):
         message = sample.message
         if not isinstance(message, nedbus.VehicleLocalPosition):
             continue
         if sample.topic == "vehicle_local_position_groundtruth":
-            truth = message
-        elif sample.topic == "estimator_local_position" and truth is not None:
-            error = math.dist((message.x, message.y, message.z), (truth.x, truth.y, truth.z))
+            truth = message.position
+        elif sample.topic == "estimator_local_position" and truth and message.position:
+            error = math.dist(message.position, truth)
             print(f"estimator {sample.instance}: {error:6.2f} m off, reports eph {message.eph:5.2f} m")

@@ -9,7 +9,7 @@ with suppress(KeyboardInterrupt), nedbus.connect() as bus:
         print(f"vehicle {vehicle}: {len(addresses)} streams")
     for sample in bus.latest():
         age = "unknown" if sample.latency is None else f"{sample.latency:.3f} s"
+        position = sample.message.position
+        where = "no valid position" if position is None else " ".join(f"{metres:.2f}" for metres in position)
         doubt = ", dead reckoning" if sample.message.dead_reckoning else ""
-        print(
-            f"{sample.vehicle}: {sample.message.x:.2f} {sample.message.y:.2f} {sample.message.z:.2f}, {age} old{doubt}"
-        )
+        print(f"{sample.vehicle}: {where}, {age} old{doubt}")

@@ -4,7 +4,9 @@ import nedbus
 
 with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     for sample in bus.subscribe():  # vehicle_local_position of all vehicles, by default
-        message = sample.message
-        if message.xy_valid and message.z_valid:
-            position = f"{message.x:.2f} m north, {message.y:.2f} m east, {-message.z:.2f} m up"
-            print(sample.vehicle, position)
+        position = sample.message.position  # None while it is invalid, or its validity unknown
+        if position is None:
+            print(sample.vehicle, "has no valid position")
+        else:
+            north, east, down = position
+            print(sample.vehicle, f"{north:.2f} m north, {east:.2f} m east, {-down:.2f} m up")

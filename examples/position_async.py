@@ -8,7 +8,9 @@ import nedbus
 
 async def show(subscription: nedbus.AsyncSubscription) -> None:
     async for sample in subscription:
-        print(f"{sample.vehicle}: {sample.message.x:8.2f} {sample.message.y:8.2f} {sample.message.z:8.2f}")
+        position = sample.message.position
+        where = "no valid position" if position is None else " ".join(f"{metres:8.2f}" for metres in position)
+        print(f"{sample.vehicle}: {where}")
 
 
 async def report(subscription: nedbus.AsyncSubscription) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from nedbus_msgs import Definition, hash_of, ros2_type
@@ -28,12 +28,19 @@ def page(definition: Definition[Any]) -> str:
     parts.append(_layouts(definition))
     rules = [row for rule in definition.rules for row in rows_of(rule)]
     parts.append(section("Rules", table(["fields", "rule"], rules)))
+    parts.append(section("Properties", table(["property", "value", "None"], list(_properties(definition)))))
     older = [
         [f"`{old.name}`", " and ".join(map(_place, old.places)) + ", in other units" * bool(old.up)]
         for old in definition.older.values()
     ]
     parts.append(section("Older names", table(["older field", "now"], older)))
     return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _properties(definition: Definition[Any]) -> Iterator[list[str]]:
+    for name, value in vars(definition.model).items():
+        if isinstance(value, property):
+            yield [f"`{name}`", *str(value.__doc__).rstrip(".").split("; None ")]
 
 
 def _topics(definition: Definition[Any]) -> str:

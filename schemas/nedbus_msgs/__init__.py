@@ -13,7 +13,7 @@ from .errors import (
     NedbusError,
     UnknownLayoutError,
 )
-from .flags import DOUBT_FLAGS, FLAG_FIELDS, describe_flags, message_doubts
+from .flags import DOUBT_FLAGS, describe_flags, message_doubts
 from .frames import (
     GlobalPosition,
     MapProjection,
@@ -77,7 +77,7 @@ from .undeclared import define
 
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS",
-    "FLAG_FIELDS", "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address",
+    "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address",
     "AddressError", "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
     "GlobalPosition", "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError",
     "NedbusError", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic",

@@ -19,14 +19,14 @@ from .codecs.msgpack import codec_of
 from .errors import InvalidMessageError
 from .functions import DEFAULT, M, definition_of
 from .model.declaration import Layout, kept
-from .model.definition import Definition
+from .model.definition import MESSAGES, Definition
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, decode_text, encode_text
 from .model.rules import passes_all, wrong_columns
 from .model.validation import Values
 
 __all__ = [
-    "DTYPE", "Arrays", "MessageArray", "arrays_of", "dtype_of", "to_array", "to_message",
+    "DTYPE", "Arrays", "MessageArray", "arrays_of", "dtype_of", "mask_invalid", "to_array", "to_message",
 ]  # fmt: skip
 
 
@@ -247,3 +247,13 @@ def to_array(messages: Sequence[M]) -> MessageArray:
 def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # any, by default
     """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
     return arrays_of(definition_of(message)).to_message(element)
+
+
+def mask_invalid(messages: MessageArray) -> MessageArray:
+    """Return a copy with NaN in each field whose flag, such as `xy_valid`, is false or not provided."""
+    masked = messages.copy()
+    for flags in (definition.flags for definition in MESSAGES.values()):
+        for flag in flags.keys() & set(messages.dtype.names or ()):
+            for name in flags[flag]:
+                masked[name][~masked[flag]] = np.nan
+    return masked

@@ -6,10 +6,6 @@ from collections.abc import Collection, Mapping
 from typing import Final
 
 from .messages.vehicle_local_position import VehicleLocalPosition
-from .model.rules import FiniteWhile
-
-FLAG_FIELDS: Final = next(rule.flags for rule in VehicleLocalPosition.RULES if isinstance(rule, FiniteWhile))
-"""The fields that must be finite while a flag is set."""
 
 _VALID: Final = {"xy_valid": "xy", "z_valid": "z", "v_xy_valid": "vxy", "v_z_valid": "vz"}
 _WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # bad if set

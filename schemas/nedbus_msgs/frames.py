@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from .messages.vehicle_local_position import VehicleLocalPosition as Message
+if TYPE_CHECKING:
+    from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
 __all__ = [
-    "GlobalPosition", "MapProjection", "Vector", "enu_to_ned", "euler_to_quaternion", "flu_to_frd", "frd_to_flu",
+    "GlobalPosition", "MapProjection", "Ned", "Vector", "enu_to_ned", "euler_to_quaternion", "flu_to_frd", "frd_to_flu",
     "ned_to_enu", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "quaternion_to_euler", "to_global", "to_local",
     "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
@@ -25,6 +26,14 @@ EARTH_RADIUS: Final = 6_371_000.0
 
 Vector = tuple[float, float, float]
 _Quaternion = tuple[float, float, float, float]
+
+
+class Ned(NamedTuple):
+    """North, east and down: a position [m] or a velocity [m/s]."""
+
+    north: float
+    east: float
+    down: float
 
 
 def ned_to_enu(vector: Vector) -> Vector:
@@ -154,7 +163,7 @@ def to_global(message: Message) -> GlobalPosition | None:
     """Return the global position of a message, None without a global origin (`xy_global` is false) or x and y.
 
     The altitude is NaN while only the horizontal origin is known.
-    The position is that of x, y and z, valid or not: check `xy_valid` and `z_valid`.
+    The position is that of x, y and z, valid or not; `message.global_position` is None while one of them is invalid.
     """
     if not message.xy_global or not math.isfinite(message.x + message.y):
         return None

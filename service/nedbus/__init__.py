@@ -4,7 +4,7 @@ import nedbus
 
 with nedbus.connect() as bus:
     for sample in bus.subscribe():
-        print(sample.vehicle, sample.message.x, sample.message.y, sample.message.z)
+        print(sample.vehicle, sample.message.position)  # north, east and down; None while it is invalid
 
 More is in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
 """
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         VehicleLocalPosition,
         define_msg,
     )
-    from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, to_array, to_message
+    from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, mask_invalid, to_array, to_message
     from nedbus_msgs.messages import *  # noqa: F403 - each by its name
 
     from . import errors as errors
@@ -73,7 +73,7 @@ __all__ = [
     "InvalidMessageError", "Message", "MessageArray", "Mode", "NedbusError", "NoDataError", "Provenance", "Publisher",
     "Quantity", "ReceiveError", "ResetTracker", "Row", "Sample", "Selection", "Session", "SourceError", "Subscription",
     "Tls", "Topic", "UtcOffset", "VehicleLocalPosition", "addresses_of", "align", "connect", "connect_async",
-    "define_msg", "dtype_of", "missing_of", "read", "to_array", "to_message", "utc_of",
+    "define_msg", "dtype_of", "mask_invalid", "missing_of", "read", "to_array", "to_message", "utc_of",
 ]  # fmt: skip
 
 # Imported on first use of a name: `nedbus --version` needs none of them, and only the last two load NumPy.

@@ -1,24 +1,47 @@
-"""The table of flags, and how doubts are shown."""
+"""Flags: how doubts are shown, and positions, velocities and the like, which are None while their flags are false."""
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import nedbus_msgs
-from nedbus_msgs import DOUBT_FLAGS, VehicleLocalPosition, describe_flags, message_doubts
+from nedbus_msgs import (
+    DOUBT_FLAGS,
+    MESSAGES,
+    Definition,
+    GlobalPosition,
+    Message,
+    VehicleLocalPosition,
+    describe_flags,
+    message_doubts,
+    to_global,
+)
+from nedbus_msgs.frames import Ned
+from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
 from tests.flights.first_message import row_of
 
 from .strategies import FLAG_FIELDS, messages
 
 GOOD = {"xy_valid": 1.0, "z_valid": 1.0, "v_xy_valid": 1.0, "v_z_valid": 1.0, "dead_reckoning": 0.0}
 
+GUARDED = [
+    (definition, name, str(value.__doc__).partition("; None unless ")[2].rstrip(".").split(" and "))
+    for definition in MESSAGES.values()
+    for name, value in vars(definition.model).items()
+    if isinstance(value, property) and "; None unless " in str(value.__doc__)
+]
+EACH = pytest.mark.parametrize(
+    ("definition", "name", "flags"), GUARDED, ids=[f"{each[0].name}.{each[1]}" for each in GUARDED]
+)
+
 
 def test_doubts_are_validity_and_dead_reckoning() -> None:
     """Validity and dead reckoning are shown; global references, terrain and heading are not."""
     assert DOUBT_FLAGS == ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning")
-    assert nedbus_msgs.FLAG_FIELDS == FLAG_FIELDS
 
 
 @pytest.mark.parametrize(
@@ -49,3 +72,84 @@ def test_doubts_have_no_percentage_in_one_message(message: VehicleLocalPosition,
     either = row_of(message) if as_row else message
     assert message_doubts(either) == describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})
     assert "%" not in message_doubts(either)
+
+
+def model_and_row(message: Message) -> tuple[Any, Any]:
+    return message, message.DEFINITION.row._make(message.__dict__.values())
+
+
+@EACH
+def test_value_is_none_unless_every_flag_is_true(definition: Definition[Any], name: str, flags: list[str]) -> None:
+    """Each flag alone makes a value None, also one that is not provided; zeros with all flags set are a value."""
+    fields = {field: 0.0 for flag in flags for field in definition.flags[flag]}
+    for each in model_and_row(definition.model(timestamp=1, **fields, **dict.fromkeys(flags, True))):
+        assert getattr(each, name) is not None
+    for unset in flags:
+        others = dict.fromkeys(set(flags) - {unset}, True)
+        for given_flags in (others, {**others, unset: False}):
+            for each in model_and_row(definition.model(timestamp=1, **fields, **given_flags)):
+                assert getattr(each, name) is None, unset
+
+
+@EACH
+def test_name_of_a_value_is_no_field(definition: Definition[Any], name: str, flags: list[str]) -> None:
+    """No layout of PX4 has a field of that name, nor had one that PX4 renamed."""
+    assert name not in definition.known_types.keys() | definition.older.keys()
+    assert name not in definition.row._fields
+
+
+def test_every_flag_guards_a_value() -> None:
+    """A field that a rule FiniteWhile names can be read with its flag checked."""
+    guarded = {(definition.name, flag) for definition, _, flags in GUARDED for flag in flags}
+    flags = {(definition.name, flag) for definition in MESSAGES.values() for flag in definition.flags}
+    assert flags - guarded == {("SensorGps", "vel_ned_valid")}  # its velocity needs a fix as well
+    assert VehicleLocalPosition.DEFINITION.flags == FLAG_FIELDS
+
+
+@given(messages(), st.booleans())
+def test_valid_values_are_those_of_the_fields(message: VehicleLocalPosition, as_row: bool) -> None:
+    """A position has x, y and z in this order, bit for bit; its height points up."""
+    either = row_of(message) if as_row else message
+    has_position, has_origin = message.xy_valid and message.z_valid, message.xy_global and message.z_global
+    assert either.position == (Ned(message.x, message.y, message.z) if has_position else None)
+    velocity = Ned(message.vx, message.vy, message.vz) if message.v_xy_valid and message.v_z_valid else None
+    assert either.velocity == velocity
+    assert either.height == (-message.z if message.z_valid else None)
+    assert either.good_heading == (message.heading if message.heading_good_for_control else None)
+    assert either.height_above_ground == (message.dist_bottom if message.dist_bottom_valid else None)
+    origin = GlobalPosition(message.ref_lat, message.ref_lon, message.ref_alt) if has_origin else None
+    assert either.origin == origin
+    assert either.global_position == (to_global(message) if has_position and has_origin else None)
+
+
+def test_other_messages_have_their_positions() -> None:
+    """A global position, home, and the ground below."""
+    where = VehicleGlobalPosition(timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True)
+    assert (where.global_position, where.ground_altitude) == (GlobalPosition(47.0, 8.0, 400.0), None)
+    home = HomePosition(timestamp=1, x=1.0, y=2.0, z=-3.0, lat=0.0, lon=0.0, alt=0.0, valid_lpos=True)
+    assert (home.position, home.global_position) == (Ned(1.0, 2.0, -3.0), None)
+
+
+@pytest.mark.parametrize(
+    ("fix_type", "flag", "has_position", "has_velocity"),
+    [(0, True, False, False), (1, True, False, False), (2, True, False, True), (3, True, True, True),
+     (6, False, True, False)],
+)  # fmt: skip
+def test_gnss_has_a_position_with_a_fix_alone(
+    fix_type: int, flag: bool, has_position: bool, has_velocity: bool
+) -> None:
+    """Receivers without a fix send zeros or an old position, and may set vel_ned_valid."""
+    position = {"latitude_deg": 47.0, "longitude_deg": 8.0, "altitude_msl_m": 400.0}
+    velocity = {"vel_n_m_s": 1.0, "vel_e_m_s": 2.0, "vel_d_m_s": 3.0}
+    fields: dict[str, Any] = {**position, **velocity, "vel_ned_valid": flag}
+    for each in model_and_row(SensorGps(timestamp=1, fix_type=fix_type, **fields)):
+        assert each.global_position == (GlobalPosition(47.0, 8.0, 400.0) if has_position else None)
+        assert each.velocity == (Ned(1.0, 2.0, 3.0) if has_velocity else None)
+
+
+def test_position_of_no_estimate_cannot_be_computed_with() -> None:
+    """A vehicle whose estimator has not begun sends zeros: a script that forgets the flags fails, and does not fly."""
+    message = VehicleLocalPosition(timestamp=1, x=0.0, y=0.0, z=0.0)
+    assert math.hypot(message.x, message.y, message.z) == 0.0
+    with pytest.raises(TypeError):
+        math.dist(message.position, (0.0, 0.0, 0.0))  # type: ignore[arg-type] # None, as mypy says

@@ -24,6 +24,7 @@ def subscribe(bus: nedbus.Bus) -> None:
         for row in subscription.rows():
             assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
             assert_type(row.message.delta_xy, tuple[float, float])
+            assert_type(row.message.height, float | None)
             row.message.y_valid  # type: ignore[attr-defined] # no such field
         for batch in subscription.batches():
             assert_type(batch, nedbus.Batch)
@@ -66,6 +67,9 @@ def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) 
     assert_type(nedbus.frames.to_global(sample.message), nedbus.frames.GlobalPosition | None)
     assert_type(nedbus.frames.to_global(row.message), nedbus.frames.GlobalPosition | None)
     nedbus.frames.to_global(row.message).latitude  # type: ignore[union-attr] # None without a global origin
+    assert_type(sample.message.position, nedbus.frames.Ned | None)
+    assert_type(row.message.global_position, nedbus.frames.GlobalPosition | None)
+    nedbus.frames.ned_to_enu(sample.message.position)  # type: ignore[arg-type] # None while it is invalid
     assert_type(nedbus.ResetTracker().add(row.message), nedbus.Continuous)
     nedbus.health.Monitor().add(row)
     nedbus.health.Monitor().add(sample)

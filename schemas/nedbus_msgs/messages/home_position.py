@@ -1,7 +1,10 @@
 """HomePosition: the place to which the vehicle returns."""
 
+from typing import ClassVar
+
+from nedbus_msgs.frames import GlobalPosition, Ned
 from nedbus_msgs.model import FiniteWhile, Layout, Message, Topic, Within
-from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field
+from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field, while_valid
 
 
 class HomePosition(Message):
@@ -45,3 +48,6 @@ class HomePosition(Message):
 
     manual_home: Bool = field("Home was set by the user, not by the vehicle")
     update_count: Uint32 = field("Count of changes of home since boot")
+
+    position: ClassVar = while_valid(Ned, "x, y and z [m] [local NED]", "valid_lpos")
+    global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "valid_hpos", "valid_alt")

@@ -2,6 +2,7 @@
 
 import math
 
+from nedbus_msgs.frames import GlobalPosition, Ned
 from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64, field
 
@@ -14,7 +15,7 @@ def _integer(value: float, scale: float) -> int:
 class SensorGps(Message):
     """Output of a GNSS receiver (sensor_gps), or the selected or blended output that EKF2 uses (vehicle_gps_position).
 
-    Check fix_type first: with 0 or 1 (no fix), position and velocity may look good, and vel_ned_valid may be true.
+    Without a fix (fix_type 0 or 1), fields may look good, also vel_ned_valid; global_position and velocity are None.
     Without a fix, some receivers report eph and epv of thousands of kilometres; many leave timestamp_sample at 0.
     cog_rad is within [-pi, pi] or [0, 2 pi], as the receiver has it; time_utc_usec is 0 until the receiver knows UTC.
 
@@ -120,3 +121,15 @@ class SensorGps(Message):
     antenna_offset_x: Float32 = field("Antenna's position, forward [m] [body FRD]")
     antenna_offset_y: Float32 = field("Antenna's position, right [m] [body FRD]")
     antenna_offset_z: Float32 = field("Antenna's position, down [m] [body FRD]")
+
+    @property
+    def global_position(self) -> GlobalPosition | None:
+        """Latitude, longitude [deg] [WGS84] and altitude above mean sea level [m]; None without a 3D fix."""
+        has_fix = self.fix_type >= SensorGps.FIX_TYPE_3D
+        return GlobalPosition(self.latitude_deg, self.longitude_deg, self.altitude_msl_m) if has_fix else None
+
+    @property
+    def velocity(self) -> Ned | None:
+        """Velocity [m/s] [NED]; None without a fix, and unless vel_ned_valid."""
+        is_valid = self.vel_ned_valid and self.fix_type >= SensorGps.FIX_TYPE_2D
+        return Ned(self.vel_n_m_s, self.vel_e_m_s, self.vel_d_m_s) if is_valid else None

@@ -1,14 +1,17 @@
 """VehicleGlobalPosition: latitude, longitude and altitude of the vehicle."""
 
+from typing import ClassVar
+
+from nedbus_msgs.frames import GlobalPosition
 from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
-from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field
+from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field, while_valid
 
 
 class VehicleGlobalPosition(Message):
     """Global position estimate of a vehicle; the output of its GNSS receiver is SensorGps.
 
     Degrees (WGS84) and metres upwards; VehicleLocalPosition is the same estimate in local NED.
-    Layouts up to 1.15 lack lat_lon_valid and alt_valid: false means unknown then, see `model_fields_set`.
+    Layouts up to 1.15 lack lat_lon_valid and alt_valid: false means unknown then, and global_position is None.
     The position can jump by metres without a counted reset, as when GNSS returns after dead reckoning.
     alt_ellipsoid is often alt in simulators, and 0 in some ground truth.
     """
@@ -54,3 +57,6 @@ class VehicleGlobalPosition(Message):
     terrain_alt_valid: Bool = field("terrain_alt is valid")
 
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
+
+    global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "lat_lon_valid", "alt_valid")
+    ground_altitude: ClassVar = while_valid(float, "terrain_alt [m]", "terrain_alt_valid")

@@ -7,8 +7,9 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.model import FLOAT32_PI, FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
-from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Timestamp, Uint8, Uint64, field
+from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Timestamp, Uint8, Uint64, field, while_valid
 
 
 class VehicleLocalPosition(Message):
@@ -138,3 +139,15 @@ class VehicleLocalPosition(Message):
     hagl_min: Float32 = field("Least height above ground [m]; none: infinity (0 in ground truth)")
     hagl_max_z: Float32 = field("Greatest height above ground for z control [m]; none: infinity")
     hagl_max_xy: Float32 = field("Greatest height above ground for xy control [m]; none: infinity")
+
+    position: ClassVar = while_valid(Ned, "x, y and z [m] [local NED]", "xy_valid", "z_valid")
+    velocity: ClassVar = while_valid(Ned, "vx, vy and vz [m/s] [local NED]", "v_xy_valid", "v_z_valid")
+    height: ClassVar = while_valid(float.__neg__, "-z, height above the origin [m]", "z_valid")
+    height_above_ground: ClassVar = while_valid(float, "dist_bottom [m]", "dist_bottom_valid")
+    good_heading: ClassVar = while_valid(float, "heading, good for control [rad]", "heading_good_for_control")
+    origin: ClassVar = while_valid(GlobalPosition, "ref_lat, ref_lon [deg], ref_alt [m]", "xy_global", "z_global")
+
+    @property
+    def global_position(self) -> GlobalPosition | None:
+        """Position as latitude, longitude [deg] [WGS84] and altitude [m]; None without position and origin."""
+        return to_global(self) if self.position and self.origin else None

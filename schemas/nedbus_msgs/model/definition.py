@@ -75,6 +75,7 @@ class Definition(Generic[M_co]):
     `name`: its name in PX4, such as VehicleAttitude. `model`: its Pydantic model.
     `types`: the PX4 type of every field of the model, in order.
     `topics`, `older`: topics and older fields by name. `rules`: the rules for its fields.
+    `flags`: the fields that are valid while a flag is true.
     `always`: the fields that every log has, even the oldest. `caches`: see `kept`.
     """
 
@@ -90,6 +91,7 @@ class Definition(Generic[M_co]):
         self.topics = {topic.name: topic for topic in model.TOPICS}
         self.older = {old.name: old for old in model.OLDER}
         self.rules = model.RULES
+        self.flags = {flag: names for rule in model.RULES for flag, names in rule.flags.items()}
         self.always = frozenset(model.ALWAYS.split())
         self.caches: dict[object, Callable[..., Any]] = {}
 
@@ -123,6 +125,7 @@ class Definition(Generic[M_co]):
     def row(self) -> type[Row]:
         """The named tuple of this message."""
         places: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
+        places |= {name: each for name, each in vars(self.model).items() if isinstance(each, property)}
         return type(f"{self.name}Row", (Row,), {**places, "__slots__": (), "_fields": self.names, "DEFINITION": self})
 
     def layout_of_release(self, release: str) -> Layout | None:

@@ -1,17 +1,19 @@
-"""PX4's field types: a table of base types, and annotations for Pydantic."""
+"""PX4's field types: a table of base types, and declarations of fields and of properties with flags."""
 
 from __future__ import annotations
 
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, TypeVar, cast
 
 from pydantic import Field
 from pydantic_core import CoreSchema, core_schema
+
+_T = TypeVar("_T")
 
 NAN: Final = math.nan
 LONGEST_ARRAY: Final = 1024
@@ -192,6 +194,20 @@ def field_type(text: str) -> FieldType:
 def field(meaning: str) -> Any:
     """Declare a field with its unit, frame and meaning; its default is NaN, false or 0."""
     return Field(description=meaning)
+
+
+def while_valid(make: Callable[..., _T], meaning: str, *flags: str) -> _T | None:
+    """Declare a property of models and rows: None while one of its flags is false or not provided.
+
+    `make`: a function from the fields of these flags, by the message's rule FiniteWhile, to the value.
+    """
+
+    def value(message: Any) -> _T | None:
+        fields = message.DEFINITION.flags
+        is_valid = all(getattr(message, flag) for flag in flags)
+        return make(*(getattr(message, name) for flag in flags for name in fields[flag])) if is_valid else None
+
+    return cast("_T | None", property(value, doc=f"{meaning}; None unless {' and '.join(flags)}."))
 
 
 Timestamp = Annotated[int, field_type("uint64")]

@@ -40,6 +40,7 @@ class Rule:
     """
 
     reason: str
+    flags: Mapping[str, Sequence[str]] = {}
 
     def __init__(self, *fields: str) -> None:
         self.fields = fields

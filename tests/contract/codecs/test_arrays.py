@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nedbus_msgs import DecodeError, VehicleLocalPosition
-from nedbus_msgs.arrays import DTYPE, to_array
-from tests.contract.strategies import BREAKING, BROKEN, FLIGHTS, KEEPING, REAL, messages, pack_full_width
+from nedbus_msgs.arrays import DTYPE, mask_invalid, to_array
+from nedbus_msgs.messages import HomePosition, VehicleAttitude
+from tests.contract.strategies import BREAKING, BROKEN, FLAG_FIELDS, FLIGHTS, KEEPING, REAL, messages, pack_full_width
 from tests.flights.first_message import (
     PAYLOAD_SIZE,
     decode_array,
@@ -127,3 +128,26 @@ def test_cdr_that_is_not_certain_is_not_valid() -> None:
     array, valid = decode_cdr_array([payload, *others, payload])
     assert valid.tolist() == [True, *[False] * len(others), True]
     assert array[0] == array[-1] == to_array(FLIGHTS[:1])[0]
+
+
+@given(st.lists(messages(), max_size=5))
+def test_invalid_fields_are_masked(sent: list[VehicleLocalPosition]) -> None:
+    """A column is NaN exactly where its flag is false; all others are unchanged, and so is the array itself."""
+    array = to_array(sent)
+    before, masked = array.tobytes(), mask_invalid(array)
+    assert array.tobytes() == before
+    assert masked.dtype == array.dtype
+    flag_of = {name: flag for flag, names in FLAG_FIELDS.items() for name in names}
+    for name in DTYPE.names or ():
+        known = array[flag_of[name]] if name in flag_of else np.ones(len(array), bool)
+        assert masked[name][known].tobytes() == array[name][known].tobytes()
+        assert np.isnan(masked[name][~known]).all()
+
+
+def test_flags_of_any_message_are_masked() -> None:
+    """The flags are those of the message in the array; one without flags is copied as it is."""
+    home = mask_invalid(to_array([HomePosition(timestamp=1, lat=0.0, lon=0.0, x=1.0, y=2.0, z=3.0, valid_lpos=True)]))
+    assert np.isnan([home["lat"], home["lon"]]).all()
+    assert [home[name].tolist() for name in "xyz"] == [[1.0], [2.0], [3.0]]
+    attitudes = to_array([VehicleAttitude(timestamp=1, q=(1.0, 0.0, 0.0, 0.0))])
+    assert mask_invalid(attitudes).tobytes() == attitudes.tobytes()

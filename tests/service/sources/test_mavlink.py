@@ -121,7 +121,9 @@ def estimates(number: int) -> list[dict[str, float]]:
     return [{name: getattr(upgrade(each.fields), name) for name in (*ROW, *flags)} for each in chosen]
 
 
-def test_unknown_validity_is_neither_valid_nor_invalid(run_nedbus: Start, port: int, endpoint: str) -> None:
+def test_unknown_validity_is_neither_valid_nor_invalid(
+    run_nedbus: Start, bus: nedbus.Bus, port: int, endpoint: str
+) -> None:
     """A vehicle without ESTIMATOR_STATUS, as ArduPilot by default: every command calls its validity unknown."""
     pages = Pages(free_port())
     run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
@@ -151,6 +153,9 @@ def test_unknown_validity_is_neither_valid_nor_invalid(run_nedbus: Start, port: 
                 assert text in shown.out + shown.err, (command, shown)
                 assert "invalid," not in shown.out, command
             assert pages.values("nedbus_stream_flag_ratio") == []
+            [sample] = bus.latest()
+            assert (sample.message.x, sample.message.position) == (0.0, None)
+            assert {"xy_valid", "z_valid"} <= sample.missing, "unknown, not invalid"
         finally:
             done.set()
         sending.result(DEADLINE)

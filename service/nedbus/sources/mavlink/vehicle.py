@@ -16,7 +16,7 @@ from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.ulog import SPOKEN, TextLimit
-from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address, is_unix_time
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, Address, is_unix_time
 
 from .fields import CONVERSIONS, is_reboot, sensors_of
 from .status_texts import StatusTexts
@@ -216,9 +216,8 @@ class Vehicle:
                 for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
                     fields |= self._recall(name, now)
                 # The flags are from an earlier message; the fields may have become NaN since.
-                for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
-                    values = cast("list[float]", [fields[name] for name in FLAG_FIELDS[flag]])
-                    if fields.get(flag) and not all(map(math.isfinite, values)):
+                for flag, names in DEFAULT.flags.items():
+                    if fields.get(flag) and not all(math.isfinite(cast("float", fields[name])) for name in names):
                         fields[flag] = False
             case "vehicle_global_position":
                 fields |= self._recall("global status", now)
