@@ -1,6 +1,6 @@
 """The contract of nedbus: messages, layouts, topics and wire format; no I/O, no Zenoh."""
 
-from .clock import is_unix_time
+from .clock import YEAR_2000, is_unix_time
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
 from .errors import (
@@ -77,7 +77,7 @@ from .undeclared import define
 
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS",
-    "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address",
+    "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address",
     "AddressError", "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
     "GlobalPosition", "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError",
     "NedbusError", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic",

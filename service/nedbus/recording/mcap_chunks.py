@@ -27,6 +27,7 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from nedbus.errors import SourceError
+from nedbus_msgs import is_unix_time
 
 from .flight_files import open_flight
 
@@ -51,7 +52,6 @@ _MAX_SMALL_CHUNK: Final = 2**26  # bytes uncompressed, at any ratio; ROS 2 write
 _MAX_CHUNK: Final = 2**30  # bytes uncompressed
 _MAX_RATIO: Final = 100  # compression ratio of chunks above _MAX_SMALL_CHUNK
 _MAX_WARNINGS: Final = 100
-_EPOCH: Final = 10**17  # ns; above this a time is a Unix time, below it counts from the vehicle's boot
 
 _Place = tuple[int, int, int]  # a record: opcode, offset, and offset of the next record
 
@@ -239,7 +239,7 @@ def _describe(chunk: bytes, offset: int) -> str:
     if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
         return f"at byte {offset}"
     start, end, *_ = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)
-    if start < _EPOCH:
+    if not is_unix_time(start // 1000):
         return f"at byte {offset} ({start / 1e9:.1f} to {end / 1e9:.1f} s)"
     first, last = (datetime.fromtimestamp(time / 1e9, UTC) for time in (start, end))
     return f"at byte {offset} ({first:%Y-%m-%d %H:%M:%S} to {last:%H:%M:%S} UTC)"

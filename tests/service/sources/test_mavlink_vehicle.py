@@ -62,6 +62,18 @@ def test_constant_position_mode_is_no_sign_of_rest(vehicle: Vehicle, flags: int,
 
 
 @pytest.mark.parametrize(
+    ("time_usec", "timestamp"),
+    [(0, 7_000_000), (6_500_000, 6_500_000), (1_700_000_000_000_000, 7_000_000), (2**64 - 1, 7_000_000)],
+)
+def test_unix_time_is_no_time_since_boot(time_usec: int, timestamp: int) -> None:
+    """A time that is Unix time, unknown or nonsense is replaced by that of the newest message since boot."""
+    vehicle = new_vehicle(f"{VLP},sensor_gps")
+    estimate(vehicle, 7000, 100.0)
+    gps = dialect.MAVLink_gps_raw_int_message(time_usec, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
+    assert handle(vehicle, gps, 100.0).fields["timestamp"] == timestamp
+
+
+@pytest.mark.parametrize(
     ("rate", "baud", "status", "odometry"),
     [
         (30.0, 57600, 13.04, 10.0),

@@ -16,7 +16,7 @@ from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.ulog import SPOKEN, TextLimit
-from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, Address, is_unix_time
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, is_unix_time
 
 from .fields import CONVERSIONS, is_reboot, sensors_of
 from .status_texts import StatusTexts
@@ -29,7 +29,6 @@ _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is res
 _FIRST_ROUNDS: Final = 3  # times that each request is sent at first, as links lose some
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
-_LONG_AGO: Final = 2**48  # us, 9 years; a later time is Unix time, not time since boot
 _UNKNOWN_HEADING: Final = 65535
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -229,7 +228,7 @@ class Vehicle:
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot]; without a time of its own, it gets the newest one received."""
         microseconds: int = getattr(message, "time_usec", 0)
-        if 0 < microseconds < _LONG_AGO:
+        if 0 < microseconds < YEAR_2000:
             return microseconds
         ms: int | None = getattr(message, "time_boot_ms", self._newest)
         if ms is None:
