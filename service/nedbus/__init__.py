@@ -92,7 +92,7 @@ if not TYPE_CHECKING:  # otherwise type checkers would accept any name
     def __getattr__(name: str) -> object:
         """Import the module of a public name on first use."""
         if name in __all__:
-            module = next(each for each in map(_import_module, _MODULES) if name in each.__all__)
+            module = next(each for each in map(_import_module, _MODULES) if hasattr(each, name))
             return globals().setdefault(name, getattr(module, name))
         if name in _SUBMODULES:
             return _import_module(f"{__name__}.{name}")

@@ -3,8 +3,3 @@
 from .declaration import Layout, Older, Topic
 from .message import Message
 from .rules import FLOAT32_PI, FiniteWhile, InRange, NotLater, NotNegative, UnitQuaternion, Within
-
-__all__ = [
-    "FLOAT32_PI", "FiniteWhile", "InRange", "Layout", "Message", "NotLater", "NotNegative", "Older", "Topic",
-    "UnitQuaternion", "Within",
-]  # fmt: skip

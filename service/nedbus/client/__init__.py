@@ -35,11 +35,3 @@ if TYPE_CHECKING:
 else:
     # Lazy, as importing NumPy takes longer than everything else.
     __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})
-
-__all__ = [
-    "HEARTBEAT", "AsyncBus", "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "Counts", "Health", "Histogram",
-    "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "Publishers", "QueryServer",
-    "RejectionReport", "Rejections", "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState",
-    "StreamStatus", "Subscription", "Vehicles", "check_max_rate", "connect", "connect_async", "connect_with",
-    "describe_stream", "find_accounts", "find_services", "health_of_last", "reply_parts", "stream_state", "to_age",
-]  # fmt: skip

@@ -4,12 +4,3 @@ from .daemon import Daemon
 from .output import TOO_MANY
 from .plan import Planned, plan_sources
 from .worker import STATES, SourceMeasures
-
-__all__ = [
-    "STATES",
-    "TOO_MANY",
-    "Daemon",
-    "Planned",
-    "SourceMeasures",
-    "plan_sources",
-]

@@ -12,5 +12,3 @@ if TYPE_CHECKING:
     from .exporter import Exporter
 else:
     __getattr__ = lazy_exports(__name__, {"Exporter": ("metrics", "exporter")})
-
-__all__ = ["Exporter", "HttpServer", "Observer", "Page", "Snapshot", "leads_here", "service_pages", "why_not_ready"]

@@ -21,9 +21,3 @@ else:
     __getattr__ = lazy_exports(
         __name__, dict.fromkeys(_AUTHORITY, ("pki", "authority")) | {"make_bundle": ("pki", "bundle")}
     )
-
-__all__ = [
-    "CERTIFICATE_PREFIX", "DAYS", "RENEW_WITHIN", "Certificate", "CertificateEntry", "certificate_name",
-    "list_certificates", "make_authority", "make_bundle", "make_certificate", "read_access_rules", "renew_certificate",
-    "write_access_rules",
-]  # fmt: skip

@@ -3,8 +3,3 @@
 from .load import find_mistakes, load_client_settings, load_settings, locate_setting, locate_source
 from .model import Settings, is_loopback, split_http
 from .toml_file import place_at
-
-__all__ = [
-    "Settings", "find_mistakes", "is_loopback", "load_client_settings", "load_settings", "locate_setting",
-    "locate_source", "place_at", "split_http",
-]  # fmt: skip

@@ -17,7 +17,7 @@ from .rmw_zenoh import (
     px4_publishers_key_expr,
     subscription_token,
 )
-from .router import RouterConfig, open_router, read_router_config, router_endpoints
+from .router import open_router, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals
 from .router_state import RouterState, ask_routers
 from .session import (
@@ -43,14 +43,3 @@ from .zenoh_ext import (
     heartbeat_payload,
     request_samples,
 )
-
-__all__ = [
-    "BRIDGED_ENCODING", "DEFAULT_ENDPOINT", "LEASE", "LONGEST_TOKEN", "MAX_ANSWERS", "MAX_REPLY_BYTES", "NO_HASH",
-    "PX4_TYPES", "AliveTokens", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
-    "RetransmitRequest", "RouterConfig", "RouterState", "Session", "SourceInfo", "Tls", "TopicKey", "Uplinks",
-    "Verdict", "alive_keys", "ask", "ask_routers", "check_endpoints", "check_pem", "dial_endpoint", "entity_name",
-    "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload", "is_forked", "log_refusals",
-    "node_token", "open_client", "open_router", "probe_writes", "publisher_token", "px4_publishers_key_expr", "query",
-    "read_router_config", "request_samples", "require_unforked", "router_endpoints", "split_endpoint",
-    "subscription_token", "translate_error", "wait_for_answers", "while_open",
-]  # fmt: skip

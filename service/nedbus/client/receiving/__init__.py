@@ -5,5 +5,3 @@ from .layout_lookup import LayoutLookup
 from .max_rate import MaxRateQueue, MaxRateReceiver
 from .pending_queue import PendingQueue
 from .receiver import Receiver
-
-__all__ = ["Decoder", "LayoutLookup", "MaxRateQueue", "MaxRateReceiver", "PendingQueue", "Receiver"]
