@@ -66,25 +66,28 @@ def find_mistakes(
         content = {name: value for name, value in content.items() if needed is None or name in needed}
     except ConfigError as exc:
         mistakes.append(exc)
-    is_read, wrong = not mistakes, set[str]()
+    is_read, details = not mistakes, list[ErrorDetails]()
     values: dict[str, Any] = {name: value for name, value in content.items() if not _from_environment(name)} | flags
     try:
         settings = Settings(**values)
     except ValidationError as exc:
         details = exc.errors()
-        mistakes += [_setting_error(path, flags, detail) for detail in details]
-        wrong = {str(detail["loc"][0]) for detail in details}
         settings = Settings(**_without_mistakes(values, details))
     _warn_of_misspelt_variables()
-    settings._set_by.update({name: _set_by(name, path, flags) for name in settings.model_fields_set})
-    settings._file = path
+    settings._file, wrong = path, {str(detail["loc"][0]) for detail in details}
+    settings._set_by.update({name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set})
+    mistakes += [_setting_error(settings, detail) for detail in details]
     settings._left_out = frozenset(wrong if is_read else wrong | (Settings.model_fields.keys() - settings._set_by))
     return settings, mistakes
 
 
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
     """Return an error for a setting with its location: file, line and column, or the name of the flag or variable."""
-    return _locate(settings._file, settings.set_by(name) or name, name, reason)
+    path, setter = settings._file, settings.set_by(name) or name
+    if path is None or setter != str(path):
+        return ConfigError(setter, reason)
+    line, column = find_key(read_text(path), name)
+    return ConfigError.in_file(path, reason, line=line, column=column)
 
 
 def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
@@ -94,13 +97,6 @@ def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigE
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
     line, column = find_source(read_text(settings._file), settings.source, index, error.key)
     return ConfigError.in_file(settings._file, str(error), line=line, column=column)
-
-
-def _locate(path: Path | None, setter: str, name: str, reason: str) -> ConfigError:
-    if path is None or setter != str(path):
-        return ConfigError(setter, reason)
-    line, column = find_key(read_text(path), name)
-    return ConfigError.in_file(path, reason, line=line, column=column)
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
@@ -153,11 +149,11 @@ def _warn_of_misspelt_variables() -> None:
             _log.warning("%s is not a setting: did you mean %s?", variable, " or ".join(near), extra=about("setting"))
 
 
-def _setting_error(path: Path | None, flags: Collection[str], detail: ErrorDetails) -> ConfigError:
+def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
     name = str(detail["loc"][0])
     reason = detail["msg"].removeprefix("Value error, ").removeprefix("endpoint: ")
     if detail["type"] == "extra_forbidden":
         reason = f"there is no setting {name!r}: choose from {', '.join(Settings.model_fields)}"
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
-    return _locate(path, _set_by(name, path, flags), name, reason)
+    return locate_setting(settings, name, reason)
