@@ -62,7 +62,7 @@ class Address:
 
     def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression of this address."""
-        return f"{prefix}/{self.vehicle}/{self.stream}"
+        return f"{prefix}/{self}"
 
     def alive_key(self, publisher: str, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key of the liveliness token of one publisher of this address; `publisher`: its Zenoh id."""
@@ -70,7 +70,7 @@ class Address:
 
     def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of reports on rejected messages of this address."""
-        return f"{prefix}/@rejected/{self.vehicle}/{self.stream}"
+        return f"{prefix}/@rejected/{self}"
 
     @classmethod
     def from_rate_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -162,10 +162,7 @@ def rejected_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
 
 def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     """Parse the key of a report on rejected messages; raise AddressError for any other key."""
-    begin = f"{prefix}/@rejected/"
-    if not key.startswith(begin):
-        raise AddressError("key", key, f"{begin}<vehicle>/<topic>[/<instance>]")
-    return Address.from_key(f"{prefix}/{key.removeprefix(begin)}", prefix=prefix)
+    return Address.from_key(key, prefix=f"{prefix}/@rejected")
 
 
 def schema_key(message: str, *, session: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Final
@@ -64,28 +65,28 @@ def _parse_key(heartbeat: str) -> tuple[str, str] | None:
     return None if found is None else (found[1], f"{found[2]}:{found[3]}")
 
 
+@dataclass(frozen=True, slots=True)
 class RetransmitRequest:
     """A request for samples of one publisher by sequence number, and its answers; used by one thread."""
 
-    def __init__(self, answers: Answers, key: str, publisher: str, numbers: range) -> None:
-        self._answers = answers
-        self._key = key
-        self._publisher = publisher
-        self._numbers = numbers
+    answers: Answers
+    key: str
+    publisher: str
+    numbers: range
 
     @property
     def ended(self) -> bool:
         """True once the last answer was taken, or the timeout has passed."""
-        return self._answers.ended
+        return self.answers.ended
 
     def take(self) -> dict[int, RawSample]:
         """Return the samples received since the last call, by sequence number."""
         samples: dict[int, RawSample] = {}
-        for sample in filter(None, (reply.ok for reply in self._answers.take())):
+        for sample in filter(None, (reply.ok for reply in self.answers.take())):
             info = sample.source_info
-            if info is None or info.source_sn not in self._numbers or str(sample.key_expr) != self._key:
+            if info is None or info.source_sn not in self.numbers or str(sample.key_expr) != self.key:
                 continue
-            if entity_name(info.source_id) == self._publisher:
+            if entity_name(info.source_id) == self.publisher:
                 samples[info.source_sn] = sample
         return samples
 
