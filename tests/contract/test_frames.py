@@ -11,10 +11,10 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from pyulog import ULog
 
-from nedbus_msgs import (
+from nedbus_msgs import VehicleLocalPosition
+from nedbus_msgs.frames import (
     GlobalPosition,
     MapProjection,
-    VehicleLocalPosition,
     enu_to_ned,
     euler_to_quaternion,
     flu_to_frd,

@@ -10,7 +10,8 @@ from typing import cast
 
 import pytest
 
-from nedbus_msgs import Continuous, MapProjection, ResetTracker, VehicleLocalPosition
+from nedbus_msgs import Continuous, ResetTracker, VehicleLocalPosition
+from nedbus_msgs.frames import MapProjection
 from tests.flights.first_message import upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay

@@ -17,14 +17,8 @@ from foxglove.messages import (
     Vector3,
 )
 
-from nedbus_msgs import (
-    MapProjection,
-    VehicleLocalPosition,
-    ned_to_enu,
-    quaternion_ned_to_enu,
-    to_global,
-    yaw_ned_to_enu,
-)
+from nedbus_msgs import VehicleLocalPosition
+from nedbus_msgs.frames import MapProjection, ned_to_enu, quaternion_ned_to_enu, to_global, yaw_ned_to_enu
 
 _MAP: Final = "map"
 _MAX_APART: Final = 500_000  # us between a position and the attitude paired with it

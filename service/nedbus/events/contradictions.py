@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Final, cast
 
-from nedbus_msgs import MapProjection
+from nedbus_msgs.frames import MapProjection
 
 from . import rules
 from .detectors import ChangeDetector, FieldReader, Finding

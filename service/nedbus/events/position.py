@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Final
 
-from nedbus_msgs import RESET_COUNTERS, MapProjection, Quantity, wrap
+from nedbus_msgs import RESET_COUNTERS, Quantity
+from nedbus_msgs.frames import MapProjection, wrap
 
 from .detectors import ChangeDetector, FieldReader, Fields, Finding, detect_flags
 from .kinds import Severity, flagged

@@ -13,7 +13,7 @@ from bokeh.models import ColumnDataSource
 from bokeh.plotting import figure
 
 from nedbus.errors import ConfigError
-from nedbus_msgs import MapProjection
+from nedbus_msgs.frames import MapProjection
 
 from .style import Style
 

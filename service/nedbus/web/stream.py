@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.client import Sample
-from nedbus_msgs import BY_TOPIC, DEFAULT, Address, MapProjection, ResetTracker, VehicleLocalPosition, to_global
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPosition
+from nedbus_msgs.frames import MapProjection, to_global
 
 POINTS: Final = 600
 """Number of points in the history of the last minute."""

@@ -17,7 +17,8 @@ import nedbus
 from nedbus import Sample
 from nedbus.bridges import FoxgloveServer
 from nedbus.bridges.foxglove_messages import orientation_of
-from nedbus_msgs import Address, MapProjection, to_global
+from nedbus_msgs import Address
+from nedbus_msgs.frames import MapProjection, to_global
 from nedbus_msgs.messages.vehicle_attitude import VehicleAttitude
 from tests.flights.first_message import CURRENT, ROS2_TYPE, decode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message

@@ -13,7 +13,8 @@ from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.fields import CONVERSIONS
 from nedbus.sources.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
-from nedbus_msgs import TOPICS, quaternion_to_euler
+from nedbus_msgs import TOPICS
+from nedbus_msgs.frames import quaternion_to_euler
 from tests.flights.messages import VLP
 
 NEEDED = (32, 230, 33, 141, 331)  # for vehicle_local_position

@@ -11,7 +11,8 @@ from nedbus.events import Account, Times
 from nedbus.web.chronicle import Chronicle
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream
-from nedbus_msgs import Address, MapProjection
+from nedbus_msgs import Address
+from nedbus_msgs.frames import MapProjection
 from tests.flights.messages import VLP, message
 from tests.service.web.page import NOON, QUAD, WING, Sky, addresses_of, sky
 

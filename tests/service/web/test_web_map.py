@@ -14,7 +14,7 @@ from PIL import Image
 from nedbus.errors import ConfigError
 from nedbus.web.background import Background
 from nedbus.web.style import DARK
-from nedbus_msgs import MapProjection
+from nedbus_msgs.frames import MapProjection
 
 PLACE = MapProjection(47.397, 8.545)
 RING = [[8.545, 47.397], [8.546, 47.397], [8.546, 47.398], [8.545, 47.397]]

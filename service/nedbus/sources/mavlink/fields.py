@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from nedbus_msgs import MESSAGES, euler_to_quaternion, quaternion_to_euler
+from nedbus_msgs import MESSAGES
+from nedbus_msgs.frames import euler_to_quaternion, quaternion_to_euler
 
 _U16: Final = 2**16 - 1  # "unknown" in most fields of this type
 _WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # MAV_BATTERY_CHARGE_STATE to `warning`

@@ -16,7 +16,8 @@ from collections.abc import Mapping, Sequence
 from random import Random
 from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion, wrap
+from nedbus_msgs import VehicleLocalPosition
+from nedbus_msgs.frames import MapProjection, euler_to_quaternion, wrap
 
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
 LAP: Final = 120.0  # s

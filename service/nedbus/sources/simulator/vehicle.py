@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from nedbus_msgs import MESSAGES, MapProjection
+from nedbus_msgs import MESSAGES
+from nedbus_msgs.frames import MapProjection
 
 from .flight import BOOT, CLIMB, LAP, ORIGIN_SET, OUTAGE, Estimator, Truth
 
