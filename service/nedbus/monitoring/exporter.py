@@ -137,22 +137,21 @@ class Exporter:
 
         A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
         """
-        while not stop.is_set():
-            states: list[RouterState] = []
-            with suppress(NedbusError):  # the router is full or the link is down: export no counts
-                self._session = self._session or self._bus.open_session(timeout=_SESSION_TIMEOUT)
-                if not stop.is_set():
-                    states = ask_routers(self._session, timeout=_ROUTERS_TIMEOUT)
-            self._routers = states[:_MAX_ROUTERS]
-            until = time.monotonic() + _ROUTERS_INTERVAL
-            while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, until - time.monotonic()))):
-                if time.monotonic() >= until:
-                    break
-                if self._session is not None and any(each.startswith("mavlink") for each in [*self._sources.values()]):
-                    with suppress(NedbusError):
-                        services = find_services(self._session, prefix=self._bus.prefix, timeout=_ROUTERS_TIMEOUT)
-                        logs = (log for each in services for source in each.sources for log in source.log_streams)
-                        self.log_streams = {log.vehicle: log for log in logs}
+        due = 0.0
+        while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, due - time.monotonic()))):
+            if time.monotonic() >= due:
+                states: list[RouterState] = []
+                with suppress(NedbusError):  # the router is full or the link is down: export no counts
+                    self._session = self._session or self._bus.open_session(timeout=_SESSION_TIMEOUT)
+                    if not stop.is_set():
+                        states = ask_routers(self._session, timeout=_ROUTERS_TIMEOUT)
+                self._routers = states[:_MAX_ROUTERS]
+                due = time.monotonic() + _ROUTERS_INTERVAL
+            elif self._session is not None and any(each.startswith("mavlink") for each in [*self._sources.values()]):
+                with suppress(NedbusError):
+                    services = find_services(self._session, prefix=self._bus.prefix, timeout=_ROUTERS_TIMEOUT)
+                    logs = (log for each in services for source in each.sources for log in source.log_streams)
+                    self.log_streams = {log.vehicle: log for log in logs}
         if self._session is not None:
             self._session.close()
 
