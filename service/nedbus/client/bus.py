@@ -139,7 +139,7 @@ class Bus:
         key_expr = selection.key_expr(prefix=self.prefix)
         decoder = Decoder(self._layouts, prefix=self.prefix)
         samples: list[Sample[Any]] = []
-        answers = query(self._session, key_expr, timeout=timeout, newest=False)
+        answers = query(self._session, key_expr, timeout=timeout)
         for raw, sample in decoder.read(answers):
             sample.retained = True
             sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE

@@ -279,7 +279,7 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
     """Query the status of all nedbus services; replies that are too large are ignored."""
     found: dict[str, ServiceStatus] = {}
-    for key, content in _parse(query(session, status_key(ANY, prefix=prefix), timeout=timeout, newest=False)):
+    for key, content in _parse(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
         if isinstance(content, dict):
             part = replace(_STATUS.validate_python(content), service=key.split("/")[-2])
             found[key] = replace(part, sources=(*found[key].sources, *part.sources)) if key in found else part
@@ -290,7 +290,7 @@ def find_accounts(session: Session, *, prefix: str, within: float, timeout: floa
     """Query the accounts of all services for the last `within` seconds; invalid and too large replies are ignored."""
     selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[str, list[AccountReport]] = {}
-    for key, content in _parse(query(session, selector, timeout=timeout, newest=False)):
+    for key, content in _parse(query(session, selector, timeout=timeout)):
         if (part := from_json(content)) is not None:
             found.setdefault(key, []).append(part)
     return list(map(joined, found.values()))

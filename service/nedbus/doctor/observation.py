@@ -129,7 +129,8 @@ class Observation:
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             for address in _parse_each(self._address_of, [str(sample.key_expr)]):
-                self.ages[address] = _age_of(sample)
+                ages = _age_of(sample), self.ages.get(address)  # several publishers or a storage may answer
+                self.ages[address] = min((age for age in ages if age is not None), default=None)
         queried = clock.utc()
         tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}

@@ -82,28 +82,24 @@ def ask(
     return Answers(handler, timeout=timeout)
 
 
-def query(session: Session, *key_exprs: str, timeout: float, newest: bool = True) -> list[RawSample]:
-    """Return the answers to these key expressions within `timeout` seconds: the newest for each key, or all.
+def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]:
+    """Return the answers within `timeout` seconds, perhaps several for a key.
 
     At most 10,000 answers and 64 MB in total are accepted; the number of answers beyond that is logged.
     """
-    kept: dict[object, RawSample] = {}
+    kept: list[RawSample] = []
     size = left_out = 0
-    queries = [ask(session, key_expr, timeout=timeout) for key_expr in key_exprs]
-    for sample in filter(None, (reply.ok for reply in wait_for_answers(queries))):
-        key: object = str(sample.key_expr) if newest else len(kept)
-        other = kept.get(key)
-        if other is not None and not _is_newer(sample, other):
-            continue
+    for sample in filter(None, (reply.ok for reply in wait_for_answers([ask(session, selector, timeout=timeout)]))):
         new_size = size + len(sample.payload) + len(str(sample.key_expr))
-        if new_size > MAX_ANSWER_BYTES or (other is None and len(kept) >= MAX_ANSWERS):
+        if new_size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
             left_out += 1
         else:
-            kept[key], size = sample, new_size
+            kept.append(sample)
+            size = new_size
     if left_out:
         text = "%s: %d answers left out, beyond the limits of a query"
-        _log.warning(text, ", ".join(key_exprs), left_out, extra=about("incomplete"))
-    return list(kept.values())
+        _log.warning(text, selector, left_out, extra=about("incomplete"))
+    return kept
 
 
 def wait_for_answers(queries: Sequence[Answers]) -> Iterator[zenoh.Reply]:
@@ -115,11 +111,6 @@ def wait_for_answers(queries: Sequence[Answers]) -> Iterator[zenoh.Reply]:
         if not taken:
             time.sleep(pause)
             pause = min(2 * pause, longest)
-
-
-def _is_newer(sample: RawSample, other: RawSample) -> bool:
-    mine, others = sample.timestamp, other.timestamp
-    return others is None or (mine is not None and mine.get_time() > others.get_time())
 
 
 def zenoh_timeout(timeout: float) -> float:

@@ -43,7 +43,8 @@ def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
     answers = query(session, "@/*/router", timeout=timeout)
     small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
     states = filter(None, (read_state(str(answer.key_expr), answer.payload.to_bytes()) for answer in small))
-    return sorted(islice(states, _MAX_ROUTERS), key=lambda state: state.zid)
+    by_zid = {state.zid: state for state in states}
+    return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
 
 
 def read_state(key: str, payload: bytes) -> RouterState | None:

@@ -208,7 +208,7 @@ def test_encoding_names_the_definition(bus: nedbus.Bus, raw: Session) -> None:
     )
     assert len(set(short.values())) == 2
     for parameter, expected in ("", set("AB")), (f"?hash={short['B']}", {"B"}):
-        replies = query(raw, f"nedbus/@schema/*/{NAME}{parameter}", timeout=DEADLINE, newest=False)
+        replies = query(raw, f"nedbus/@schema/*/{NAME}{parameter}", timeout=DEADLINE)
         found = [json.loads(reply.payload.to_bytes()) for reply in replies]
         assert {each["hash"] for each in found} == {short[firmware] for firmware in expected}
 
