@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from .foxglove import FoxgloveServer
     from .ros2 import Ros2Bridge
 
-__all__ = ["FOXGLOVE_PORT", "FoxgloveServer", "Ros2Bridge"]
-
 FOXGLOVE_PORT: Final = 8765
 """The default port of the Foxglove app."""
 

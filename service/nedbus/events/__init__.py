@@ -16,11 +16,3 @@ from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import CLOCKS, Times, since_text, to_age, to_clock, unit_of
 from .vehicle import Vehicle
 from .verdict import Verdict, verdict_of
-
-__all__ = [
-    "ACCOUNT_PARAMETER", "AIR_DATA", "ALL", "CLOCKS", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS",
-    "MAX_VEHICLES", "MODES", "RECENT", "SEVERITIES", "VALID", "WINDOW", "Account", "AccountReport", "Condition",
-    "Event", "Expectation", "Kind", "Severity", "Span", "State", "Story", "Times", "Vehicle", "VehicleReport",
-    "Verdict", "by_vehicle", "faults_of", "from_json", "joined", "report_of", "since_text", "spans_of", "state_at",
-    "stories_of", "story_of", "to_age", "to_clock", "unit_of", "verdict_of",
-]  # fmt: skip

@@ -35,9 +35,3 @@ else:
         ("plot", "plot"): "MAX_STREAMS draw",
     }
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
-
-__all__ = [
-    "MAX_STREAMS", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader", "RecordingWriter",
-    "UlogReader", "UtcOffset", "addresses_of", "align", "check_recording", "distinct_names", "draw", "find_format",
-    "format_of", "matching", "missing_of", "open_flight", "read", "utc_of",
-]  # fmt: skip

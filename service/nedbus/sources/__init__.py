@@ -6,9 +6,3 @@ from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_te
 from .mavlink.link import Link, open_link, parse_link
 from .mavlink.senders import Senders, why_ignored
 from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
-
-__all__ = [
-    "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Flights", "Link", "LiveSource", "Rejection", "ReplayRun",
-    "ReplaySource", "Senders", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "convert",
-    "follow", "open_link", "parse_link", "parse_source", "read_account", "source_text_of_file", "why_ignored",
-]  # fmt: skip

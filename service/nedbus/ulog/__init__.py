@@ -16,8 +16,3 @@ from .records import (
     Unsubscription,
 )
 from .texts import SPOKEN, TextLimit, Texts, to_statement
-
-__all__ = [
-    "SPOKEN", "Damage", "Data", "Dropout", "Header", "Information", "LoggedStream", "LoggedText", "Parameter",
-    "Record", "Subscription", "TextLimit", "Texts", "UlogError", "UlogParser", "Unsubscription", "to_statement",
-]  # fmt: skip

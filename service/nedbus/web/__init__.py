@@ -8,5 +8,3 @@ if TYPE_CHECKING:
     from .server import Where, serve_live, serve_recording
 else:
     __getattr__ = lazy_exports(__name__, dict.fromkeys(("Where", "serve_live", "serve_recording"), ("web", "server")))
-
-__all__ = ["Where", "serve_live", "serve_recording"]
