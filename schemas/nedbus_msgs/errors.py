@@ -36,7 +36,7 @@ class AddressError(ArgumentError):
 
 
 class LayoutError(NedbusError, ValueError):
-    """Raised when a layout is unknown, or if field names are not those of a layout."""
+    """Raised when a layout is unknown."""
 
 
 class DecodeError(NedbusError, ValueError):

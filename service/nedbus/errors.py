@@ -4,7 +4,7 @@
     ├── the caller's arguments
     │   ├── ArgumentError (ValueError)       an invalid argument, such as mode, max_rate or on
     │   │   └── AddressError                 ... a vehicle, topic, instance, key or prefix
-    │   ├── LayoutError (ValueError)         field names that match no layout
+    │   ├── LayoutError (ValueError)         a layout that is unknown
     │   ├── InvalidMessageError (ValueError) a message to publish with an invalid field
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process

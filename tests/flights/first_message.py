@@ -34,7 +34,6 @@ from nedbus_msgs import encoding_of as _encoding_of
 from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.codecs.msgpack import Newer
-from nedbus_msgs.model.definition import require_fields
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 LAYOUTS: Final = DEFAULT.layouts
@@ -96,19 +95,15 @@ def describe(error: ValidationError, message: type[Message] | str = _FIRST) -> s
     return _describe(error, definition_of(message))
 
 
-def upgrade(fields: Mapping[str, object], layout: str | None = None, message: type[M] = _FIRST) -> M:
+def upgrade(fields: Mapping[str, object], message: type[M] = _FIRST) -> M:
     """Return the message with these fields of any PX4 release; arrays are tuples.
 
-    With the name of a layout, the fields must be exactly that layout's.
-    Without, all known fields are used, by their present name, and unknown names are ignored.
+    All known fields are used, by their present name, and unknown names are ignored.
     A missing field is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
 
-    Raises LayoutError for other fields than the layout's, pydantic.ValidationError for an invalid message.
+    Raises pydantic.ValidationError for an invalid message.
     """
-    definition = definition_of(message)
-    if layout is not None:
-        require_fields(definition, fields, definition.layouts[layout])
-    return upgrade_with(definition, fields)
+    return upgrade_with(definition_of(message), fields)
 
 
 def downgrade(message: Message, layout: str) -> dict[str, object]:

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs.errors import DecodeError, EncodeError
 from nedbus_msgs.model.declaration import Layout, kept
-from nedbus_msgs.model.definition import Definition, require_fields
+from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.validation import Validation
 
 HEAD: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
@@ -69,10 +69,9 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
 
     float32 fields are rounded to the nearest float32.
 
-    Raises LayoutError for fields other than the layout's, EncodeError for a value that its type cannot hold.
+    Raises EncodeError for a value that its type cannot hold.
     """
     cdr = cdr_layout(layout)
-    require_fields(definition, fields, layout)
     row = cdr.validation.values_of(fields)
     try:
         return HEAD + cdr.body.pack(*cdr.validation.flatten(cdr.validation.validate(row)))

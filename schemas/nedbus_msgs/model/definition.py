@@ -13,8 +13,6 @@ from operator import attrgetter, itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
-from nedbus_msgs.errors import LayoutError
-
 from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, kept
 from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values
@@ -271,21 +269,6 @@ def _converted(convert: Callable[[Any], Any], value: object) -> object:
         return convert(value)
     except (TypeError, OverflowError):
         return value
-
-
-def require_fields(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> None:
-    """Raise LayoutError, with missing and unknown names, unless these are exactly the layout's fields."""
-    given, wanted = set(fields), set(layout.types)
-    if given == wanted:
-        return
-    problems = [
-        f"{problem} {', '.join(sorted(names)[:5])}"
-        for problem, names in (("missing", wanted - given), ("unknown", given - wanted))
-        if names
-    ]
-    fitting = definition.find_layout(fields)
-    hint = f"; these are the fields of layout {fitting.name}" if fitting else ""
-    raise LayoutError(f"not the {len(wanted)} fields of layout {layout.name}: {'; '.join(problems)}{hint}")
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:

@@ -143,7 +143,9 @@ def test_every_layout_is_read_by_its_hash(listener: Listener, raw: Session) -> N
         sent = [message(each, x=0.1 * each, xy_valid=True, y=-1.0, hagl_max_z=5.0) for each in range(1, 11)]
         for each in sent:
             px4.put(each)
-        received = [(upgrade(each.fields, layout), each.lost) for each in listener.receive(10)]
+        taken = listener.receive(10)
+        assert all(each.fields.keys() == {*LAYOUTS[layout].fields} for each in taken)
+        received = [(upgrade(each.fields), each.lost) for each in taken]
         assert received == [(upgrade(downgrade(each, layout)), 0) for each in sent]
 
 
