@@ -134,7 +134,7 @@ def encode_cdr(fields: Mapping[str, object], *, layout: str, message: type[Messa
 
     `layout` is that of `decode_cdr`. Floats are rounded to the nearest float32 where PX4 has one.
 
-    Raises LayoutError for other fields than the layout's, EncodeError for a value that its type cannot hold.
+    Raises EncodeError for a value that its type cannot hold.
     """
     definition, found = _layout(layout, message)
     return encode_with(definition, fields, found)
