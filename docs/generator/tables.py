@@ -12,7 +12,7 @@ from nedbus.events import KINDS
 from nedbus.log_event import EVENTS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus_msgs import MESSAGES, TOPICS, Address, encode, encoding_of
+from nedbus_msgs import MESSAGES, TOPICS, Address, codec_of, encoding_of
 
 from .api import constants_of
 from .markdown import cell, code, page, section, table
@@ -103,7 +103,7 @@ def keys_page() -> str:
         [
             code(name),
             str(len(each.types)),
-            str(len(encode(each.model(timestamp=1)))),
+            str(codec_of(each).size),
             code(encoding_of(each, None)),
         ]
         for name, each in MESSAGES.items()

@@ -14,15 +14,7 @@ from .errors import (
     UnknownLayoutError,
 )
 from .flags import DOUBT_FLAGS, describe_flags, message_doubts
-from .functions import (
-    DEFAULT,
-    decode,
-    definition_of,
-    encode,
-    json_schema_of,
-    layout_table_of,
-    schema_of,
-)
+from .functions import DEFAULT, definition_of, json_schema_of, layout_table_of, schema_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
@@ -62,9 +54,9 @@ __all__ = [
     "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError", "NedbusError", "Provenance", "Quantity",
     "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion", "UnknownLayoutError", "VehicleLocalPosition",
     "ack_key", "address_of_alive_key", "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle",
-    "codec_of", "dds_type", "decode", "decode_text", "decode_with", "define", "define_msg", "definition_of",
-    "definition_text", "describe", "describe_flags", "encode", "encode_with", "encoding_of", "field_type",
-    "get_topic", "hash_of", "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input", "json_schema_of",
+    "codec_of", "dds_type", "decode_text", "decode_with", "define", "define_msg", "definition_of",
+    "definition_text", "describe", "describe_flags", "encode_with", "encoding_of", "field_type", "get_topic",
+    "hash_of", "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input", "json_schema_of",
     "layout_table_of", "message_doubts", "message_of_type_hash", "provenance_of", "read_msg", "rejected_key_expr",
     "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "schema_of", "short_hash", "split_ros2_topic",
     "status_key", "topic_of", "upgrade_fields", "upgrade_with", "vehicle_name",

@@ -1,19 +1,17 @@
-"""Functions of the contract: encode and decode messages, and describe their schemas."""
+"""Functions of the contract: find definitions, and describe their schemas."""
 
 from __future__ import annotations
 
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from typing_extensions import TypeVar
 
-from .codecs.msgpack import Newer, codec_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import DEFAULT_TOPIC
 from .model.definition import BY_TOPIC, MESSAGES, Definition
 from .model.message import Message
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
-_FIRST: Final = cast("type[Any]", VehicleLocalPosition)
 
 
 def definition_of(message: type[M] | str) -> Definition[M]:
@@ -25,26 +23,6 @@ def definition_of(message: type[M] | str) -> Definition[M]:
 
 DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
 """The default message of functions that take one."""
-
-
-def encode(message: Message) -> bytes:
-    """Return the payload of a message; float32 fields are rounded.
-
-    Raises EncodeError if values do not fit their fields, in a message whose validation was bypassed.
-    """
-    return codec_of(message.DEFINITION).encode(message)
-
-
-def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
-    """Return the validated message of a payload.
-
-    `newer`: field names of layouts unknown to this version, by number on the wire; fields with known names are decoded,
-    others ignored.
-
-    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
-    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
-    """
-    return codec_of(definition_of(message)).decode(payload, newer=newer)
 
 
 def schema_of(definition: Definition[Any]) -> dict[str, object]:

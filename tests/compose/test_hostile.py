@@ -10,7 +10,8 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus_msgs import Address, encode
+from nedbus_msgs import Address
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.waits import DEADLINE, wait_for
 

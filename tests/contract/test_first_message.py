@@ -15,7 +15,6 @@ import pytest
 from pydantic import ValidationError
 
 from nedbus_msgs import NedbusError, VehicleLocalPosition
-from nedbus_msgs import decode as decode_payload
 from nedbus_msgs.arrays import DTYPE
 from tests.contract.strategies import DATA, FLIGHTS, REAL
 from tests.flights.first_message import (
@@ -28,6 +27,7 @@ from tests.flights.first_message import (
     message_definition,
     type_hash,
 )
+from tests.flights.first_message import decode as decode_payload
 
 KEPT: Final = DATA / "vehicle_local_position.json"
 VALID: Final[dict[str, Any]] = {"timestamp": 5, "timestamp_sample": 4, "xy_valid": True, "x": 1.0, "y": 2.0}

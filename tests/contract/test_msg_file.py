@@ -9,18 +9,8 @@ from contextlib import suppress
 import pytest
 from pydantic import ValidationError
 
-from nedbus_msgs import (
-    MESSAGES,
-    MsgError,
-    decode,
-    define_msg,
-    definition_text,
-    encode,
-    hash_of,
-    hash_of_msg,
-    read_msg,
-    ros2_type,
-)
+from nedbus_msgs import MESSAGES, MsgError, define_msg, definition_text, hash_of, hash_of_msg, read_msg, ros2_type
+from tests.flights.first_message import decode, encode
 
 from .strategies import DATA
 

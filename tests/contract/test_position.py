@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from nedbus_msgs import InvalidMessageError, VehicleLocalPosition, encode
+from nedbus_msgs import InvalidMessageError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_array
-from tests.flights.first_message import FIELD_TYPES, describe, encode_fields, json_schema
+from tests.flights.first_message import FIELD_TYPES, describe, encode, encode_fields, json_schema
 
 from .strategies import BREAKING, KEEPING, WITHIN, bits, fields, messages
 

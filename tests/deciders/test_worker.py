@@ -17,8 +17,8 @@ from nedbus.events import Account
 from nedbus.health import SourceStatus
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
-from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition, decode
-from tests.flights.first_message import encode_fields
+from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition
+from tests.flights.first_message import decode, encode_fields
 from tests.flights.messages import VLP
 
 ONE, TWO = Address("1", VLP), Address("2", VLP)

@@ -72,6 +72,26 @@ def layout_of_type_hash(text: str) -> str | None:
 _FIRST: Any = VehicleLocalPosition
 
 
+def encode(message: Message) -> bytes:
+    """Return the payload of a message; float32 fields are rounded.
+
+    Raises EncodeError if values do not fit their fields, in a message whose validation was bypassed.
+    """
+    return codec_of(message.DEFINITION).encode(message)
+
+
+def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
+    """Return the validated message of a payload.
+
+    `newer`: field names of layouts unknown to this version, by number on the wire; fields with known names are decoded,
+    others ignored.
+
+    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
+    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
+    """
+    return codec_of(definition_of(message)).decode(payload, newer=newer)
+
+
 def encode_fields(fields: Mapping[str, object], message: type[M] = _FIRST) -> bytes:
     """Return the payload of a message with these fields, validated; raise InvalidMessageError if it is invalid."""
     return codec_of(definition_of(message)).encode_fields(fields)

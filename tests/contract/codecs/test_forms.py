@@ -15,26 +15,19 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError, field_validator
 
-from nedbus_msgs import (
-    DEFAULT,
-    DecodeError,
-    EncodeError,
-    InvalidMessageError,
-    Row,
-    VehicleLocalPosition,
-    decode,
-    encode,
-)
+from nedbus_msgs import DEFAULT, DecodeError, EncodeError, InvalidMessageError, Row, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.contract.strategies import BROKEN, bits, messages, pack_full_width
 from tests.flights.first_message import (
     CURRENT,
     FIELD_TYPES,
+    decode,
     decode_array,
     decode_cdr_array,
     decode_row,
     describe,
     downgrade,
+    encode,
     encode_array,
     encode_cdr,
     encode_cdr_array,

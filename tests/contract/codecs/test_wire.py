@@ -10,18 +10,19 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from nedbus_msgs import (
-    PAYLOAD_LIMIT,
-    DecodeError,
-    EncodeError,
-    UnknownLayoutError,
-    VehicleLocalPosition,
-    decode,
-    encode,
-)
+from nedbus_msgs import PAYLOAD_LIMIT, DecodeError, EncodeError, UnknownLayoutError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_message
 from tests.contract.strategies import DATA, FLIGHTS, MANY, REAL, bits, messages
-from tests.flights.first_message import FIELD_TYPES, PAYLOAD_SIZE, decode_array, decode_row, downgrade, encode_row
+from tests.flights.first_message import (
+    FIELD_TYPES,
+    PAYLOAD_SIZE,
+    decode,
+    decode_array,
+    decode_row,
+    downgrade,
+    encode,
+    encode_row,
+)
 
 GOLDEN = json.loads((DATA / "golden.json").read_text())
 

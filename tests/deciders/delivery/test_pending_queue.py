@@ -24,9 +24,9 @@ from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.transport import RawSample
-from nedbus_msgs import DEFAULT, codec_of, encode
+from nedbus_msgs import DEFAULT, codec_of
 from nedbus_msgs.messages import VehicleAttitude
-from tests.flights.first_message import encoding_of
+from tests.flights.first_message import encode, encoding_of
 from tests.waits import DEADLINE, wait_for
 
 from .raw_samples import (

@@ -29,12 +29,11 @@ from nedbus_msgs import (
     VehicleLocalPosition,
     dds_type,
     define,
-    encode,
     field_type,
     split_ros2_topic,
     upgrade_with,
 )
-from tests.flights.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, type_hash, upgrade
+from tests.flights.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, encode, type_hash, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS

@@ -25,7 +25,8 @@ import nedbus
 from nedbus import Mode
 from nedbus.transport import Session, alive_tokens, open_router
 from nedbus.transport.queries import Answers
-from nedbus_msgs import DEFAULT, Address, encode
+from nedbus_msgs import DEFAULT, Address
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
 from tests.service.commands.answering import answering, reply_with

@@ -21,7 +21,8 @@ from nedbus.client import PublisherRegistry, QueryServer, RejectionReport
 from nedbus.client.protocol import LIVE
 from nedbus.client.receiving import PendingQueue
 from nedbus.transport import Session
-from nedbus_msgs import Address, encode
+from nedbus_msgs import Address
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.service.commands.answering import answering, reply_with
 from tests.service.delivery.publishing import numbered, publish, take, wait_for_subscriber

@@ -15,9 +15,9 @@ import nedbus
 from nedbus import Batch
 from nedbus.client.publishing.flow_control import CACHE, WINDOW
 from nedbus.transport import Session, open_router
-from nedbus_msgs import Address, Row, VehicleLocalPosition, encode
+from nedbus_msgs import Address, Row, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
-from tests.flights.first_message import LAYOUTS, downgrade
+from tests.flights.first_message import LAYOUTS, downgrade, encode
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
 from tests.service.delivery.publishing import numbered, publish, take, wait_for_subscriber

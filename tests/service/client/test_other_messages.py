@@ -18,8 +18,9 @@ from nedbus import Counts
 from nedbus.cli.output.samples import to_line
 from nedbus.client.receiving import Receiver
 from nedbus.transport import open_client
-from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, define, encode, field_type
+from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, define, field_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start

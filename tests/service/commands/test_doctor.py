@@ -28,8 +28,8 @@ from nedbus.doctor import Finding, State, examine
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router, publisher_token
-from nedbus_msgs import dds_type, encode, status_key
-from tests.flights.first_message import ROS2_TYPE
+from nedbus_msgs import dds_type, status_key
+from tests.flights.first_message import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
 from tests.peers.certificates import files_of, pki, secure_endpoint, tls_of, write_config

@@ -22,7 +22,8 @@ from nedbus.cli.output.log_limit import BURST, PER_MINUTE, RateLimit
 from nedbus.cli.output.logs import JournalFormatter, JsonFormatter, TextFormatter
 from nedbus.log_event import EVENTS, about
 from nedbus.transport import Session
-from nedbus_msgs import Address, encode
+from nedbus_msgs import Address
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import run_command
 from tests.peers.hasty import start_hasty

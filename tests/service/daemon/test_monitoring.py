@@ -30,8 +30,9 @@ from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page,
 from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
 from nedbus.transport import Session
-from nedbus_msgs import Address, VehicleLocalPosition, encode
+from nedbus_msgs import Address, VehicleLocalPosition
 from nedbus_msgs.messages import VehicleStatus
+from tests.flights.first_message import encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command

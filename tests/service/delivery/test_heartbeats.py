@@ -9,7 +9,7 @@ import zenoh
 import nedbus
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
-from nedbus_msgs import decode
+from tests.flights.first_message import decode
 from tests.flights.messages import VLP
 from tests.waits import wait_for
 

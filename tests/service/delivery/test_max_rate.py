@@ -18,7 +18,8 @@ from nedbus import Mode
 from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
 from nedbus.transport import Session
-from nedbus_msgs import Address, AddressError, Selection, encode
+from nedbus_msgs import Address, AddressError, Selection
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.peers.processes import Start
 from tests.service.commands.answering import answering, reply_with

@@ -20,8 +20,7 @@ from nedbus.client.receiving import Receiver, pending_queue, retransmission, wri
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
-from nedbus_msgs import encode
-from tests.flights.first_message import encoding_of
+from tests.flights.first_message import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
 from tests.service.commands.answering import answering, reply_with

@@ -20,8 +20,9 @@ from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.daemon.write_permission import WritePermission
 from nedbus.pki import write_access_rules
 from nedbus.transport import Session, open_client, open_router
-from nedbus_msgs import Address, define, encode, field_type
+from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
+from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
 from tests.peers.command_line import run_command

@@ -11,9 +11,9 @@ import pytest
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import SourceMessage
-from nedbus_msgs import BY_TOPIC, DEFAULT, TOPICS, VehicleLocalPosition, encode, upgrade_with
+from nedbus_msgs import BY_TOPIC, DEFAULT, TOPICS, VehicleLocalPosition, upgrade_with
 from nedbus_msgs.frames import quaternion_to_euler, to_global
-from tests.flights.first_message import FIELD_TYPES, upgrade
+from tests.flights.first_message import FIELD_TYPES, encode, upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 
