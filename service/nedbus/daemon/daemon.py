@@ -18,7 +18,7 @@ from nedbus.errors import ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
-from nedbus.sources import LiveSource, Source
+from nedbus.sources import LiveSource
 from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
@@ -238,14 +238,11 @@ class Daemon:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
                     # Heartbeats tell readers of the last message, in case they missed it.
-                    self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
+                    speeds = [worker.source.speed for worker in finite if not isinstance(worker.source, LiveSource)]
+                    self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
             self._changed.wait(_POLL)
             self._changed.clear()
             self.look()
             uplinks.check()
-
-
-def _is_paced(source: Source) -> bool:
-    return isinstance(source, LiveSource) or source.speed is not None

@@ -154,14 +154,11 @@ class Publisher:
                 with suppress(NedbusError):
                     self.flush(timeout)
         finally:
-            self._close()
-
-    def _close(self) -> None:
-        self._writer.close()
-        self._on_close()
-        self._downsampler.close()
-        with suppress(zenoh.ZError):  # the session is already closed
-            self._token.undeclare()
+            self._writer.close()
+            self._on_close()
+            self._downsampler.close()
+            with suppress(zenoh.ZError):  # the session is already closed
+                self._token.undeclare()
 
     def __enter__(self) -> Self:
         return self
