@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
 
-from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, StreamStatus, stream_state
+from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
@@ -37,19 +37,18 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 
 @dataclass(frozen=True, slots=True)
 class SourceMeasures:
-    """Measurements of one source for metrics: status, all streams, and times to publish a message [s]."""
+    """Measurements of one source for metrics: status, with all streams, and times to publish a message [s]."""
 
     status: SourceStatus
-    streams: tuple[StreamStatus, ...]
     durations: Histogram
 
     @property
     def states(self) -> dict[str, str]:
         """State of each stream by address; silence after the end of the source is ok."""
         if self.status.ended:
-            return {stream.address: "ok" for stream in self.streams}
-        alive = frozenset(self.status.addresses)
-        return {each.address: stream_state(each.health, publishers=each.address in alive).name for each in self.streams}
+            return {stream.address: "ok" for stream in self.status.streams}
+        alive, streams = frozenset(self.status.addresses), self.status.streams
+        return {each.address: stream_state(each.health, publishers=each.address in alive).name for each in streams}
 
 
 class Clock:
@@ -112,15 +111,14 @@ class Worker:
     @property
     def status(self) -> SourceStatus:
         """Current status of the source."""
-        return self._status(self._output.streams(_MAX_STREAMS))
+        return self._status(_MAX_STREAMS)
 
     @property
     def measures(self) -> SourceMeasures:
         """Measurements of the source for metrics."""
-        streams = self._output.streams()
-        return SourceMeasures(self._status(streams[:_MAX_STREAMS]), streams, self._output.durations)
+        return SourceMeasures(self._status(), self._output.durations)
 
-    def _status(self, streams: tuple[StreamStatus, ...]) -> SourceStatus:
+    def _status(self, max_streams: int | None = None) -> SourceStatus:
         run, output = self._run, self._output
         return SourceStatus(
             source=self.text,
@@ -138,7 +136,7 @@ class Worker:
             summary=run.summary if run else "",
             warnings=run.warnings if run else output.warnings,
             error=self._error,
-            streams=streams,
+            streams=output.streams(max_streams),
             not_carried=output.absence.not_carried,
             silent=output.absence.silent,
             log_streams=tuple(output.log_streams.values()),

@@ -274,7 +274,7 @@ def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:
 
 
 def _streams(source: str, measures: SourceMeasures) -> Iterator[MeasuredStream]:
-    for stream in measures.streams:
+    for stream in measures.status.streams:
         vehicle, _, topic = stream.address.partition("/")
         yield MeasuredStream((vehicle, topic, source), stream.health, active=not measures.status.ended)
 

@@ -427,12 +427,10 @@ def test_vehicle_that_was_switched_off_has_no_age(
 @pytest.mark.parametrize(("state", "active"), [("running", {"on", "off"}), ("done", set())])
 def test_stream_that_has_ended_has_no_age(monkeypatch: pytest.MonkeyPatch, state: State, active: set[str]) -> None:
     """A replay that has ended has only counts; a stale stream has its age."""
-    status = SourceStatus(
-        "px4-zenoh:", state, (f"on/{VLP}",), (f"off/{VLP}",), *(0, 0, {}, 0, 0, 0, None, 0, "", (), None, ())
-    )
     health = streams(1)[0].health
     both = tuple(StreamStatus(f"{vehicle}/{VLP}", health) for vehicle in ("on", "off"))
-    monkeypatch.setattr(Daemon, "measures", [SourceMeasures(status, both, Histogram((1.0,)))])
+    status = SourceStatus("px4-zenoh:", state, (f"on/{VLP}",), (f"off/{VLP}",), streams=both)
+    monkeypatch.setattr(Daemon, "measures", [SourceMeasures(status, Histogram((1.0,)))])
     page = service_pages(Daemon(load_settings(source=("sim:",)), version="0"))["/metrics"]()
     found = read_families(page.content.decode())
     counts, of_now = ("messages_published", "resets"), ("age_seconds", "rate_hertz", "flag_ratio")
@@ -469,7 +467,9 @@ def test_a_scrape_looks_at_each_stream_once(endpoint: str, monkeypatch: pytest.M
     running = threading.Thread(target=daemon.run)
     running.start()
     try:
-        wait_for(lambda: [len(source.streams) for source in daemon.measures] == [12], what="a message of each stream")
+        wait_for(
+            lambda: [len(source.status.streams) for source in daemon.measures] == [12], what="a message of each stream"
+        )
         looks: list[StreamHealth] = []
         original = StreamHealth.snapshot
 
