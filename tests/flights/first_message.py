@@ -60,7 +60,7 @@ def decode_cdr_array(payloads: Sequence[bytes]) -> tuple[MessageArray, npt.NDArr
 
 def row_of(message: VehicleLocalPosition) -> VehicleLocalPosition:
     """Return a message as a row, which is the message itself for type checkers."""
-    return cast("VehicleLocalPosition", DEFAULT.row._make(message.__dict__.values()))
+    return cast("VehicleLocalPosition", tuple.__new__(DEFAULT.row, message.__dict__.values()))
 
 
 def layout_of_type_hash(text: str) -> str | None:

@@ -218,8 +218,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
         if any(isinstance(part, tuple) for part in parts):
             raise reject(f"{name}: an array within an array")
         is_text = name in definition.types and definition.types[name].is_text
-        if not is_text and any(
-            isinstance(part, str) for part in parts
-        ):  # the model accepts "NaN" and the like, from JSON
+        # The model accepts "NaN" and the like, from JSON.
+        if not is_text and any(isinstance(part, str) for part in parts):
             raise reject(f"{name}: text, where msgpack has numbers and bools")
     return dict(zip(names, values, strict=True))

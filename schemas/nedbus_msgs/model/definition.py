@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import cached_property
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, kept
 from .px4_types import NAN, FieldType, field_type
@@ -34,10 +34,6 @@ class Row(tuple[Any, ...]):
     __slots__ = ()
     DEFINITION: ClassVar[Definition[Any]]
     _fields: ClassVar[tuple[str, ...]] = ()
-
-    @classmethod
-    def _make(cls, values: Iterable[Any]) -> Self:
-        return tuple.__new__(cls, values)
 
     def _asdict(self) -> dict[str, Any]:
         return dict(zip(self._fields, self, strict=True))

@@ -19,9 +19,7 @@ from .finding import Finding, State, brief, worst_state
 
 _CONNECT_TIMEOUT: Final = 2.0  # s
 _HANDSHAKE_TIMEOUT: Final = 1.5  # s
-_ALERT_TIMEOUT: Final = (
-    0.5  # s to wait for the TLS alert of a router that rejects our certificate; one that accepts it is silent
-)
+_ALERT_TIMEOUT: Final = 0.5  # s for the TLS alert of a router that rejects our certificate; else it is silent
 _OPEN_TIMEOUT: Final = 1.5  # s
 _PEM_FILES: Final = {"tls_ca": "the authority is", "tls_certificate": "this client is", "tls_key": ""}
 _ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
