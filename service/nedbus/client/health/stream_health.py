@@ -78,18 +78,12 @@ class Health:
         return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
 
 
-class _Shares:
-    """Number of messages in which each flag was set, and in which it was known."""
+_FlagCounts = Counter[tuple[str, bool]]  # messages by flag and its value, if it is known
 
-    def __init__(self) -> None:
-        self._set, self._known = Counter[str](), Counter[str]()
 
-    def add(self, flag: str, *, is_set: bool) -> None:
-        self._known[flag] += 1
-        self._set[flag] += is_set
-
-    def measured(self) -> dict[str, float]:
-        return {flag: self._set[flag] / self._known[flag] for flag in DOUBT_FLAGS if flag in self._known}
+def _shares(counts: _FlagCounts) -> dict[str, float]:
+    known = {flag: counts[flag, True] + counts[flag, False] for flag in DOUBT_FLAGS}
+    return {flag: counts[flag, True] / total for flag, total in known.items() if total}
 
 
 @dataclass(slots=True, eq=False)
@@ -100,7 +94,7 @@ class _Window:
     messages: int = 0
     intervals: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
-    flags: _Shares = field(default_factory=_Shares)
+    flags: _FlagCounts = field(default_factory=Counter)
 
     @property
     def mean(self) -> float:
@@ -148,7 +142,7 @@ class StreamHealth:
         self._usual_step = 0.0  # us between two messages
         self._usual_rate: float | None = None
         self._steps = 0
-        self._flags = _Shares()
+        self._flags: _FlagCounts = Counter()
         self._counters: tuple[int, ...] = ()
         self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
         self.latencies = Histogram(_LATENCY_BUCKETS)
@@ -190,8 +184,8 @@ class StreamHealth:
             self.latencies.add(latency)
         for flag, is_set in zip(DOUBT_FLAGS, seen, strict=False):
             if flag not in missing:
-                window.flags.add(flag, is_set=bool(is_set))
-                self._flags.add(flag, is_set=bool(is_set))
+                window.flags[flag, bool(is_set)] += 1
+                self._flags[flag, bool(is_set)] += 1
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
@@ -212,8 +206,8 @@ class StreamHealth:
             gaps=self._gaps,
             out_of_order=self._out_of_order,
             reboots=self._reboots,
-            flags=window.flags.measured() if self._is_position and window.messages else None,
-            flags_ever=self._flags.measured() if self._is_position and self._messages else None,
+            flags=_shares(window.flags) if self._is_position and window.messages else None,
+            flags_ever=_shares(self._flags) if self._is_position and self._messages else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,
