@@ -13,14 +13,12 @@ from nedbus_msgs import (
     DOUBT_FLAGS,
     MESSAGES,
     Definition,
-    GlobalPosition,
     Message,
     VehicleLocalPosition,
     describe_flags,
     message_doubts,
-    to_global,
 )
-from nedbus_msgs.frames import Ned
+from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
 from tests.flights.first_message import row_of
 
@@ -75,7 +73,7 @@ def test_doubts_have_no_percentage_in_one_message(message: VehicleLocalPosition,
 
 
 def model_and_row(message: Message) -> tuple[Any, Any]:
-    return message, message.DEFINITION.row._make(message.__dict__.values())
+    return message, tuple.__new__(message.DEFINITION.row, message.__dict__.values())
 
 
 @EACH
