@@ -18,7 +18,7 @@ ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
 
 _MAX_TOPICS: Final = 30  # per vehicle
-_Vehicle = Annotated[str, AfterValidator(check_vehicle)]
+_Name = Annotated[str, AfterValidator(check_vehicle)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class AccountReport:
     service: str
     host: str
     now: Seconds
-    vehicles: Annotated[Mapping[_Vehicle, VehicleReport], Field(max_length=MAX_VEHICLES)]
+    vehicles: Annotated[Mapping[_Name, VehicleReport], Field(max_length=MAX_VEHICLES)]
     events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
 
     def split(self, number: int) -> list[AccountReport]:
