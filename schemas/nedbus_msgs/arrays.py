@@ -4,8 +4,6 @@ Types, offsets and rules come from the same definition as for single messages.
 Import this module only where arrays are used: NumPy takes longer to load than everything else.
 """
 
-from __future__ import annotations
-
 import struct
 import sys
 from collections.abc import Iterator, Sequence

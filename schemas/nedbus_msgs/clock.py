@@ -1,7 +1,5 @@
 """The clock of a timestamp: time since PX4's boot, or Unix time, as once uXRCE-DDS is synchronized."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 YEAR_2000: Final = 946_684_800_000_000  # us; an earlier time is since boot

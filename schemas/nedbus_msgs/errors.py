@@ -1,7 +1,5 @@
 """Root of the error tree, and the errors of the contract; `nedbus.errors` shows the whole tree."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

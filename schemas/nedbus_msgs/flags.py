@@ -1,7 +1,5 @@
 """Describe the flags of a VehicleLocalPosition that cast doubt on it."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Functions of the contract: find definitions, and describe their schemas."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from typing_extensions import TypeVar

@@ -9,8 +9,6 @@ field is missing.
 Both directions are cached, as almost all messages of a publisher have the same encoding.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ A new origin also counts as a reset, but its delta may describe a jump that did 
 values. Source: real logs, in one of which `delta_z` is -179.5 m and z moved by 2 mm.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

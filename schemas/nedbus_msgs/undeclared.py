@@ -1,7 +1,5 @@
 """Define messages without a file at run time, by field names and types, from a log, a .msg file or a publisher."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final

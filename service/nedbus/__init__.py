@@ -9,8 +9,6 @@ with nedbus.connect() as bus:
 More is in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
 """
 
-from __future__ import annotations
-
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 

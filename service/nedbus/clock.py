@@ -3,8 +3,6 @@
 NTP, a GNSS receiver or a person may set the host's clock at any time, forth or back.
 """
 
-from __future__ import annotations
-
 import time
 from datetime import UTC, datetime
 from typing import Final

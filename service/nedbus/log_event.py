@@ -1,7 +1,5 @@
 """The closed list of log events, and the structured data of a log record: stream, source, reason."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -3,8 +3,6 @@
 Converts between payloads and fields by name; the model validates the fields.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A payload is therefore both plain msgpack and a fixed-size struct, 244 bytes for
 Any other valid msgpack encoding of the array is decoded as well.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

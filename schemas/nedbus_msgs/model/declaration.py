@@ -1,7 +1,5 @@
 """Declarations in a message's file besides its fields: topics, layouts, and fields of older layouts."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The base of all messages: a validated, immutable Pydantic model with PX4's fields."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar, cast

@@ -1,7 +1,5 @@
 """PX4's field types: a table of base types, and declarations of fields and of properties with flags."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct

@@ -3,8 +3,6 @@
 Every rule holds on all real flights examined; docs/messages.md has the counts.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence

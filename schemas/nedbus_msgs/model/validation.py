@@ -4,8 +4,6 @@ It has the types and rules of the model, and accepts nothing that the model reje
 Whatever it does not accept goes to the model, which decides and gives the reasons.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Parser for PX4's .msg files: fields with types, units, ranges and meanings; errors have line and column."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

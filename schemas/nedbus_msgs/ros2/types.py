@@ -1,7 +1,5 @@
 """ROS 2 types of messages: names, definitions and RIHS01 hashes, computed from layouts."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from functools import cache

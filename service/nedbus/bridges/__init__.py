@@ -1,7 +1,5 @@
 """Bridges from a bus to ROS 2 nodes and to Foxglove."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Final
 
 from nedbus.extras import lazy_exports

@@ -1,7 +1,5 @@
 """Conversion of position and attitude to Foxglove's pose, transforms and location messages; no I/O, no clock."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Filter of late samples, by each publisher's own clock; no I/O, and no synchronized clocks needed."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any, Final
 

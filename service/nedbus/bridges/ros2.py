@@ -1,7 +1,5 @@
 """Bridge from a bus to ROS 2: CDR over rmw_zenoh, in the message layout of the ROS 2 workspace."""
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

@@ -1,7 +1,5 @@
 """Arbitration of ROS 2 topics: the addresses to publish and their topic names; no I/O, no clock."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Mapping

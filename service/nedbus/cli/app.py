@@ -1,7 +1,5 @@
 """The Typer application: commands and global options."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """Receive loop of commands with a subscription; it logs when the router link is lost and restored."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Options shared by commands, and the translation of errors into one line and an exit code."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import itertools

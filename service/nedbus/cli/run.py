@@ -1,7 +1,5 @@
 """Run the body of a command in a thread until it ends or a signal arrives; works as PID 1 of a container, too."""
 
-from __future__ import annotations
-
 import logging
 import os
 import queue

@@ -1,7 +1,5 @@
 """sd_notify messages of a service with Type=notify: ready, status, reloading, stopping, watchdog."""
 
-from __future__ import annotations
-
 import logging
 import os
 import socket

@@ -1,7 +1,5 @@
 """The blocking API: connect, subscribe, query, publish."""
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Finalizers: close unreferenced objects on a separate thread, and all open ones before the process exits."""
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import os

@@ -4,8 +4,6 @@ A lossless publisher requests acknowledgements from readers of mode `every` with
 `<key>/@ack?publisher=<id>;number=<sequence number>;read=<0 or 1>`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Downsampling: the rates that publishers offer, and the gate that limits a stream to a rate; no I/O."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

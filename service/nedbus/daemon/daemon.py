@@ -1,7 +1,5 @@
 """The service: publishes validated messages from sources, answers status queries, reloads and shuts down."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

@@ -1,7 +1,5 @@
 """Output of a source: validates, publishes or rejects its messages, and tracks the health of each stream."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import Counter

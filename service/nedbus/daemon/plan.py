@@ -1,7 +1,5 @@
 """Plan of a service: its opened sources, or the mistakes in their settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final

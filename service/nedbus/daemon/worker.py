@@ -1,7 +1,5 @@
 """Worker threads of a service: each runs one source, a replay or a live source."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Checks of settings and router files for `nedbus check` and `nedbus serve --check`: mistakes with their location."""
 
-from __future__ import annotations
-
 import logging
 import socket
 from collections.abc import Collection, Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """The examination: runs all checks, each with a time limit."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

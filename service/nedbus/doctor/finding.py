@@ -1,7 +1,5 @@
 """A finding: the state of one subject, the observation behind it, and advice."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal, get_args

@@ -1,7 +1,5 @@
 """Check of a MAVLink link for packets, messages, positions and the ULog stream; needs the extra `mavlink`."""
 
-from __future__ import annotations
-
 import errno
 import struct
 import time

@@ -1,7 +1,5 @@
 """Checks of the network behind a router: sessions, permissions, services, vehicles, clocks, other keys."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

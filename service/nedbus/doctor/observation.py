@@ -1,7 +1,5 @@
 """Observation of a network for a few seconds: services, tokens, messages and routers, input of the checks."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable

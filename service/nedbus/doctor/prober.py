@@ -1,7 +1,5 @@
 """Probes of routers and certificates: `nedbus check` tests endpoints and files, the doctor also opens sessions."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The bounded event history and current conditions of all vehicles; no I/O."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter, defaultdict, deque

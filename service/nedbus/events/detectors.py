@@ -1,7 +1,5 @@
 """Event detectors for flags, flight modes, GNSS receivers, batteries and EKFs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Health checks of vehicles."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """The table of all kinds of events: where they come from, how bad they are, and what may explain them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args

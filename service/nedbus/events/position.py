@@ -1,7 +1,5 @@
 """Event detector of the position estimate: flags, resets, origin changes, and unexplained jumps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain

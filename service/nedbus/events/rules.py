@@ -1,7 +1,5 @@
 """Labels of flags, thresholds, and names of modes, for the table of kinds and the event detectors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

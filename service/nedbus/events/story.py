@@ -1,7 +1,5 @@
 """Stories for `nedbus why`: each fault with its duration, evidence, and the topics that lack evidence."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace

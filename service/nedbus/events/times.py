@@ -1,7 +1,5 @@
 """Formatting and parsing of times, as UTC if known or as seconds since boot, and of durations."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

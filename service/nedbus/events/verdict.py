@@ -1,7 +1,5 @@
 """Verdict on a vehicle: whether it is usable, since when, for how long, and why, in one or two sentences."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Collection, Iterable, Sequence

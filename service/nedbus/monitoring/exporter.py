@@ -3,8 +3,6 @@
 Needs the extra `metrics`.
 """
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

@@ -4,8 +4,6 @@ Needs the extra `metrics`. Names and units follow https://prometheus.io/docs/pra
 Labels: `vehicle`, `topic` as shown by `nedbus list` (estimator_local_position/0), `source` as configured.
 """
 
-from __future__ import annotations
-
 import platform
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Reader that tracks the health of the selected streams and the events of their vehicles."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Mapping

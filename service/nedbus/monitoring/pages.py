@@ -1,7 +1,5 @@
 """HTTP pages of a service: /metrics, /healthz, /readyz, /vehicles and /status."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final

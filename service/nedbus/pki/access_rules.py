@@ -4,8 +4,6 @@ Zenoh's access control has no patterns for common names or for key expressions d
 its own rule, subject and policy. These go between marks in the file; the rest of the file is left as it is.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Bundle for a vehicle: its certificate, its key, and the configuration that uses them, ready to copy to it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

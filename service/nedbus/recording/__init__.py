@@ -3,8 +3,6 @@
 Each name imports its module on first use: MCAP and plots need extras, and NumPy is slow to import.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports

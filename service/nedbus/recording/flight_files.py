@@ -1,7 +1,5 @@
 """Flight files: format by suffix, opening, and selection of streams."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ The summary, which has its own CRC, lists the chunks; without a summary the reco
 Decompression is bounded in memory; the readers of the `mcap` package have no limit and stop at the first damage.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Collection, Iterator

@@ -1,7 +1,5 @@
 """Reader of MCAP recordings by nedbus, and of px4_msgs recorded by `ros2 bag record`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress

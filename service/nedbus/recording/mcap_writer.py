@@ -4,8 +4,6 @@ A file is valid from the start and after every flush: a footer follows the last 
 it. A power cut costs only the messages since the last flush, never the file.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import struct

@@ -1,7 +1,5 @@
 """Recorder of a subscription to an MCAP file."""
 
-from __future__ import annotations
-
 import threading
 import time
 from itertools import repeat

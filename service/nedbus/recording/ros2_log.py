@@ -1,7 +1,5 @@
 """PX4's texts as rcl_interfaces/msg/Log, which Foxglove's Log panel and ROS 2 show."""
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 

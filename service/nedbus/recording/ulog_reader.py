@@ -1,7 +1,5 @@
 """Reader of PX4 .ulg logs, message by message."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """UTC of a flight, derived from its messages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta

@@ -1,7 +1,5 @@
 """Load settings from a file, the environment and flags, each overriding the previous one."""
 
-from __future__ import annotations
-
 import difflib
 import logging
 import os

@@ -1,7 +1,5 @@
 """The settings: names, types, defaults and checks."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Read a settings file in TOML, and locate settings in it for error messages."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Convert a replay to an MCAP recording, validating each message."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path

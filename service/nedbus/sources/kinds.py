@@ -1,7 +1,5 @@
 """Table of source kinds, and parser for sources: `KIND:TARGET?OPTION=VALUE&...`, or a TOML table."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Replay an MCAP file, paced by its log times."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from heapq import heappop, heappush
 from typing import Final

@@ -1,7 +1,5 @@
 """The options of each kind of source, as Pydantic models."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Set
 from typing import Annotated, Literal
 

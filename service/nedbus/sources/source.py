@@ -1,7 +1,5 @@
 """The two kinds of sources, replay and live, and the messages they yield."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """Replay a PX4 .ulg log while reading it: all instances of its topics in the log's own order, paced by timestamps."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from itertools import islice

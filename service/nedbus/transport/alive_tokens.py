@@ -1,7 +1,5 @@
 """Liveliness tokens: the present ones, and changes as they appear and disappear."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re

@@ -1,7 +1,5 @@
 """Zenoh endpoints: the default, their syntax, and the address to dial for a listening endpoint."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Sequence

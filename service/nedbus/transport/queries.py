@@ -5,8 +5,6 @@ GIL on a thread of Zenoh's, which for a liveliness query holds the session lock 
 thread needs that lock.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Iterator, Sequence

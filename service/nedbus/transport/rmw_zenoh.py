@@ -8,8 +8,6 @@
 Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatible with it.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from dataclasses import dataclass

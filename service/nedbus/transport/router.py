@@ -1,7 +1,5 @@
 """An embedded Zenoh router, with nedbus's settings or a configuration file of `zenohd`."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

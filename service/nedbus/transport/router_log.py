@@ -3,8 +3,6 @@
 Zenoh does not report links, and writes refusals only to its own log, on stdout.
 """
 
-from __future__ import annotations
-
 import atexit
 import logging
 import os

@@ -1,7 +1,5 @@
 """State of the routers of a network from their admin spaces: number and limit of sessions."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

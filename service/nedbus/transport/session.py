@@ -1,7 +1,5 @@
 """Zenoh sessions of clients, and translation of Zenoh's errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """TLS files of a client for `tls/` endpoints, and the detection of mistakes in them."""
 
-from __future__ import annotations
-
 import os
 import re
 import ssl

@@ -4,8 +4,6 @@ One session subscribes to keys of the vehicles that are not topics, and another 
 The publisher sees a match once the router has announced the subscriber; a match without a message means denied.
 """
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Callable, Collection

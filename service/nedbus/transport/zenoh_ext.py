@@ -4,8 +4,6 @@ Source: the code of zenoh-ext 1.10.2; Zenoh does not document them as stable. Th
 language recover samples from nedbus's publishers, and nedbus's from any advanced publisher.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Streams of logged messages: address, definition and decoding, for topics with and without a file in nedbus."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

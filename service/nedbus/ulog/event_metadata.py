@@ -3,8 +3,6 @@
 Format: https://github.com/mavlink/libevents. Everything in them may be hostile.
 """
 
-from __future__ import annotations
-
 import json
 import lzma
 import re

@@ -1,7 +1,5 @@
 """Layouts of logged messages, resolved from the formats of a log within limits."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Mapping

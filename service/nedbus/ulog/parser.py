@@ -1,7 +1,5 @@
 """Incremental parser of a ULog: bytes in, records out."""
 
-from __future__ import annotations
-
 import re
 import struct
 from enum import Enum, auto

@@ -1,7 +1,5 @@
 """The records of a ULog, named by its specification, and the readers of their content."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """PX4's own words in a log, its texts and its events, as messages of `log_message`: each statement once."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections import deque

@@ -1,7 +1,5 @@
 """Background of the map: GeoJSON, or a picture with a world file, in WGS 84."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator, Sequence

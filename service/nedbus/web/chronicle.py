@@ -1,7 +1,5 @@
 """Events of a page in time order, with the spans, states and stories derived from them, and times as text."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Bokeh column data of a viewer, updated incrementally."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Streams of a page, and the snapshot of their states that all parts of the page show; no I/O."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter, deque

@@ -1,7 +1,5 @@
 """Map of all vehicles in metres, north up."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Playback of a recording: its messages and events, and a clock with play, pause and seek."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Bokeh server of the web page, for live vehicles or a recording."""
 
-from __future__ import annotations
-
 import logging
 import resource
 import threading

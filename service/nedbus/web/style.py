@@ -1,7 +1,5 @@
 """Style of the page: dark and light theme, shapes of states, and text templates."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Plots over time: the event timeline of all vehicles, and values of the selected one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 

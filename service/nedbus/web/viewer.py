@@ -1,7 +1,5 @@
 """Viewer: the Bokeh document of one browser, and the actions of its clicks and keys."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Mapping

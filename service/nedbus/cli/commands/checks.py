@@ -1,7 +1,5 @@
 """Commands that check: health for watchdogs, doctor for a running system, check for configuration files."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections import Counter

@@ -1,7 +1,5 @@
 """The command echo: print messages as they arrive."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

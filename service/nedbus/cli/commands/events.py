@@ -1,7 +1,5 @@
 """Commands for vehicle events and their causes: events, why."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The command hz: measure rates, latencies and losses of streams."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import asdict

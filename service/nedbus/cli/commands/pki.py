@@ -1,7 +1,5 @@
 """Commands for keys and certificates of a fleet: pki ca, cert, enroll, list, renew, rules."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import math

@@ -1,7 +1,5 @@
 """Commands that send one query: list, get, info, schema."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Commands for files: record, convert, plot."""
 
-from __future__ import annotations
-
 import math
 import time
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Commands that run a service or a router: serve, router."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Mapping

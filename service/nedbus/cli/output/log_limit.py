@@ -1,7 +1,5 @@
 """Rate limit of the log, against peers that flood it; the number of suppressed lines is logged."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Logging to stderr: text for terminals, syslog priorities for the journal, or JSON."""
 
-from __future__ import annotations
-
 import atexit
 import json
 import logging

@@ -1,7 +1,5 @@
 """Progress reports: log lines of `nedbus serve`, and the progress bar of commands that write files."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Text formats of samples: lines, terminal columns, all fields, JSON and CSV."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

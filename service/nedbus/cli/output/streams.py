@@ -1,7 +1,5 @@
 """Writing to stdout and stderr: printable characters only; a closed stdout is a one-line error."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import io

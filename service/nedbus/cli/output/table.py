@@ -1,7 +1,5 @@
 """Tables, printed once or redrawn in place; fitted to the width of a terminal, else complete."""
 
-from __future__ import annotations
-
 import io
 import os
 import shutil

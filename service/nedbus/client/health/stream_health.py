@@ -4,8 +4,6 @@ Used by `nedbus hz`, the status of services and scripts.
 Rates and ages use a monotonic clock, as the wall clock may be set at any time.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """Stream state: ok, slow, stale, gone or disconnected, with the reason; no I/O."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 

@@ -4,8 +4,6 @@
 A vehicle without such subscribers costs one declaration; each stream declares more once that one is matched.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Flow control of lossless publishers, by acknowledgements of the readers of mode `every`."""
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -1,7 +1,5 @@
 """The publishers of a session, by address, and the replies to queries for their last messages and schemas."""
 
-from __future__ import annotations
-
 import json
 import logging
 import threading

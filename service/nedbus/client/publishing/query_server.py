@@ -1,7 +1,5 @@
 """Replies to Zenoh queries: the I/O thread polls for them, and a thread of their own computes the replies."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Batch: a NumPy array of messages with the address, time and sequence number of each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

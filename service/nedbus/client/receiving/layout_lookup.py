@@ -1,7 +1,5 @@
 """Layout lookup: ask publishers for message definitions and layouts that are not installed here."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

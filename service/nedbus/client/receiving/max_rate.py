@@ -3,8 +3,6 @@
 If a publisher does not downsample, a warning is logged; the full rate is never used, as the link may not carry it.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

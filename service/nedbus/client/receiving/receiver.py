@@ -5,8 +5,6 @@ A reader that waits without a timeout drains the ring on its own thread. The fir
 starts a pump thread that takes over. While no reader waits, the I/O thread drains the ring.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

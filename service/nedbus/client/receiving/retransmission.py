@@ -5,8 +5,6 @@ publisher's cache: with 1,000 publishers a router restart caused a query storm t
 Here at most 64 requests are open, and a gap holds back only later messages of the same publisher.
 """
 
-from __future__ import annotations
-
 import logging
 from contextlib import suppress
 from typing import Final

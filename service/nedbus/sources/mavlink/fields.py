@@ -1,7 +1,5 @@
 """Conversion of single MAVLink messages to fields of PX4's messages, without unknown values."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Links to MAVLink vehicles: UDP, TCP or a serial port; they read bytes with their sender, and send bytes."""
 
-from __future__ import annotations
-
 import os
 import re
 import select

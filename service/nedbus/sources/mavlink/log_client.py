@@ -3,8 +3,6 @@
 Times are monotonic seconds of the caller's clock.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Saves a ULog stream as a .ulg file that is valid at any moment: it grows by whole records."""
 
-from __future__ import annotations
-
 import struct
 from contextlib import suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reassembly of PX4's ULog stream from LOGGING_DATA and LOGGING_DATA_ACKED; no I/O, no clock."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """Requests and acknowledges the ULog streams of all vehicles on a link, in a thread that reads ahead."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """The ULog stream of one vehicle: reassembled bytes in, messages out, with its losses, its delay and its file."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Generator, Iterator

@@ -1,7 +1,5 @@
 """Reader of a link: messages of autopilots with their sender."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple

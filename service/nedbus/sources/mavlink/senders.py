@@ -1,7 +1,5 @@
 """Senders on a MAVLink link: autopilots, others, and two autopilots with one system id."""
 
-from __future__ import annotations
-
 from collections import defaultdict, deque
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Receive from MAVLink vehicles; every system id on a link is a vehicle."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

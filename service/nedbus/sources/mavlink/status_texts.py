@@ -1,7 +1,5 @@
 """Joins the chunks of STATUSTEXT to whole texts; no I/O, no clock."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Any, Final
 

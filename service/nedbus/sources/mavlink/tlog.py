@@ -1,7 +1,5 @@
 """Replay a .tlog, MAVLink as QGroundControl or MAVProxy received it: each frame behind the host's time in 8 bytes."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import replace

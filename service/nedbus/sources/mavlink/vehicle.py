@@ -3,8 +3,6 @@
 Times are monotonic seconds of the caller's clock unless stated otherwise.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Collection

@@ -1,7 +1,5 @@
 """Receive from PX4's Zenoh module, and from any other publisher of px4_msgs over rmw_zenoh."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack

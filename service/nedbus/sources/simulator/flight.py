@@ -9,8 +9,6 @@ Every lap of 120 s has the events of a real flight:
     t = 90 s         a reset of z
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from random import Random

@@ -1,7 +1,5 @@
 """Replay a simulated flight with all topics of its vehicle; the same seed gives identical messages."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Messages of the simulated vehicle besides its estimates: status, landing, home, battery and GNSS receiver."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 
