@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
 ARGS = --source sim: --http 127.0.0.1:9464
 
-.PHONY: run check generated docs quick test behaviour test-all measured compose-test wheel bench clean
+.PHONY: run check generated docs quick test behaviour slow test-all measured compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
@@ -38,13 +38,16 @@ quick: $(DEV)  ## the tests of rules alone, without routers and processes: under
 test: check behaviour  ## lint, types, and all tests that prove behaviour: three to four minutes on two cores
 
 behaviour: $(DEV)
-	$(BIN)/pytest -q -n 4 --dist worksteal -m "not slow and not compose"
+	$(BIN)/pytest -q -n 4 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
+
+slow: $(DEV)  ## the slow tests, and the properties of `make test` with four times as many examples
+	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not compose" --hypothesis-profile=all --junitxml=build/slow-tests.xml
 
 test-all: check measured compose-test  ## the same with branch coverage and more examples, the slow tests, and containers
 
-measured: $(DEV)
+measured: $(DEV)  ## the tests of `make test` and `make slow`, under coverage
 	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest -q -n 4 --dist worksteal -m "not compose" --hypothesis-profile=all --junitxml=build/tests.xml
+	$(BIN)/coverage run -m pytest -q -n 4 --dist worksteal -m "not compose" --hypothesis-profile=all
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
