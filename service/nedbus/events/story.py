@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from .event import WINDOW, Condition, Event, State, explain, state_of
-from .kinds import KINDS
+from .kinds import KINDS, importance
 from .rules import RECENT
 from .times import Times
 
@@ -188,11 +188,16 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _is_part(story: Story, of: Story) -> bool:
-    """Return True if a story is part of another; a fault of the estimate that outlasts it is not."""
-    if not of.is_bad or story.spans[0].begin not in (*of.meanwhile, *of.after):
+    """Return True if a story is part of another.
+
+    A more important one is not, nor one that is active after it, nor a fault of the estimate that outlasts it.
+    """
+    begin, kind = story.spans[0].begin, story.spans[0].kind
+    if not of.is_bad or begin not in (*of.before, *of.meanwhile, *of.after):
         return False
-    outlasts = of.until is not None and (story.until is None or story.until > of.until + TOGETHER)
-    return not (outlasts and story.is_bad and KINDS[story.spans[0].kind].message == "VehicleLocalPosition")
+    is_estimate = KINDS[kind].message == "VehicleLocalPosition"
+    outlasts = of.until is not None and (story.until is None or (is_estimate and story.until > of.until + TOGETHER))
+    return not (story.is_bad and (outlasts or importance(kind) < importance(of.spans[0].kind)))
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:

@@ -20,13 +20,17 @@ from nedbus.events import (
     AccountReport,
     Event,
     Expectation,
+    Severity,
     VehicleReport,
+    by_vehicle,
     faults_of,
     from_json,
     joined,
+    rank_vehicle,
     report_of,
     stories_of,
 )
+from nedbus.monitoring.pages import vehicles_page
 from nedbus.transport import MAX_REPLY_BYTES
 from tests.flights.messages import VLP
 
@@ -180,6 +184,18 @@ def test_any_answer_is_a_report_or_none(name: str, value: object) -> None:
     if read is not None:
         assert isinstance(faults_of([read], Expectation(vehicles=1, valid=("xy",), within=1.0)), list)
         assert isinstance(stories_of(read.events), list)
+
+
+def test_lists_of_vehicles_begin_with_the_worst() -> None:
+    """Vehicles of a report are listed by their state, then in natural order, as on the page."""
+    known: dict[str, Severity] = {"uav-10": "info", "uav-2": "info", "3": "watch", "b": "bad", "a": "bad"}
+    vehicles = {name: VehicleReport(severity, f"is {severity}") for name, severity in known.items()}
+    given = AccountReport("s", "h", 1.0, vehicles)
+    order = sorted(known, key=lambda name: rank_vehicle(name, known[name]))
+    assert list(by_vehicle([given])) == order == ["a", "b", "3", "uav-2", "uav-10"]
+    assert faults_of([given], Expectation(well=True)) == ["vehicle a: is bad", "vehicle b: is bad"]
+    page = vehicles_page(replace(given, vehicles={name: vehicles[name] for name in known if known[name] != "bad"}))
+    assert page.content.decode().splitlines() == ["3 is watch", "uav-2 is info", "uav-10 is info"]
 
 
 def test_well_vehicle_has_no_fault() -> None:

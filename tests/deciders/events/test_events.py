@@ -742,11 +742,11 @@ def test_kind_of_a_newer_service_is_an_event() -> None:
 
 
 def test_state_is_the_current_one(flight: Flight) -> None:
-    """An active condition counts before single events of the last minute, and of those the newest."""
+    """An active condition counts before single events of the last minute, and of those the largest."""
     flight.send()
     flight.wait(1.0).send(xy_reset_counter=1, delta_xy=(20.0, 0.0), x=20.0)
     flight.wait(1.0).send(xy_reset_counter=2, delta_xy=(3.0, 0.0), x=23.0)
-    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 3.0 m")
+    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 20.0 m")
     flight.wait(1.0).send(xy_reset_counter=2, x=23.0, dead_reckoning=True)
     assert flight.account.state("1", flight.now).text == "dead reckoning"
 
