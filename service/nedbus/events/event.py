@@ -67,11 +67,6 @@ class Event:
         evidence = tuple(each.later(seconds) for each in self.evidence)
         return replace(self, time=max(0.0, self.time + seconds), evidence=evidence)
 
-    @property
-    def is_notable(self) -> bool:
-        """True if a story includes it: a begin or single event of severity bad or watch, or a change of mode."""
-        return self.change != "end" and (self.severity != "info" or self.kind == "mode")
-
 
 @dataclass(frozen=True, slots=True)
 class Condition:
@@ -103,20 +98,15 @@ class State:
     conditions: tuple[Condition, ...]
 
 
-def size_of(condition: Condition, until: float | None) -> float:
-    """Return the duration of a condition, infinite while it is active; of a single event its largest number."""
-    if condition.begin.change == "once":
-        return max(map(abs, condition.begin.numbers.values()), default=0.0)
-    return round(math.inf if until is None else until - condition.since, 2)
-
-
 def rank(condition: Condition, until: float | None, *, is_now: bool = True) -> tuple[int, bool, bool, int, float]:
     """Return the sort key of conditions, the worst first; `until`: the end, None while it is active.
 
     One of severity bad before one to watch, now an active one before one that has ended or a single event, then a large
-    correction of the estimate, then the more important kind, then the longest or largest.
+    correction of the estimate, then the more important kind, then the longest, or the single event of largest numbers.
     """
-    size, has_ended = size_of(condition, until), is_now and until is not None
+    numbers = map(abs, condition.begin.numbers.values()) if condition.begin.change == "once" else ()
+    size = max(numbers, default=round((math.inf if until is None else until) - condition.since, 2))
+    has_ended = is_now and until is not None
     is_large = KINDS[condition.kind].correction and size >= LARGE_CORRECTION
     return SEVERITIES.index(condition.severity), has_ended, not is_large, importance(condition.kind), -size
 

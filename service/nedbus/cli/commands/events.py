@@ -101,9 +101,8 @@ def events(
     found = select(found)
     begin({read.times.clock(event) for event in found})
     show(found, read.times)
-    initial = {name: each.held_from_start for name, each in sorted(read.account.vehicles.items())}
-    texts = [f"{name}: {text}" for name, text in initial.items() if text and vehicle in (ANY, name)]
-    if texts:
+    vehicles = sorted(each for each in read.account.vehicles.items() if vehicle in (ANY, each[0]))
+    if texts := [f"{name}: {each.held_from_start}" for name, each in vehicles if each.held_from_start]:
         write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
         least = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
