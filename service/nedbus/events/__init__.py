@@ -4,7 +4,7 @@ To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`).
 a detector, too, which yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
 """
 
-from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
+from .account import KEPT, MAX_VEHICLES, Account
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State

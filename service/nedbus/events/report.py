@@ -8,9 +8,10 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
+from nedbus.timings import TIMINGS
 from nedbus_msgs import check_vehicle
 
-from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
+from .account import KEPT, MAX_VEHICLES, Account
 from .event import Condition, Event, Seconds
 from .kinds import KINDS, rank_vehicle
 
@@ -46,8 +47,8 @@ class VehicleReport:
         return "silent" in self.kinds or "gone" in self.kinds
 
     def is_forgotten(self, now: float) -> bool:
-        """Return True if the vehicle has been silent for FORGOTTEN seconds."""
-        return self.is_silent and self.since is not None and now - self.since >= FORGOTTEN
+        """Return True if the vehicle has been silent for an hour."""
+        return self.is_silent and self.since is not None and now - self.since >= TIMINGS.forgotten
 
 
 @dataclass(frozen=True, slots=True)

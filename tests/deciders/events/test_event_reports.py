@@ -14,7 +14,6 @@ from hypothesis import given
 from nedbus.client import ServiceStatus, SourceStatus, StreamHealth, StreamStatus, reply_parts
 from nedbus.events import (
     ALL,
-    FORGOTTEN,
     KEPT,
     MAX_VEHICLES,
     AccountReport,
@@ -31,6 +30,7 @@ from nedbus.events import (
     stories_of,
 )
 from nedbus.monitoring.pages import vehicles_page
+from nedbus.timings import TIMINGS
 from nedbus.transport import MAX_REPLY_BYTES
 from tests.flights.messages import VLP
 
@@ -212,7 +212,7 @@ def test_silent_vehicle_is_a_fault() -> None:
     flight.wait(10.0).look("stale")
     line = "vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (10.0 s)"
     assert faults_of([report(flight)], NOTHING) == [line]
-    flight.wait(FORGOTTEN - 11).look("stale")
+    flight.wait(TIMINGS.forgotten - 11).look("stale")
     assert len(faults_of([report(flight)], NOTHING)) == 1
     flight.wait(2).look("stale")
     assert faults_of([report(flight)], NOTHING) == []
