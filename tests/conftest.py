@@ -13,9 +13,11 @@ import hypothesis
 import pytest
 
 import nedbus
+from nedbus.timings import Timings
 from nedbus.transport import Session, open_router
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start, Zygote, unmeasured
+from tests.waits import changing_timings
 
 from .blocking import blocking
 
@@ -80,6 +82,13 @@ def _no_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in [name for name in os.environ if name.startswith("NEDBUS_")]:
         monkeypatch.delenv(name)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def timings() -> Iterator[Timings]:
+    """Change timings of this process for a test: `timings.stale = 0.5`."""
+    with changing_timings() as those:
+        yield those
 
 
 @pytest.fixture(params=["sync", "async"])

@@ -6,10 +6,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields, replace
 from typing import cast
 
 import zenoh
 
+from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import Session, alive_keys
 
 DEADLINE = 30.0
@@ -34,6 +36,17 @@ def wait_for_reader(raw: Session, key: str) -> None:
 def wait_for_router(raw: Session) -> None:
     """Wait until the router knows what a session has declared: it answers in the order in which it is told."""
     alive_keys(raw, "nowhere", timeout=DEADLINE)
+
+
+@contextmanager
+def changing_timings() -> Iterator[Timings]:
+    """Yield the timings of this process, to change fields of them, and restore them at the end."""
+    before = replace(TIMINGS)
+    try:
+        yield TIMINGS
+    finally:
+        for each in fields(before):
+            setattr(TIMINGS, each.name, getattr(before, each.name))
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import re
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +14,7 @@ from nedbus.events import KINDS
 from nedbus.log_event import EVENTS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS
+from nedbus.timings import Timings
 from nedbus_msgs import MESSAGES, TOPICS, Address, codec_of, encoding_of
 
 from .api import constants_of
@@ -164,7 +167,13 @@ def limits_page() -> str:
         "The limits in the code, with the names of their constants; a vehicle's name is 1 to 64 of `A-Z a-z 0-9 _ -`, "
         "and an instance 0 to 255.",
         *(section(title, table(["limit", "value", "constant"], rows)) for title, rows in parts.items()),
+        section("Durations", table(["duration [s]", "value", "field of `nedbus.timings.TIMINGS`"], _durations())),
     )
+
+
+def _durations() -> list[list[str]]:
+    lines = re.findall(r"^    (\w+): .+ = .+?  # (.+)$", inspect.getsource(Timings), re.MULTILINE)
+    return [[cell(text), code(str(getattr(Timings(), name))), code(name)] for name, text in lines]
 
 
 def _numbers(tree: ast.Module) -> list[tuple[str, str]]:

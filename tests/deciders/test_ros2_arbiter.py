@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping
 
 import pytest
 
-from nedbus.bridges.ros2_arbiter import TAKE_OVER_DELAY, Decision, Ros2Arbiter
+from nedbus.bridges.ros2_arbiter import Decision, Ros2Arbiter
 from nedbus.errors import AddressError
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 from tests.flights.messages import VLP
 
@@ -70,8 +71,8 @@ def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
     arbiter = make()
     for now in (0.0, 4.0):
         arbiter.update([ONE], {ONE: "px4"}, now=now)
-    assert actions(arbiter, [ONE], now=4.0 + TAKE_OVER_DELAY) == []
-    assert actions(arbiter, [ONE], now=4.1 + TAKE_OVER_DELAY) == [("publish", TOPIC)]
+    assert actions(arbiter, [ONE], now=4.0 + TIMINGS.take_over) == []
+    assert actions(arbiter, [ONE], now=4.1 + TIMINGS.take_over) == [("publish", TOPIC)]
     assert actions(arbiter, [ONE], {ONE: "px4"}, now=20.0) == [("defer", TOPIC)]
 
 
@@ -99,4 +100,4 @@ def test_two_addresses_of_one_topic_conflict() -> None:
     assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
     assert actions(arbiter, [first, second], {second: "px4"}, now=4.0) == [("defer", topic)]
     assert actions(arbiter, [first, second], now=5.0) == [("publish", topic)]
-    assert actions(arbiter, [first, second], now=5.0 + TAKE_OVER_DELAY) == [("conflict", topic)]  # reported again
+    assert actions(arbiter, [first, second], now=5.0 + TIMINGS.take_over) == [("conflict", topic)]  # reported again

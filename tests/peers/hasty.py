@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final
 
+from nedbus.timings import Timings
 from tests.peers.processes import Process, Start
 
 _SCRIPT: Final = """
 import sys
-from importlib import import_module
+from dataclasses import fields
 from nedbus.cli import main
-for name, value in eval(sys.argv.pop(1)).items():
-    module, _, constant = name.rpartition(".")
-    getattr(import_module(module), constant)  # it must be there
-    setattr(import_module(module), constant, value)
+from nedbus.timings import TIMINGS, Timings
+given = eval(sys.argv.pop(1))
+for each in fields(given):
+    setattr(TIMINGS, each.name, getattr(given, each.name))
 main()
 """
 
 
-def start_hasty(start: Start, constants: Mapping[str, object], *arguments: str, **environment: str) -> Process:
-    """Start `nedbus` with these arguments; `constants`: values by the full names of what they replace."""
-    return start("-c", _SCRIPT, repr(constants), *arguments, **environment)
+def start_hasty(start: Start, timings: Timings, *arguments: str, **environment: str) -> Process:
+    """Start `nedbus` with these arguments and timings."""
+    return start("-c", _SCRIPT, repr(timings), *arguments, **environment)

@@ -21,6 +21,7 @@ from foxglove.messages import Quaternion, Vector3
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
+from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     DEFAULT_TOPIC,
     Address,
@@ -38,7 +39,6 @@ from . import FOXGLOVE_PORT
 from .foxglove_messages import MapFrame, has_position, orientation_of, to_location, to_pose, to_transforms
 
 _ATTITUDE: Final = "vehicle_attitude"
-_POLL: Final = 1.0  # s between queries for the published addresses
 
 
 class FoxgloveServer:
@@ -72,13 +72,13 @@ class FoxgloveServer:
         Raises ClosedError when the bus is closed meanwhile.
         """
         with self._bus.subscribe_to(selection or Selection()) as subscription:
-            next_poll = time.monotonic() + _POLL
+            next_poll = time.monotonic() + TIMINGS.bridge_poll
             while not stop.is_set():
                 if time.monotonic() >= next_poll:
                     self._close_unpublished()
                     for address, (message, time_ns) in list(self._unseen.items()):
                         self._show_fields(address, message, time_ns)
-                    next_poll = time.monotonic() + _POLL
+                    next_poll = time.monotonic() + TIMINGS.bridge_poll
                 try:
                     self.show(subscription.receive(0.1))
                 except NoDataError:

@@ -4,10 +4,8 @@ from collections import Counter
 from typing import Any, Final
 
 from nedbus.client import Sample
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
-
-MAX_LATENESS: Final = 10**9
-"""Nanoseconds above which a sample is late: it was recovered after an outage, or queued behind one that was."""
 
 DRIFT: Final = 60 * 10**9
 """Nanoseconds for which the fastest sample is the reference: the two clocks drift apart."""
@@ -22,6 +20,7 @@ class LateFilter:
         self._clocks: dict[Address, tuple[str, PublisherClock]] = {}
         self._held = Counter[Address]()
         self._latest = 0  # ns, greatest lateness among these
+        self._limit = round(1e9 * TIMINGS.lateness)  # ns
 
     def admits(self, sample: Sample[Any], *, arrived: int) -> bool:
         """Return True if a sample is current or has no timestamp.
@@ -37,7 +36,7 @@ class LateFilter:
                 clock = PublisherClock(sent, arrived)
                 self._clocks[address] = publisher, clock
             late = clock.lateness(sent, arrived)
-            if late <= MAX_LATENESS:
+            if late <= self._limit:
                 return True
         self._held[address] += 1
         self._latest = max(self._latest, late)

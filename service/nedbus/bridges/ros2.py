@@ -15,6 +15,7 @@ from nedbus import clock
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus.transport import (
     BRIDGED_ENCODING,
     NO_HASH,
@@ -52,10 +53,8 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
-_POLL: Final = 1.0  # s between queries for addresses and for publishers of other nodes
 _MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; publishers keep 20 s for recovery
 _MAX_LEFT_OUT: Final = 1000  # addresses logged as unsupported
-_VISIBLE_TIMEOUT: Final = 5.0  # s for a token to become visible to other sessions; later counts as denied
 
 
 class Ros2Bridge:
@@ -129,10 +128,10 @@ class Ros2Bridge:
 
     def _require_visible(self, observer: Session, token: str, stop: threading.Event) -> None:
         """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
-        end = time.monotonic() + _VISIBLE_TIMEOUT
+        end = time.monotonic() + TIMINGS.token_visible
         while not stop.is_set() and not alive_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
-                end = time.monotonic() + _VISIBLE_TIMEOUT  # without a link the token cannot be visible
+                end = time.monotonic() + TIMINGS.token_visible  # without a link the token cannot be visible
             elif time.monotonic() > end:
                 raise NedbusError(
                     "the router's access control denies the keys of ROS 2, so no ROS 2 node sees this bridge:"
@@ -145,7 +144,7 @@ class Ros2Bridge:
         while not stop.is_set():
             if time.monotonic() >= next_poll:
                 self._poll()
-                next_poll = time.monotonic() + _POLL
+                next_poll = time.monotonic() + TIMINGS.bridge_poll
             try:
                 sample = subscription.receive(0.1)
             except NoDataError:

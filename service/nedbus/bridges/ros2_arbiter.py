@@ -4,12 +4,10 @@ import math
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Literal
 
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, AddressError, ros2_topic_of
-
-TAKE_OVER_DELAY: Final = 5.0
-"""Seconds after another node's publisher is gone until its topic is taken over."""
 
 _NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*|")
 
@@ -88,7 +86,7 @@ class Ros2Arbiter:
             self._deferred[address] = now
             self._published.pop(address, None)
             return Decision("defer", address, topic, other_node) if is_new else None
-        if address in self._published or now - self._deferred.get(address, -math.inf) <= TAKE_OVER_DELAY:
+        if address in self._published or now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over:
             return None
         owner = next((each for each, published in self._published.items() if published == topic), None)
         if owner is None:

@@ -3,18 +3,15 @@
 import logging
 import time
 from collections.abc import Callable
-from typing import Final
 
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NoDataError
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 
 from .output.streams import write_stderr
 
 _log = logging.getLogger("nedbus")
-
-SILENCE_TIMEOUT: Final = 2.0
-"""Time without a first sample until a notice is written to stderr [s]."""
 
 
 def follow(
@@ -45,7 +42,7 @@ def follow(
                 event = "link-back" if connected else "link-broken"
                 _log.warning(text, " or ".join(bus.routers), extra=about(event))
             each_second()
-        if not seen and not noticed and now > start + SILENCE_TIMEOUT:
+        if not seen and not noticed and now > start + TIMINGS.first_sample:
             noticed = True
             write_notice(subscription)
         try:

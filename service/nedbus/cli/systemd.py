@@ -11,13 +11,12 @@ from typing import Final, Self
 
 from nedbus.daemon import Daemon
 from nedbus.monitoring import why_not_ready
+from nedbus.timings import TIMINGS
 
 from .output.streams import MAX_TEXT, counted, to_text
 
 _log = logging.getLogger("nedbus")
 
-_ROUTER_TIMEOUT: Final = 30.0  # s until a client without its router reports READY, to let the boot continue
-_STATUS_INTERVAL: Final = 1.0  # s between two status texts
 _START_INTERVAL: Final = 0.1  # s between two checks until the service is ready
 
 
@@ -50,20 +49,18 @@ class Notifier:
 
     READY is sent once `daemon.ready` is set: the router listens, or the session is open, and all sources have started.
     Silent sources do not delay it; the status text names them.
-    A client whose router does not answer reports READY after `patience` [s].
+    A client whose router does not answer reports READY after half a minute.
 
     WATCHDOG is sent only while everything works: Zenoh returns the number of sessions, the main thread has called
     `tick` since the last ping, and no source has spent half of systemd's limit on one message.
     It is sent from a separate thread: the main thread has to handle signals even while Zenoh blocks.
     """
 
-    def __init__(
-        self, daemon: Daemon, *, environment: Mapping[str, str] = os.environ, patience: float = _ROUTER_TIMEOUT
-    ) -> None:
+    def __init__(self, daemon: Daemon, *, environment: Mapping[str, str] = os.environ) -> None:
         self._daemon = daemon
         self._socket = NotifySocket(environment.get("NOTIFY_SOCKET", ""))
         self._watchdog = watchdog_interval(environment)
-        self._router_deadline = time.monotonic() + patience
+        self._router_deadline = time.monotonic() + TIMINGS.systemd_patience
         self._counted = time.monotonic(), 0  # time, and messages published until then
         self._is_ready = self._ticked = False  # READY was accepted; the main thread is alive
         self._rejected = ""
@@ -115,12 +112,12 @@ class Notifier:
                     self._is_ready = False
             elif now >= next_status:
                 self._socket.send(STATUS=self._status())
-                next_status = now + _STATUS_INTERVAL
+                next_status = now + TIMINGS.systemd_status
             interval = self._watchdog
             if interval is not None and now >= next_ping and self._ticked and self._daemon.busy < interval:
                 self._ticked, next_ping = False, now + interval
                 self._socket.send(WATCHDOG=1)
-            pause = _STATUS_INTERVAL if self._is_ready else _START_INTERVAL
+            pause = TIMINGS.systemd_status if self._is_ready else _START_INTERVAL
             if self._stop.wait(pause if interval is None else min(pause, interval / 2)):
                 return
 

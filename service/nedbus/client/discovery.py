@@ -23,6 +23,7 @@ from nedbus.client.health.stream_health import Health
 from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus.transport import (
     MAX_ANSWERS,
     MAX_REPLY_BYTES,
@@ -57,7 +58,6 @@ _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rej
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
-_SCHEMA_TIMEOUT: Final = 3.0  # s for a busy publisher to reply, as long as readers wait for it
 _POLL: Final = 0.002  # s between polls for tokens
 
 
@@ -318,7 +318,7 @@ def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -
     keys = {
         schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
     }
-    queries = [ask(session, key, timeout=_SCHEMA_TIMEOUT) for key in keys]
+    queries = [ask(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
     replies = islice(wait_for_answers(queries), MAX_ANSWERS)
     for key, content in _parse(reply.ok for reply in replies if reply.ok is not None):
         name = key.rpartition("/")[2]

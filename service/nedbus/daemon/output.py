@@ -11,14 +11,14 @@ from typing import Any, Final, cast
 from nedbus import clock
 from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
-from nedbus.events import FORGOTTEN, Account
+from nedbus.events import Account
 from nedbus.log_event import about
 from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
 _log = logging.getLogger(__name__)
 
-_STALE: Final = 3.0  # s without a message after which a live address is no longer published
 _MAX_ADDRESSES: Final = 1000  # of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one for each `where`
 _MAX_TEXT: Final = 300  # logged characters of a rejection, which any peer may have sent
@@ -194,18 +194,18 @@ class SourceOutput:
         fresh = {
             address
             for address, stream in self._streams.items()
-            if stream.heard is not None and now - stream.heard < _STALE
+            if stream.heard is not None and now - stream.heard < TIMINGS.stale
         }
         heard = {address.vehicle for address in fresh}
         fresh |= {each for each in self._streams if each.vehicle in heard and not get_topic(each.topic).rate}
         for address in self.addresses:
             if address not in fresh:
-                text = f"{address} is stale: no message for {_STALE:.0f} s"
+                text = f"{address} is stale: no message for {TIMINGS.stale:.0f} s"
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
             is_known = address.vehicle in self._account.vehicles and stream.heard is not None
-            if stream.publisher is None and not (is_known and now - (stream.heard or 0.0) < FORGOTTEN):
+            if stream.publisher is None and not (is_known and now - (stream.heard or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]
         self._is_full = False
         return bool(fresh)

@@ -13,6 +13,7 @@ from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
 from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, SourceMessage
+from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
 from .output import SourceOutput
@@ -20,7 +21,6 @@ from .plan import Planned
 
 _log = logging.getLogger(__name__)
 
-_BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s before a failed source is restarted
 _MIN_RUN: Final = 0.1  # s, minimum of a looped run: a log of one message must not be read thousands of times a second
 _MAX_DELAY: Final = 1.0  # s: a replay that is later than this shifts its schedule instead of catching up
 _STALE_POLL: Final = 0.5  # s between two checks for stale streams
@@ -191,9 +191,9 @@ class Worker:
             if not self._retry:
                 self._end("failed", self._error)
                 return
-            if self._clock.now() - start > _BACKOFF[-1]:
+            if self._clock.now() - start > TIMINGS.backoff[-1]:
                 failures = 0  # it ran well before this failure
-            self._clock.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
+            self._clock.wait(TIMINGS.backoff[min(failures, len(TIMINGS.backoff) - 1)])
             failures += 1
 
     def _run_replay(self, source: ReplaySource) -> None:

@@ -17,18 +17,12 @@ from nedbus.client import PublisherRegistry
 from nedbus.errors import ConnectError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings
+from nedbus.timings import TIMINGS
 from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, while_open
 
 _log = logging.getLogger(__name__)
 
-_FIRST: Final = (1.0, 5.0)  # s, random: all vehicles of a fleet reconnect at once after their router restarted
-_CONFIRM: Final = 1.0  # s until a denial is checked again
 _BELIEVED: Final = 3  # consecutive denials that count as a refusal: a slow or restarting router causes fewer
-_UNSURE_PAUSE: Final = 60.0  # s until the next check while a vehicle is refused or unknown
-_PAUSE: Final = 600.0  # s until the next check if all vehicles are allowed
-_POLL: Final = 1.0  # s between two polls of the link
-_OPEN: Final = 5.0  # s to open a session
-_ARRIVED: Final = 3.0  # s for an allowed message to arrive
 _GRACE: Final = 5.0  # s to end
 _MAX_NAMED: Final = 20  # vehicles named in a log line
 
@@ -82,14 +76,14 @@ class WritePermission:
 
     def _run(self) -> None:
         due, known = 0.0, (set[str](), set[str]())
-        while not self._stop.wait(_POLL):
+        while not self._stop.wait(TIMINGS.probe_poll):
             now = time.monotonic()
             routers, vehicles = _routers_of(self._session), self._vehicles()
             if routers != known[0]:
                 self._denials = {vehicle: _BELIEVED * refused for vehicle, refused in self.refused.items()}
-                due = now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
+                due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads load, no secret
             elif vehicles - known[1]:
-                due = min(due, now + _FIRST[0])
+                due = min(due, now + TIMINGS.probe_first[0])
             known = routers, vehicles
             if routers and vehicles and now >= due:
                 due = now + self.check()
@@ -114,22 +108,22 @@ class WritePermission:
                 self._denials.pop(vehicle, None)
         self._log_changes(before)
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
-            return _CONFIRM
+            return TIMINGS.probe_confirm
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
-        return _PAUSE if is_well else _UNSURE_PAUSE
+        return TIMINGS.probe_pause if is_well else TIMINGS.probe_unsure
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
         """Return the verdict on each vehicle; empty if the two sessions share no router."""
         routers = _routers_of(self._session)
         for endpoint in self._endpoints if vehicles else ():
             try:
-                reader = open_client([endpoint], timeout=_OPEN, tls=self._tls, stop=self._stop)
+                reader = open_client([endpoint], timeout=TIMINGS.probe_open, tls=self._tls, stop=self._stop)
             except ConnectError:
                 continue
             with reader:
                 if not (there := _routers_of(reader)) or not there <= routers:
                     continue
-                verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=_ARRIVED)
+                verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
                 # A missing probe counts only if no link was lost meanwhile.
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}

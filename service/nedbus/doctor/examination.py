@@ -13,6 +13,7 @@ from nedbus.extras import needs
 from nedbus.log_event import about
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
+from nedbus.timings import TIMINGS
 from nedbus.transport import Tls, open_client, probe_writes
 
 from .configuration import check_sources
@@ -24,20 +25,18 @@ from .prober import check_endpoint, check_tls_files
 _log = logging.getLogger(__name__)
 
 Check = Callable[[], Iterable[Finding]]
-_LISTEN: Final = 3.0  # s
 _ENDPOINTS_TIMEOUT: Final = 9.0  # s for the checks before joining a router, which run in parallel
 _NETWORK_TIMEOUT: Final = 12.0  # s
-_OPEN_TIMEOUT: Final = 1.5  # s
 _MAX_ROUTERS: Final = 8
 
 
 def examine(
-    settings: Settings, *, version: str, vehicle: str | None = None, mavlink: str | None = None, listen: float = _LISTEN
+    settings: Settings, *, version: str, vehicle: str | None = None, mavlink: str | None = None
 ) -> list[Finding]:
     """Run all checks and return their findings, the worst last; takes up to 10 s if no router answers.
 
     `version`: of this nedbus. `vehicle`: examine only this one, and test the permission to write it. `mavlink`: link
-    to listen to, such as `udpin:0.0.0.0:14550`. `listen`: time to wait for messages and packets [s].
+    to listen to, such as `udpin:0.0.0.0:14550`.
 
     Raises ConfigError for an invalid link.
     """
@@ -46,7 +45,7 @@ def examine(
     checks: dict[tuple[str, str], Check] = {("settings", ""): partial(_check_sources, settings)}
     if mavlink is not None:
         parse_link(mavlink)
-        checks["mavlink", mavlink] = lambda: needs("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink, listen)
+        checks["mavlink", mavlink] = lambda: needs("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink)
     for endpoint in settings.routers[:_MAX_ROUTERS]:
         checks["endpoint", endpoint] = partial(check_endpoint, endpoint, tls)
     findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
@@ -56,7 +55,7 @@ def examine(
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
         seen = Observation(settings.prefix, version, vehicle)
-        checks = {("network", ""): partial(check_network, seen, answering[0], tls, listen)}
+        checks = {("network", ""): partial(check_network, seen, answering[0], tls)}
         findings += _run_together(checks, _NETWORK_TIMEOUT)
     return sort_findings(findings)
 
@@ -79,13 +78,13 @@ def _check_sources(settings: Settings) -> Iterator[Finding]:
         yield Finding("settings", mistake.where, "wrong", mistake.reason, "correct it and restart the service")
 
 
-def check_network(seen: Observation, router: str, tls: Tls | None, listen: float) -> Iterator[Finding]:
+def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[Finding]:
     """Join a router, observe the network behind it, and yield the findings of `NETWORK_CHECKS`."""
-    with open_client([router], timeout=_OPEN_TIMEOUT, tls=tls) as session:
+    with open_client([router], timeout=TIMINGS.doctor_open, tls=tls) as session:
         if seen.vehicle is not None:
-            with open_client([router], timeout=_OPEN_TIMEOUT, tls=tls) as writer:
+            with open_client([router], timeout=TIMINGS.doctor_open, tls=tls) as writer:
                 seen.verdict = probe_writes(session, writer, [seen.vehicle], prefix=seen.prefix)[seen.vehicle]
-        seen.observe(session, listen=listen)
+        seen.observe(session)
     for check in NETWORK_CHECKS:
         yield from limit_findings(check(seen))
 

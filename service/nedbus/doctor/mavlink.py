@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
 from nedbus.sources import Link, Senders, open_link, why_ignored
+from nedbus.timings import TIMINGS
 
 from .finding import Finding, limit_findings, list_names
 
@@ -51,11 +52,11 @@ class _System:
             self.log_clients.add(f"system {message.target_system} component {message.target_component}")
 
 
-def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
-    """Listen to a link for `listen` seconds and yield the findings; raise ConfigError for an invalid link."""
+def check_mavlink(link: str) -> Iterator[Finding]:
+    """Listen to a link for 3 s and yield the findings; raise ConfigError for an invalid link."""
     try:
         with closing(open_link(link, baud=_BAUD)) as opened:
-            senders, systems, faults = _listen(opened, listen)
+            senders, systems, faults = _listen(opened, TIMINGS.listen)
     except SourceError as exc:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check address, port or device, and permissions"
@@ -65,7 +66,7 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         return
     if not senders:
         advice = "check that the vehicle sends to this host and port ('mavlink status' in PX4's shell), and firewalls"
-        yield Finding("mavlink", link, "wrong", f"no packet within {listen:g} s", advice)
+        yield Finding("mavlink", link, "wrong", f"no packet within {TIMINGS.listen:g} s", advice)
     elif not systems and not faults:
         seen = f"{senders.total()} packets from {list_names(sorted(senders))}, none of them MAVLink"
         advice = "check the baud rate, or use a port that no other program sends to"
@@ -76,11 +77,11 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         if system not in systems or not why_ignored(system, component)
     )
     yield from limit_findings(
-        _judge_system(f"{link} system {number}", link, system.counts, listen)
+        _judge_system(f"{link} system {number}", link, system.counts, TIMINGS.listen)
         for number, system in sorted(systems.items())
     )
     yield from limit_findings(
-        _judge_log(f"{link} system {number}", link, system, listen)
+        _judge_log(f"{link} system {number}", link, system, TIMINGS.listen)
         for number, system in sorted(systems.items())
         if system.is_px4
     )

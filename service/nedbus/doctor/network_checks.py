@@ -158,7 +158,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
 
 def _check_states(seen: Observation) -> Iterator[Finding]:
     """Yield the vehicles that services report with severity bad or watch."""
-    for name, report in sorted(by_vehicle(seen.accounts).items()):
+    for name, report in by_vehicle(seen.accounts).items():
         now, told = report.now, report.vehicles[name]
         if seen.vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
             continue

@@ -13,6 +13,7 @@ import zenoh
 from nedbus import clock
 from nedbus.client import ServiceStatus, SourceStatus, find_accounts, find_services
 from nedbus.events import AccountReport
+from nedbus.timings import TIMINGS
 from nedbus.transport import (
     PublisherToken,
     RawSample,
@@ -29,7 +30,6 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection
 
 T = TypeVar("T")
 
-_MIN_LISTEN: Final = 1.0  # s after all queries, to measure the delay of messages
 _POLL: Final = 0.02  # s; also the error of that delay
 _QUERY_TIMEOUT: Final = 1.0  # s
 _MAX_TIME: Final = 1e11  # s since the epoch accepted from a service
@@ -112,8 +112,8 @@ class Observation:
         """Addresses with at least one received message."""
         return {each.address for each in self.streams.values() if each.flows and each.address is not None}
 
-    def observe(self, session: Session, *, listen: float) -> None:
-        """Query and listen for little more than `listen` seconds."""
+    def observe(self, session: Session) -> None:
+        """Query, and listen for little more than 3 s."""
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
@@ -135,7 +135,7 @@ class Observation:
         self._add_messages(take_messages())
         for stream in self.streams.values():
             stream.delay = None  # these messages waited during the queries, and appear delayed
-        end = max(start + listen, time.monotonic() + _MIN_LISTEN)
+        end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)
             self._add_messages(take_messages())

@@ -11,14 +11,12 @@ from nedbus import clock
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
+from nedbus.timings import TIMINGS
 from nedbus.transport import Tls, check_pem, open_client, split_endpoint
 
 from .finding import Finding, State, brief, worst_state
 
 _CONNECT_TIMEOUT: Final = 2.0  # s
-_HANDSHAKE_TIMEOUT: Final = 1.5  # s
-_ALERT_TIMEOUT: Final = 0.5  # s for the TLS alert of a router that rejects our certificate; else it is silent
-_OPEN_TIMEOUT: Final = 1.5  # s
 _PEM_FILES: Final = {"tls_ca": "the authority is", "tls_certificate": "this client is", "tls_key": ""}
 _ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
     "CERTIFICATE_REQUIRED": "it requires a client certificate, and none is given",
@@ -44,7 +42,7 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
         if worst_state(findings) == "wrong":
             return
     try:
-        open_client([endpoint], timeout=_OPEN_TIMEOUT, tls=tls).close()
+        open_client([endpoint], timeout=TIMINGS.doctor_open, tls=tls).close()
     except NedbusError:
         if protocol == "tcp" and _read_certificate(host, port):
             seen, advice = "it speaks TLS", "use tls/ instead of tcp/, with --tls-ca and a client certificate if needed"
@@ -119,7 +117,7 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
 def _read_certificate(host: str, port: int) -> str:
     """Return the unverified certificate of a server in PEM; "" if it does not speak TLS."""
     with suppress(OSError):  # SSLError, too
-        return ssl.get_server_certificate((host, port), timeout=_HANDSHAKE_TIMEOUT)
+        return ssl.get_server_certificate((host, port), timeout=TIMINGS.handshake)
     return ""
 
 
@@ -131,10 +129,10 @@ def _shake_hands(host: str, port: int, tls: Tls) -> None:
         context.load_cert_chain(tls.certificate, tls.key)
     with (
         suppress(TimeoutError, ConnectionError),
-        socket.create_connection((host, port), timeout=_HANDSHAKE_TIMEOUT) as plain,
+        socket.create_connection((host, port), timeout=TIMINGS.handshake) as plain,
         context.wrap_socket(plain, server_hostname=host) as connection,
     ):
-        connection.settimeout(_ALERT_TIMEOUT)
+        connection.settimeout(TIMINGS.tls_alert)
         connection.recv(1)  # with TLS 1.3 the alert comes after the handshake
 
 

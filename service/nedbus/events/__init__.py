@@ -4,12 +4,12 @@ To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`).
 a detector, too, which yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
 """
 
-from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
+from .account import KEPT, MAX_VEHICLES, Account
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State
 from .faults import VALID, Expectation, faults_of
-from .kinds import KINDS, SEVERITIES, Kind, Severity
+from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of

@@ -9,6 +9,7 @@ from itertools import takewhile
 from typing import Final
 
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 
 from .detectors import Change, Finding
@@ -18,9 +19,6 @@ from .rules import MAX_SILENCE, PAUSE, RECENT
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
-
-FORGOTTEN: Final = 3600.0
-"""Seconds after which a vehicle that is gone, or has been silent, counts as switched off and is forgotten."""
 
 KEPT: Final = 2000
 """Maximum number of events in an account; beyond, the vehicle with the most events loses its oldest."""
@@ -124,7 +122,7 @@ class Account:
                 self._most_present = max(self._most_present, len(present))
                 gone = self._gone(time)
                 beyond = gone[: -max(MAX_GONE, self._most_present)]
-                for _, name in [each for each in gone if time - each[0] > FORGOTTEN] or beyond:
+                for _, name in [each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond:
                     self._forget(name)
             if self.overload is not None:
                 self._settled = time + MAX_SILENCE  # delayed messages need time to arrive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal
@@ -9,6 +10,7 @@ from typing import Annotated, Final, Literal
 from pydantic import Field
 
 from .kinds import KINDS, SEVERITIES, Severity, importance
+from .rules import LARGE_CORRECTION
 
 WINDOW: Final = 10.0
 """Seconds before an event in which other events count as evidence; the begin of an active condition always does."""
@@ -65,11 +67,6 @@ class Event:
         evidence = tuple(each.later(seconds) for each in self.evidence)
         return replace(self, time=max(0.0, self.time + seconds), evidence=evidence)
 
-    @property
-    def is_notable(self) -> bool:
-        """True if a story includes it: a begin or single event of severity bad or watch, or a change of mode."""
-        return self.change != "end" and (self.severity != "info" or self.kind == "mode")
-
 
 @dataclass(frozen=True, slots=True)
 class Condition:
@@ -101,19 +98,23 @@ class State:
     conditions: tuple[Condition, ...]
 
 
-def state_of(conditions: Iterable[Condition]) -> State:
-    """Return the state of a vehicle with these conditions and recent single events.
+def rank(condition: Condition, until: float | None, *, is_now: bool = True) -> tuple[int, bool, bool, int, float]:
+    """Return the sort key of conditions, the worst first; `until`: the end, None while it is active.
 
-    The first of them gives severity, text and begin: the worst, an active condition before a single event; of the
-    conditions the most important kind, of the single events the newest.
+    One of severity bad before one to watch, now an active one before one that has ended or a single event, then a large
+    correction of the estimate, then the more important kind, then the longest, or the single event of largest numbers.
     """
+    numbers = map(abs, condition.begin.numbers.values()) if condition.begin.change == "once" else ()
+    size = max(numbers, default=round((math.inf if until is None else until) - condition.since, 2))
+    has_ended = is_now and until is not None
+    is_large = KINDS[condition.kind].correction and size >= LARGE_CORRECTION
+    return SEVERITIES.index(condition.severity), has_ended, not is_large, importance(condition.kind), -size
 
-    def order(each: Condition) -> tuple[int, bool, float]:
-        is_single = each.begin.change == "once"
-        return SEVERITIES.index(each.severity), is_single, -each.since if is_single else importance(each.kind)
 
+def state_of(conditions: Iterable[Condition]) -> State:
+    """Return the state of a vehicle: that of the worst of these conditions and recent single events."""
     counting = (each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless)
-    ordered = sorted(counting, key=order)
+    ordered = sorted(counting, key=lambda each: rank(each, each.since if each.begin.change == "once" else None))
     if not ordered:
         return State("info", "ok", None, ())
     first = ordered[0]

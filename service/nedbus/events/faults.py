@@ -35,11 +35,11 @@ def faults_of(reports: Sequence[AccountReport], expected: Expectation, *, only: 
     vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
     missing = [name for name in expected.expect if name not in vehicles]
     faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
-    flying = sorted(name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent)
+    flying = [name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent]
     if len(flying) < (expected.vehicles or 0):
         names = f": {', '.join(flying[:20])}" if flying else ""
         faults.append(f"{len(flying)} of {expected.vehicles} vehicles are heard{names}")
-    for name, (now, vehicle) in sorted(vehicles.items()):
+    for name, (now, vehicle) in vehicles.items():
         if not expected.expect or name in expected.expect:
             faults += [f"vehicle {name}: {fault}" for fault in _faults_of_vehicle(name, vehicle, now, expected)]
     return list(dict.fromkeys([*faults, *_recent_faults(checked, expected)]))

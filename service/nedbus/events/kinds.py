@@ -1,5 +1,6 @@
 """The table of all kinds of events: where they come from, how bad they are, and what may explain them."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
@@ -91,10 +92,6 @@ _ROWS: Final = (
     Kind("silent", "bad", causes=("link_down", "battery", "overload"), fault=True, kept_on_reboot=True),
     Kind("link_down", "bad"),
     Kind("reboot", "bad", causes=("duplicate", "battery", "gone", "silent"), fault=True, phase=True),
-    Kind(
-        "failsafe", "bad", "VehicleStatus", ("text", *_INVALID, *_SENSING, "failsafe_flag", "gcs_lost", "battery"),
-        fault=True, flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe ends",
-    ),
     _validity("xy_invalid", "xy_valid", "xy", "dead_reckoning"),
     _validity("z_invalid", "z_valid", "z"),
     _validity("v_xy_invalid", "v_xy_valid", "vxy", "dead_reckoning"),
@@ -102,6 +99,10 @@ _ROWS: Final = (
     *(
         Kind(name, "bad", _ESTIMATE, ("text", *_SENSING, "dead_reckoning", "reset", "jump"), "info", fault=True)
         for name in _CONTRADICTED
+    ),
+    Kind(
+        "failsafe", "bad", "VehicleStatus", ("text", *_INVALID, *_SENSING, "failsafe_flag", "gcs_lost", "battery"),
+        fault=True, flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe ends",
     ),
     Kind("battery", "bad", "BatteryStatus", ("text",), fault=True),
     Kind(
@@ -185,6 +186,11 @@ KINDS: Final = _Kinds({kind.name: kind for kind in _ROWS})
 def importance(kind: str) -> int:
     """Return the place of a kind in KINDS."""
     return [*KINDS, kind].index(kind)
+
+
+def rank_vehicle(name: str, severity: Severity) -> tuple[int, str]:
+    """Return the sort key of vehicles: the worst first, then in natural order (2 before 10)."""
+    return SEVERITIES.index(severity), re.sub(r"\d+", lambda found: found[0].zfill(20), name)
 
 
 def flagged(message: str) -> list[Kind]:

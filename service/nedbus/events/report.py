@@ -8,11 +8,12 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
+from nedbus.timings import TIMINGS
 from nedbus_msgs import check_vehicle
 
-from .account import FORGOTTEN, KEPT, MAX_VEHICLES, Account
+from .account import KEPT, MAX_VEHICLES, Account
 from .event import Condition, Event, Seconds
-from .kinds import KINDS
+from .kinds import KINDS, rank_vehicle
 
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
@@ -46,8 +47,8 @@ class VehicleReport:
         return "silent" in self.kinds or "gone" in self.kinds
 
     def is_forgotten(self, now: float) -> bool:
-        """Return True if the vehicle has been silent for FORGOTTEN seconds."""
-        return self.is_silent and self.since is not None and now - self.since >= FORGOTTEN
+        """Return True if the vehicle has been silent for an hour."""
+        return self.is_silent and self.since is not None and now - self.since >= TIMINGS.forgotten
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,13 +106,13 @@ def joined(parts: Sequence[AccountReport]) -> AccountReport:
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
-    """Return a report for each vehicle, preferably from a service that hears the vehicle."""
+    """Return a report for each vehicle, the worst first, preferably from a service that hears the vehicle."""
     found: dict[str, AccountReport] = {}
     for report in reports:
         for name in report.vehicles:
             if name not in found or found[name].vehicles[name].is_silent:
                 found[name] = report
-    return found
+    return dict(sorted(found.items(), key=lambda each: rank_vehicle(each[0], each[1].vehicles[each[0]].severity)))
 
 
 def from_json(content: object) -> AccountReport | None:

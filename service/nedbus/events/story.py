@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from .event import WINDOW, Condition, Event, State, explain, state_of
-from .kinds import KINDS
+from .kinds import KINDS, importance
 from .rules import RECENT
 from .times import Times
 
@@ -164,7 +164,8 @@ def _make_story(
     if not before and not span.initial:
         before = unused(e for e in near if e.change != "end" and not (KINDS[e.kind].phase and e.severity == "info"))
     after = unused(explain(end, events)) if end else []
-    notable = [each for each in events if each not in used and each.is_notable]
+    begun = (each for each in events if each.change != "end" and (each.severity != "info" or each.kind == "mode"))
+    notable = [each for each in begun if each not in used]
     stop = math.inf if until is None else until
     after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
     lacking: list[str] = []
@@ -188,11 +189,13 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _is_part(story: Story, of: Story) -> bool:
-    """Return True if a story is part of another; a fault of the estimate that outlasts it is not."""
-    if not of.is_bad or story.spans[0].begin not in (*of.meanwhile, *of.after):
+    """Return True if a story is part of another, and neither more important nor a lasting one that outlasts it."""
+    begin, kind = story.spans[0].begin, story.spans[0].kind
+    if not of.is_bad or begin not in (*of.before, *of.meanwhile, *of.after):
         return False
-    outlasts = of.until is not None and (story.until is None or story.until > of.until + TOGETHER)
-    return not (outlasts and story.is_bad and KINDS[story.spans[0].kind].message == "VehicleLocalPosition")
+    is_estimate = KINDS[kind].message == "VehicleLocalPosition"
+    outlasts = of.until is not None and (story.until is None or (is_estimate and story.until > of.until + TOGETHER))
+    return not (story.is_bad and (outlasts or importance(kind) < importance(of.spans[0].kind)))
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:

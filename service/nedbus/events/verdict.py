@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
 
-from .event import ALL, WINDOW, Condition, Event
-from .kinds import KINDS, importance
-from .rules import LARGE_CORRECTION, POSITIONS
+from .event import ALL, WINDOW, Condition, Event, rank
+from .kinds import KINDS
+from .rules import POSITIONS
 from .story import TOGETHER, Story, stories_of
 from .times import Times
 
@@ -54,19 +54,12 @@ def verdict_of(
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     stories = stories_of(events, held, topics=topics, at=at)
-    parts = {event for story in stories if story.is_bad for event in story.meanwhile}
-    is_now = times.is_live and at is None
-
-    def order(story: Story) -> tuple[bool, bool, bool, bool, int, float]:
-        kind, has_ended = story.spans[0].kind, is_now and story.until is not None
-        is_large = KINDS[kind].correction and _size(story) >= LARGE_CORRECTION
-        return not story.is_bad, story.begin in parts, has_ended, not is_large, importance(kind), -_size(story)
-
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
         length = "the history of the services" if times.is_live else f"{end:.0f} s"
         return Verdict(f"no faults in {length}{'' if known else '; the data has no validity of a position'}", known)
-    worst = min(stories, key=order)
+    ranked = sorted(stories, key=lambda story: rank(story.spans[0], story.until, is_now=times.is_live and at is None))
+    worst = ranked[0]
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and is_then else known
     of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
@@ -77,7 +70,7 @@ def verdict_of(
     room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # the rest for others
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
     also = ""
-    for part in _also(worst, cause, stories, times):
+    for part in _also(ranked, cause, times):
         longer = f"{also}; {part}" if also else f" Also {part}"
         also = longer if len(textwrap.wrap(f"{text}{longer}.", _WIDTH)) < 4 else also
     text += f"{also}." * bool(also)
@@ -119,14 +112,13 @@ def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[
     return [*([f"No evidence in the {WINDOW:.0f} s before"] if story.begin and not cause else []), *missing]
 
 
-def _also(worst: Story, cause: Iterable[Event], stories: Sequence[Story], times: Times) -> list[str]:
-    """Return the largest other fault of each kind, those near in time first."""
-    told = {worst.begin, *cause}
-    by_size = sorted(stories, key=lambda each: (_size(each), -each.since))
-    largest = {each.spans[0].kind: each for each in by_size}.values()
+def _also(ranked: Sequence[Story], cause: Iterable[Event], times: Times) -> list[str]:
+    """Return the worst other fault of each kind, those near in time first."""
+    told = {ranked[0].begin, *cause}
+    largest = {each.spans[0].kind: each for each in reversed(ranked)}.values()
     return [
-        f"{times.text(each.begin)} {_cut(each.what, 60)}{_count(each, stories)}"
-        for each in sorted(largest, key=lambda each: abs(each.since - worst.since))
+        f"{times.text(each.begin)} {_cut(each.what, 60)}{_count(each, ranked)}"
+        for each in sorted(largest, key=lambda each: abs(each.since - ranked[0].since))
         if each.begin is not None and each.begin not in told
     ]
 
@@ -135,12 +127,6 @@ def _count(story: Story, stories: Iterable[Story]) -> str:
     """Return the number of faults of the kind of a story, "" if it is the only one."""
     number = sum(each.spans[0].kind == story.spans[0].kind for each in stories)
     return f" (one of {number})" if number > 1 else ""
-
-
-def _size(story: Story) -> float:
-    """Return the duration of a condition, the largest number of a single event."""
-    numbers = map(abs, story.begin.numbers.values()) if story.begin and story.until == story.since else ()
-    return round(max(numbers, default=(story.until or math.inf) - story.since), 2)
 
 
 def _cut(text: str, width: int = 80) -> str:

@@ -18,6 +18,7 @@ from nedbus import clock
 from nedbus.client import Bus, LogStreamStatus, Sample, find_services
 from nedbus.errors import NedbusError
 from nedbus.events import report_of
+from nedbus.timings import TIMINGS
 from nedbus.transport import RouterState, Session, ask_routers
 from nedbus_msgs import Address, Selection
 
@@ -35,10 +36,7 @@ from .pages import vehicles_page
 
 _POLL_INTERVAL: Final = 0.5  # s between polls of all vehicles
 _MAX_ROUTERS: Final = 16  # routers exported; any peer may claim to be one
-_ROUTERS_INTERVAL: Final = 30.0  # s between router queries; a reply has 183 bytes per session
 _SERVICES_INTERVAL: Final = 5.0  # s between queries of services, while messages from MAVLink arrive
-_ROUTERS_TIMEOUT: Final = 5.0  # s for all replies; the link may be slow
-_SESSION_TIMEOUT: Final = 1.0  # s to open the session for router queries
 
 
 class Exporter:
@@ -140,14 +138,14 @@ class Exporter:
             if time.monotonic() >= due:
                 states: list[RouterState] = []
                 with suppress(NedbusError):  # the router is full or the link is down: export no counts
-                    self._session = self._session or self._bus.open_session(timeout=_SESSION_TIMEOUT)
+                    self._session = self._session or self._bus.open_session(timeout=TIMINGS.routers_session)
                     if not stop.is_set():
-                        states = ask_routers(self._session, timeout=_ROUTERS_TIMEOUT)
+                        states = ask_routers(self._session, timeout=TIMINGS.routers_timeout)
                 self._routers = states[:_MAX_ROUTERS]
-                due = time.monotonic() + _ROUTERS_INTERVAL
+                due = time.monotonic() + TIMINGS.routers_interval
             elif self._session is not None and any(each.startswith("mavlink") for each in [*self._sources.values()]):
                 with suppress(NedbusError):
-                    services = find_services(self._session, prefix=self._bus.prefix, timeout=_ROUTERS_TIMEOUT)
+                    services = find_services(self._session, prefix=self._bus.prefix, timeout=TIMINGS.routers_timeout)
                     logs = (log for each in services for source in each.sources for log in source.log_streams)
                     self.log_streams = {log.vehicle: log for log in logs}
         if self._session is not None:

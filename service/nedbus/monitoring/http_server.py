@@ -17,11 +17,11 @@ from typing import Any, Final, NamedTuple
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
+from nedbus.timings import TIMINGS
 
 _log = logging.getLogger(__name__)
 
 _MAX_REQUESTS: Final = 16  # concurrent requests
-_CLIENT_TIMEOUT: Final = 5.0  # s to send a request, to read the response, and to wait for a free thread
 _ACCEPT_PAUSE: Final = 0.2  # s
 _ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # Prometheus and probes may use any host name
 
@@ -95,7 +95,7 @@ class HttpServer(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a client in its own thread; wait up to 5 s for a free one, then disconnect the client."""
-        if self._free.acquire(timeout=_CLIENT_TIMEOUT):
+        if self._free.acquire(timeout=TIMINGS.http_client):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
@@ -114,13 +114,13 @@ class HttpServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: HttpServer
-    timeout = _CLIENT_TIMEOUT  # for each receive, and for the whole response
     server_version = "nedbus"
     sys_version = ""
 
     def handle(self) -> None:
         """Handle one request; stop receiving after the timeout, in case the client sends it byte by byte."""
-        deadline = threading.Timer(self.timeout, self._stop_receiving)
+        self.connection.settimeout(TIMINGS.http_client)
+        deadline = threading.Timer(TIMINGS.http_client, self._stop_receiving)
         deadline.start()
         try:
             super().handle()

@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from nedbus import clock
 from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
-from nedbus.events import FORGOTTEN, RECENT, Account
+from nedbus.events import RECENT, Account
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Selection
 
 _MAX_WAITING: Final = 200  # queued messages that do not yet count as falling behind, at any rate
@@ -93,7 +94,7 @@ class Observer:
         if settled:
             silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
             for age, address in silent:
-                if age > FORGOTTEN or (age > RECENT and address.vehicle not in self.account.vehicles):
+                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.account.vehicles):
                     del healths[address]
                     with self._lock:
                         self.monitor.forget(address)

@@ -21,7 +21,6 @@ from .router import open_router, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals
 from .router_state import RouterState, ask_routers
 from .session import (
-    LEASE,
     MAX_REPLY_BYTES,
     RawSample,
     Session,

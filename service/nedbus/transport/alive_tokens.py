@@ -10,6 +10,7 @@ from typing import Final
 import zenoh
 
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 
 from .queries import MAX_ANSWER_BYTES, MAX_ANSWERS, Answers, wait_for_answers, zenoh_timeout
 from .session import Session, while_open
@@ -20,7 +21,6 @@ _MAX_WAITING: Final = 131_072  # answers; large, as Zenoh would hold its session
 _MAX_CHANGES: Final = 16_384  # waiting changes, more than the tokens that are kept
 _MAX_KEY_LENGTH: Final = MAX_ANSWER_BYTES // MAX_ANSWERS
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before it is probed again
-_RETRY_PAUSE: Final = 10.0  # s before tokens beyond the limit are listed again, once there is room
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
@@ -101,7 +101,7 @@ class AliveTokens:
             if self._retry == math.inf:
                 text = "%s: more than %d liveliness tokens: some vehicles are missing"
                 _log.warning(text, self._key_expr, MAX_ANSWERS, extra=about("incomplete"))
-            self._retry = time.monotonic() + _RETRY_PAUSE
+            self._retry = time.monotonic() + TIMINGS.tokens_retry
             return False
         (self._keys.add if alive else self._keys.remove)(key)
         return True

@@ -14,6 +14,7 @@ import zenoh
 
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .session import COMMON_SETTINGS, Session, draw_retry, error_reason, insert_settings, open_session
@@ -23,7 +24,6 @@ _log = logging.getLogger(__name__)
 
 # Longer than the lease of clients: a router drops a silent client before that client joins another router. If two
 # routers have the same client for a moment, Zenoh 1.10.2 loses its queryables on a third router that joins later.
-_LEASE: Final = 8.0  # s
 _OTHER_FILES: Final = 100  # open files besides sessions: 21 of a router, and the sources and HTTP clients of a service
 
 
@@ -52,7 +52,7 @@ def open_router(
         settings = {
             **COMMON_SETTINGS,
             "mode": "router",
-            "transport/link/tx/lease": round(1000 * _LEASE),
+            "transport/link/tx/lease": round(1000 * TIMINGS.router_lease),
             "scouting/delay": 0,  # scouting is off, so do not wait 0.5 s for answers
             "listen/endpoints": list(router_endpoints(listen)),
             "connect/endpoints": list(connect),

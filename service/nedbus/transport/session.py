@@ -16,6 +16,7 @@ from typing import Final
 import zenoh
 
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
+from nedbus.timings import TIMINGS
 
 from .endpoints import check_endpoints, explain_endpoints
 from .tls import Tls
@@ -23,9 +24,6 @@ from .tls import Tls
 Session = zenoh.Session
 RawSample = zenoh.Sample
 SourceInfo = zenoh.SourceInfo
-
-LEASE: Final = 5.0
-"""Seconds of silence after which a link is closed, as with a frozen host or a cut cable."""
 
 # Shared memory limits a router to 351 fewer sessions, and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
@@ -36,7 +34,6 @@ COMMON_SETTINGS: Final = {
     "scouting/gossip/enabled": False,
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
-    "transport/link/tx/lease": round(1000 * LEASE),
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
 }
@@ -92,6 +89,7 @@ def open_client(
         **COMMON_SETTINGS,
         **({"transport/link/tls": tls.zenoh_settings()} if tls is not None else {}),
         "mode": "client",
+        "transport/link/tx/lease": round(1000 * TIMINGS.lease),
         "connect/endpoints": list(endpoints),
         "connect/timeout_ms": 0,
         "connect/retry": draw_retry(),

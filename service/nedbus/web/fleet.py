@@ -19,13 +19,11 @@ from nedbus.client import (
     health_of_last,
     stream_state,
 )
-from nedbus.events import FIXES, MODES, State
+from nedbus.events import FIXES, MODES, State, rank_vehicle
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.messages import VehicleStatus
 
 from .stream import LONG, Origin, PageStream, is_position
-
-GRADES: Final = ("bad", "watch", "ok")
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
@@ -35,7 +33,6 @@ _SILENT: Final = 60.0  # s without a message after which a stream makes room for
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _OK: Final = State("info", "ok", None, ())
-_DIGITS: Final = re.compile(r"\d+")
 _DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its details
 
 
@@ -206,8 +203,7 @@ class Fleet:
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
         rows = [self._row(name, each, states.get(name, _OK), logs.get(name)) for name, each in lines.items()]
-        order = {row.vehicle: _DIGITS.sub(lambda found: found[0].zfill(20), row.vehicle) for row in rows}  # 2 before 10
-        rows.sort(key=lambda row: (GRADES.index(row.grade), order[row.vehicle]))
+        rows.sort(key=lambda row: rank_vehicle(row.vehicle, row.state.severity))
         rejected = self._rejected.total()
         self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture

@@ -31,6 +31,7 @@ from nedbus.events import ALL, Times
 from nedbus.log_event import about
 from nedbus.monitoring import Exporter, Page, Snapshot, leads_here
 from nedbus.settings import is_loopback
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection
 
 from .background import Background
@@ -50,7 +51,6 @@ _MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers 
 _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
 _MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, of which all but the newest are about to expire
 _MAX_CONNECTIONS: Final = 512  # or half of the open files that the process may have
-_REQUEST_TIMEOUT: Final = 10.0  # s for a client to send a request, and between two requests
 _PING: Final = 15.0  # s between pings of a WebSocket, which is closed unless the answer arrives before the next one
 _UNUSED_LIFETIME: Final = 15_000  # ms; a page is kept this long without its browser, for example during a short sleep
 
@@ -180,7 +180,7 @@ class WebServer:
         )  # fmt: skip
         http = _HttpServer(
             tornado, max_body_size=_MAX_BODY_BYTES, max_buffer_size=2 * _MAX_MESSAGE_BYTES,
-            idle_connection_timeout=_REQUEST_TIMEOUT, body_timeout=_REQUEST_TIMEOUT,
+            idle_connection_timeout=TIMINGS.page_request, body_timeout=TIMINGS.page_request,
         )  # fmt: skip
         self._loop.add_callback(http.add_sockets, sockets)
         self._server = BaseServer(self._loop, tornado, http)

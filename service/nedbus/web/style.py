@@ -16,7 +16,7 @@ from bokeh.themes import Theme
 from nedbus.client import to_age
 
 from .chronicle import Chronicle
-from .fleet import GRADES, MAX_STREAMS
+from .fleet import MAX_STREAMS
 from .stream import is_position
 
 SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "info": "●"}
@@ -79,7 +79,7 @@ def _panels() -> jinja2.Template:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=to_age, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)
-    environment.globals.update(GRADES=GRADES, MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, hypot=math.hypot)
+    environment.globals.update(MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, hypot=math.hypot)
     return environment.from_string(re.sub(r"(?<=[>}])\n\s*(?=[<{])", "", read_asset("panels.html")))
 
 

@@ -11,8 +11,9 @@ from typing import Final, NamedTuple, Protocol
 from unittest import mock
 
 from nedbus import Counts, Mode
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, pending_queue, writer_proxy
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, pending_queue
 from nedbus.client.receiving.writer_proxy import WriterProxy
+from nedbus.timings import TIMINGS
 from nedbus.transport import RawSample
 
 from .raw_samples import INVALID, name_of, raw
@@ -69,7 +70,7 @@ class QueueAccount(PendingQueue):
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # steps take no time
         self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
-        self._patience = mock.patch.object(writer_proxy, "RETRANSMIT_TIMEOUT", 1e6)
+        self._patience = mock.patch.object(TIMINGS, "retransmit_timeout", 1e6)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         with self._capacity:

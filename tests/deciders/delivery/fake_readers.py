@@ -18,7 +18,7 @@ from nedbus.client.protocol import CLOSED
 from nedbus.client.publishing import flow_control as module
 from nedbus.client.publishing.flow_control import FlowControl, SharedWindow
 from nedbus.client.publishing.writer import Writer
-from nedbus.transport import LEASE
+from nedbus.timings import TIMINGS
 
 from .raw_samples import Payload
 
@@ -33,7 +33,7 @@ class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
 
 @dataclass(eq=False)
 class Reader:
-    """A reader of `rate` messages per second; its lease expires LEASE seconds after it is suspended."""
+    """A reader of `rate` messages per second; its lease expires 5 s after it is suspended."""
 
     name: str
     rate: float = math.inf
@@ -44,7 +44,7 @@ class Reader:
     stops_in_answer: bool = False  # between its next answer, and the word that this was all
 
     def is_linked(self, now: float) -> bool:
-        return self.alive and (self.stopped is None or now - self.stopped < LEASE)
+        return self.alive and (self.stopped is None or now - self.stopped < TIMINGS.lease)
 
     def is_running(self) -> bool:
         return self.alive and self.stopped is None
@@ -86,7 +86,7 @@ class World:
 
     def flow_control(self, monkeypatch: pytest.MonkeyPatch, *, needs_router: bool = True) -> FlowControl:
         """Return a flow control in this world."""
-        monkeypatch.setattr(module, "_POLLS", (0.0005, _TICK))
+        monkeypatch.setattr(TIMINGS, "credit_polls", (0.0005, _TICK))
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
         return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)

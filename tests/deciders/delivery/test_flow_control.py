@@ -12,7 +12,7 @@ from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, Sh
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
-from nedbus.transport import LEASE
+from nedbus.timings import TIMINGS
 
 from .fake_readers import END, Reader, Stuck, World
 
@@ -172,8 +172,8 @@ def test_reader_that_comes_back_in_time_has_missed_nothing(  # noqa: PLR0917 - a
     [
         (World.cut, 0.1003, 5.0),
         (World.restart_router, 0.1003, 1.0 + 5.0),
-        (World.stop, 0.1003, LEASE + 90.0),
-        (World.stop, 0.0, LEASE + 90.0),
+        (World.stop, 0.1003, TIMINGS.lease + 90.0),
+        (World.stop, 0.0, TIMINGS.lease + 90.0),
     ],
 )
 def test_reader_that_does_not_come_back_is_given_up(
@@ -225,9 +225,9 @@ def test_reader_that_is_stopped_as_it_answers_is_known(
     """The publisher waits for no unknown reader after it returns: it had replied to the request that it delayed."""
     reader = Reader("back", stops_in_answer=True)
     world.readers += [reader, *map(Reader, others)]
-    world.plan(LEASE + back, lambda: setattr(reader, "stopped", None))
-    assert WINDOW / 2 < lead_over(world, control, reader, LEASE + back - 0.01) < LIMIT
-    assert world.now < LEASE + back + 20_000 / 10_000.0
+    world.plan(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
+    assert WINDOW / 2 < lead_over(world, control, reader, TIMINGS.lease + back - 0.01) < LIMIT
+    assert world.now < TIMINGS.lease + back + 20_000 / 10_000.0
 
 
 def test_reader_that_ended_beside_a_stuck_one_is_given_up_after_5_seconds(world: World, control: FlowControl) -> None:

@@ -23,6 +23,7 @@ from nedbus.client.receiving.decoder import KeyState
 from nedbus.client.receiving.layout_lookup import Schemas, Wanted
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.writer_proxy import WriterProxy
+from nedbus.timings import Timings
 from nedbus.transport import RawSample
 from nedbus_msgs import DEFAULT, codec_of
 from nedbus_msgs.messages import VehicleAttitude
@@ -510,9 +511,9 @@ def test_batch_goes_past_what_is_invalid() -> None:
         assert pending_queue.counts == Counts(received=1, invalid=1)
 
 
-def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrivals_do_not_wait_for_a_batch_that_asks(timings: Timings) -> None:
     """While a batch waits for the description of a message, arriving samples are queued at once."""
-    monkeypatch.setattr(layout_lookup, "_PATIENCE", DEADLINE)
+    timings.definition_timeout = DEADLINE
     asked, answered = threading.Event(), threading.Event()
 
     def find(_: Collection[Wanted]) -> Schemas:

@@ -12,11 +12,11 @@ from nedbus import Bus, Counts, Sample, Selection
 from nedbus.client import PublisherRegistry
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import FORGOTTEN
 from nedbus.events.account import MAX_GONE
 from nedbus.monitoring import Observer
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
+from nedbus.timings import TIMINGS
 from nedbus.web.fleet import Fleet
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VALID, VLP, message
@@ -91,7 +91,7 @@ def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.Monk
     most = AT_A_TIME + MAX_GONE + 31
     assert all(number <= most for name, number in sizes[-1].items() if name != "counts")
     assert sizes[-1]["counts"] <= 3 * most
-    world.now += FORGOTTEN
+    world.now += TIMINGS.forgotten
     for _ in range(10):  # after the pause the reader counts as overloaded
         world.now += 1.0
         world.hear(there[-1])
@@ -107,7 +107,7 @@ def test_stream_of_a_vehicle_that_is_there_is_forgotten_after_an_hour(monkeypatc
         world.hear(position)
         world.hear(attitude)
         world.look(position, attitude)
-    for seconds, known in ((FORGOTTEN - 9, {position, attitude}), (10, {position})):
+    for seconds, known in ((TIMINGS.forgotten - 9, {position, attitude}), (10, {position})):
         world.now += seconds
         world.hear(position)
         world.look(position)

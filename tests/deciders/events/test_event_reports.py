@@ -14,19 +14,23 @@ from hypothesis import given
 from nedbus.client import ServiceStatus, SourceStatus, StreamHealth, StreamStatus, reply_parts
 from nedbus.events import (
     ALL,
-    FORGOTTEN,
     KEPT,
     MAX_VEHICLES,
     AccountReport,
     Event,
     Expectation,
+    Severity,
     VehicleReport,
+    by_vehicle,
     faults_of,
     from_json,
     joined,
+    rank_vehicle,
     report_of,
     stories_of,
 )
+from nedbus.monitoring.pages import vehicles_page
+from nedbus.timings import TIMINGS
 from nedbus.transport import MAX_REPLY_BYTES
 from tests.flights.messages import VLP
 
@@ -182,6 +186,18 @@ def test_any_answer_is_a_report_or_none(name: str, value: object) -> None:
         assert isinstance(stories_of(read.events), list)
 
 
+def test_lists_of_vehicles_begin_with_the_worst() -> None:
+    """Vehicles of a report are listed by their state, then in natural order, as on the page."""
+    known: dict[str, Severity] = {"uav-10": "info", "uav-2": "info", "3": "watch", "b": "bad", "a": "bad"}
+    vehicles = {name: VehicleReport(severity, f"is {severity}") for name, severity in known.items()}
+    given = AccountReport("s", "h", 1.0, vehicles)
+    order = sorted(known, key=lambda name: rank_vehicle(name, known[name]))
+    assert list(by_vehicle([given])) == order == ["a", "b", "3", "uav-2", "uav-10"]
+    assert faults_of([given], Expectation(well=True)) == ["vehicle a: is bad", "vehicle b: is bad"]
+    page = vehicles_page(replace(given, vehicles={name: vehicles[name] for name in known if known[name] != "bad"}))
+    assert page.content.decode().splitlines() == ["3 is watch", "uav-2 is info", "uav-10 is info"]
+
+
 def test_well_vehicle_has_no_fault() -> None:
     """A vehicle that is heard has no fault without further criteria."""
     assert faults_of([report(flying())], NOTHING) == []
@@ -196,7 +212,7 @@ def test_silent_vehicle_is_a_fault() -> None:
     flight.wait(10.0).look("stale")
     line = "vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (10.0 s)"
     assert faults_of([report(flight)], NOTHING) == [line]
-    flight.wait(FORGOTTEN - 11).look("stale")
+    flight.wait(TIMINGS.forgotten - 11).look("stale")
     assert len(faults_of([report(flight)], NOTHING)) == 1
     flight.wait(2).look("stale")
     assert faults_of([report(flight)], NOTHING) == []

@@ -13,7 +13,6 @@ from hypothesis import example, given
 
 from nedbus.events import (
     ALL,
-    FORGOTTEN,
     KEPT,
     KINDS,
     MAX_VEHICLES,
@@ -28,6 +27,7 @@ from nedbus.events import (
 )
 from nedbus.events.account import MAX_GONE
 from nedbus.events.rules import FLAPPING_CHANGES, PAUSE
+from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, message
 
@@ -671,13 +671,13 @@ def test_vehicle_that_is_gone_is_forgotten() -> None:
         flight.send(vehicle=vehicle)
         flight.send(vehicle=vehicle, xy_valid=False)
     account, start = flight.account, flight.now
-    assert look(account, start + FORGOTTEN, "here") == {"here", "gone"}
-    assert look(account, start + FORGOTTEN + 1, link="no link") == {"here", "gone"}
-    assert look(account, start + 2 * FORGOTTEN, "here") == {"here", "gone"}
-    assert look(account, start + 2 * FORGOTTEN + 2, "here") == {"here"}
+    assert look(account, start + TIMINGS.forgotten, "here") == {"here", "gone"}
+    assert look(account, start + TIMINGS.forgotten + 1, link="no link") == {"here", "gone"}
+    assert look(account, start + 2 * TIMINGS.forgotten, "here") == {"here", "gone"}
+    assert look(account, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
     assert {name for name, _ in account.counts} == {ALL, "here"}
     assert [each.vehicle for each in account.events if each.kind == "xy_invalid"] == ["here", "gone"]
-    account.update(start + 9 * FORGOTTEN, {})  # of a file
+    account.update(start + 9 * TIMINGS.forgotten, {})  # of a file
     assert set(account.vehicles) == {"here"}
 
 
@@ -697,8 +697,8 @@ def test_fleet_that_drops_at_once_is_remembered() -> None:
     for vehicle in fleet:
         flight.send(vehicle=vehicle)
     assert look(flight.account, flight.now, *fleet) == set(fleet)
-    assert look(flight.account, flight.now + FORGOTTEN - 1) == set(fleet)
-    assert look(flight.account, flight.now + FORGOTTEN + 1) == set()
+    assert look(flight.account, flight.now + TIMINGS.forgotten - 1) == set(fleet)
+    assert look(flight.account, flight.now + TIMINGS.forgotten + 1) == set()
 
 
 def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
@@ -742,11 +742,11 @@ def test_kind_of_a_newer_service_is_an_event() -> None:
 
 
 def test_state_is_the_current_one(flight: Flight) -> None:
-    """An active condition counts before single events of the last minute, and of those the newest."""
+    """An active condition counts before single events of the last minute, and of those the largest."""
     flight.send()
     flight.wait(1.0).send(xy_reset_counter=1, delta_xy=(20.0, 0.0), x=20.0)
     flight.wait(1.0).send(xy_reset_counter=2, delta_xy=(3.0, 0.0), x=23.0)
-    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 3.0 m")
+    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 20.0 m")
     flight.wait(1.0).send(xy_reset_counter=2, x=23.0, dead_reckoning=True)
     assert flight.account.state("1", flight.now).text == "dead reckoning"
 

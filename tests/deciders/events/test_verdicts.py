@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import textwrap
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
+
+import pytest
 
 from nedbus.events import ALL, Condition, Event, Times, Verdict, from_json, report_of, verdict_of
 from nedbus.events.detectors import Finding
@@ -170,6 +173,29 @@ def test_verdict_of_what_holds_from_begin_to_end() -> None:
     assert found.text.startswith("not usable: xy not valid from the first message on, until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
     assert (found.usable, len(found.stories)) == (False, 1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "cause"),
+    [
+        ([lambda f: f.send(xy_valid=False), lambda f: f.status(ARMED, failsafe=True)], "xy not valid"),
+        (
+            [lambda f: f.send(xy_valid=False), lambda f: f.status(ARMED, failsafe=True), lambda f: f.send()],
+            "failsafe",
+        ),
+        ([lambda f: f.send(xy_valid=False), lambda f: f.look("gone")], "gone: no publisher of "),
+        ([lambda f: f.look("gone"), lambda f: f.look("ok"), lambda f: f.send(z_valid=False)], "z not valid"),
+        ([lambda f: f.send(dead_reckoning=True), lambda f: f.battery(2)], "battery "),
+    ],
+)  # fmt: skip
+def test_state_and_verdict_name_the_same_cause(steps: list[Callable[[Flight], object]], cause: str) -> None:
+    """An invalid position is the cause of the failsafe while it lasts, a vehicle that is gone worse than both."""
+    flight = Flight()
+    flight.send()
+    for step in steps:
+        step(flight.wait(1.0))
+    assert flight.account.state("1", flight.now).text.startswith(cause)
+    assert verdict(flight, times=LIVE).text.removeprefix("not usable: ").startswith(cause)
 
 
 def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:

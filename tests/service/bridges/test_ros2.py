@@ -20,6 +20,7 @@ import zenoh
 import nedbus
 from nedbus.bridges import Ros2Bridge
 from nedbus.errors import NedbusError
+from nedbus.timings import Timings
 from nedbus.transport import Attachment, Session, TopicKey, gid_of_token, open_client, open_router, publisher_token
 from nedbus_msgs import (
     ANY,
@@ -63,10 +64,10 @@ def definition(layout: str) -> str:
 
 
 @pytest.fixture
-def run_bridge(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Iterator[RunBridge]:
+def run_bridge(endpoint: str, timings: Timings, caplog: pytest.LogCaptureFixture) -> Iterator[RunBridge]:
     """Run a bridge in a thread, which looks for changes twenty times a second, and on a bus of its own."""
     caplog.set_level("INFO")
-    monkeypatch.setattr("nedbus.bridges.ros2._POLL", 0.05)
+    timings.bridge_poll = 0.05
     stop = threading.Event()
     with ExitStack() as closing, ThreadPoolExecutor() as threads:
 
@@ -243,10 +244,10 @@ def test_last_value_does_not_reach_ros_2(
 
 
 def test_vehicle_that_is_back_brings_nothing_late(
-    run_bridge: RunBridge, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    run_bridge: RunBridge, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """After a router's restart a vehicle may be gone for a moment: what is recovered then is no current estimate."""
-    monkeypatch.setattr("nedbus.bridges.late_filter.MAX_LATENESS", 10**8)
+    timings.lateness = 0.1
     address = Address("1", VLP)
     subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
 
@@ -336,11 +337,11 @@ def test_topic_of_another_node_is_left_to_it(
     run_bridge: RunBridge,
     bus: nedbus.Bus,
     raw: Session,
-    monkeypatch: pytest.MonkeyPatch,
+    timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A topic that a PX4 publishes itself is not published twice; the same one in another layout is a translation."""
-    monkeypatch.setattr("nedbus.bridges.ros2_arbiter.TAKE_OVER_DELAY", 0.1)
+    timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
@@ -406,9 +407,9 @@ def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.B
     assert bridge.wait() == 0
 
 
-def test_router_that_hides_ros_2_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_router_that_hides_ros_2_is_named(timings: Timings, tmp_path: Path) -> None:
     """A router whose access control has no rule for ROS 2 denies in silence: the bridge finds out, and ends."""
-    monkeypatch.setattr("nedbus.bridges.ros2._VISIBLE_TIMEOUT", 0.2)
+    timings.token_visible = 0.2
     endpoint, file = free_endpoint(), tmp_path / "router.json5"
     rules = [{"id": "no", "permission": "deny", "messages": ["liveliness_token"], "key_exprs": ["@ros2_lv/**"]}]
     policies = [{"rules": ["no"], "subjects": ["all"]}]

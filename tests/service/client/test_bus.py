@@ -23,6 +23,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
+from nedbus.timings import Timings
 from nedbus.transport import Session, alive_tokens, open_router
 from nedbus.transport.queries import Answers
 from nedbus_msgs import DEFAULT, Address
@@ -173,11 +174,11 @@ def test_more_vehicles_appear_between_calls_than_are_kept(
 
 
 def test_vehicles_beyond_the_limit_are_logged(
-    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Two of three are an incomplete list, which is logged once; it completes once there is room."""
     monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 2)
-    monkeypatch.setattr(alive_tokens, "_RETRY_PAUSE", 0.0)
+    timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with nedbus.connect(endpoint) as other:
         wait_for(lambda: other.vehicles() and "more than 2 liveliness tokens" in caplog.text, what="a warning")

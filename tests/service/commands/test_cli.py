@@ -13,10 +13,10 @@ import pytest
 import nedbus
 from nedbus.cli import follow
 from nedbus.cli.app import app
-from nedbus.cli.commands import query
 from nedbus.cli.commands.pki import pki
 from nedbus.client import Subscription, connect_with
 from nedbus.settings import Settings
+from nedbus.timings import Timings
 from nedbus.transport import alive_tokens, open_router
 from nedbus_msgs import ANY
 from tests.flights.first_message import LAYOUTS, json_schema
@@ -99,11 +99,11 @@ def test_incomplete_list_fails(bus: nedbus.Bus, endpoint: str, monkeypatch: pyte
 
 
 def test_list_that_has_not_arrived_is_no_empty_list(
-    bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
+    bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """While the router has not listed the vehicles, the command does not claim that there are none."""
     monkeypatch.setattr(alive_tokens.AliveTokens, "take", lambda _: [])
-    monkeypatch.setattr(query, "_LIST_TIMEOUT", 0.01)
+    timings.list_timeout = 0.01
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1
     assert "the router has not listed all vehicles within 0.01 s" in listed.err
@@ -171,7 +171,9 @@ def test_schema_needs_no_network() -> None:
     assert [layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)] == list(LAYOUTS)
 
 
-def test_no_data_yet_is_reported(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_data_yet_is_reported(
+    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
     """With a router but no vehicle: list says so, echo says so and waits."""
     listed = run_command("list", "-c", endpoint)
     assert (listed.exit_code, listed.out, "no vehicle is published" in listed.err) == (0, "", True)
@@ -182,7 +184,7 @@ def test_no_data_yet_is_reported(endpoint: str, bus: nedbus.Bus, monkeypatch: py
         bus.publisher(VLP, vehicle="7").publish(message(5, x=1.0))
 
     monkeypatch.setattr(follow, "write_notice", publish_after_notice)
-    monkeypatch.setattr(follow, "SILENCE_TIMEOUT", 0.1)
+    timings.first_sample = 0.1
     echo = run_command("echo", "-c", endpoint, "-n", "1")
     assert echo.exit_code == 0
     assert echo.err.count("yet, still waiting") == 1

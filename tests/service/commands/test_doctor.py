@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from nedbus.client import QueryServer
 from nedbus.doctor import Finding, State, examine
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
+from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router, publisher_token
 from nedbus_msgs import dds_type, status_key
 from tests.flights.first_message import ROS2_TYPE, encode
@@ -44,17 +44,16 @@ HOUR = 3600.0
 
 
 @pytest.fixture(autouse=True)
-def _listen_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
+def _listen_shortly(timings: Timings) -> None:
     """Listen for a shorter time than a person would: `look` says how long."""
-    monkeypatch.setattr("nedbus.doctor.observation._MIN_LISTEN", 0.1)
-    monkeypatch.setattr("nedbus.doctor.prober._ALERT_TIMEOUT", 0.1)
-    monkeypatch.setattr("nedbus.cli.commands.checks.examine", partial(examine, listen=0.5))
+    timings.min_listen, timings.tls_alert, timings.listen = 0.1, 0.1, 0.5
 
 
 def look(*endpoints: str, tls: Mapping[str, Path] | None = None, listen: float = 0.1, **options: Any) -> list[Finding]:
     """Examine with these settings. `listen`: longer where something has to arrive; answers are there before."""
     settings = load_settings(None, connect=endpoints, **(tls or {}))
-    return examine(settings, version=nedbus.__version__, listen=listen, **options)
+    TIMINGS.listen = listen
+    return examine(settings, version=nedbus.__version__, **options)
 
 
 def found(findings: list[Finding], check: str, state: State, text: str) -> Finding:
@@ -124,10 +123,9 @@ def test_check_that_raises(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplo
     assert "Traceback" in caplog.text
 
 
-def test_what_is_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_router(timings: Timings) -> None:
     """Another server is told from a router and from TLS; one that never answers does not hold up the doctor."""
-    for name in ("_OPEN_TIMEOUT", "_HANDSHAKE_TIMEOUT"):
-        monkeypatch.setattr(f"nedbus.doctor.prober.{name}", 0.2)
+    timings.doctor_open = timings.handshake = 0.2
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
         thread.start()
@@ -418,21 +416,21 @@ def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
     ],
 )
 def test_certificate_that_is_wrong(
-    run_router: Run, pki: Path, monkeypatch: pytest.MonkeyPatch, case: tuple[str, str | None, str], told: dict[str, str]
+    run_router: Run, pki: Path, timings: Timings, case: tuple[str, str | None, str], told: dict[str, str]
 ) -> None:
     """The reason is told, which Zenoh never does, and the router's certificate is shown though no session opens."""
     router, name, ca = case
     if name != "reader":  # it is rejected, perhaps slowly
-        monkeypatch.setattr("nedbus.doctor.prober._ALERT_TIMEOUT", DEADLINE)
+        timings.tls_alert = DEADLINE
     findings = look(run_router(router), tls=files_of(pki, name, ca))
     for check, text in told.items():
         found(findings, check, "wrong", text)
     assert any("the router shows" in each.seen for each in findings)
 
 
-def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timings: Timings) -> None:
     """TLS where there is none, none where there is, no authority at all, and a key of another certificate."""
-    monkeypatch.setattr("nedbus.doctor.prober._OPEN_TIMEOUT", 0.1)
+    timings.doctor_open = 0.1
     secure = run_router()
     findings = look(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
     found(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
@@ -495,10 +493,11 @@ def test_certificates_without_the_package_that_reads_them(run_router: Run, pki: 
     program = f"""
 import sys
 sys.modules["cryptography"] = None
-from nedbus.doctor import examine, observation
+from nedbus.doctor import examine
 from nedbus.settings import load_settings
-observation._MIN_LISTEN = 0.1
-for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}), version="0", listen=0.1):
+from nedbus.timings import TIMINGS
+TIMINGS.min_listen = TIMINGS.listen = 0.1
+for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}), version="0"):
     if each.check in ("tls", "certificate"):
         print(each.subject, each.check, each.state, each.seen, each.advice, sep="|")
 """

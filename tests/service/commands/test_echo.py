@@ -21,6 +21,7 @@ from typing import NamedTuple
 import pytest
 
 import nedbus
+from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
 from tests.flights.messages import VALID, VLP, message
@@ -156,9 +157,9 @@ def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedb
     assert "2 received, 0 lost, 0 skipped (--every prints all), 1 invalid" in process.err
 
 
-def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, timings: Timings) -> None:
     """A last value is marked as old by echo, and hz does not measure it."""
-    monkeypatch.setattr("nedbus.cli.output.samples._OLD", 0.01)
+    timings.old = 0.01
     bus.publisher(VLP, vehicle="1").publish(message(1))
     wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
     assert "s old]" in echo(endpoint, "-n", "1").out

@@ -21,6 +21,7 @@ import nedbus
 from nedbus.cli.output.log_limit import BURST, PER_MINUTE, RateLimit
 from nedbus.cli.output.logs import JournalFormatter, JsonFormatter, TextFormatter
 from nedbus.log_event import EVENTS, about
+from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.flights.first_message import encode
@@ -154,7 +155,7 @@ def test_service_logs_json(start: Start) -> None:
     What a person would read beside the log is in an object; what to type in a second terminal is left out.
     """
     sources = ("-s", REPLAY, "-s", "sim:?vehicle=2")
-    soon = {"nedbus.cli.output.progress._REPORT_INTERVALS": (0.2,)}
+    soon = Timings(reports=(0.2,))
     service = start_hasty(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
     for event in ("done", "progress"):  # a report comes after what to type
         wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - it is called at once
@@ -328,7 +329,7 @@ def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, 
 def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
     """Vehicles that appear, reboot and fall silent by the hundred make a service log a few lines of each event."""
     began = time.monotonic()
-    soon = {"nedbus.daemon.output._STALE": 0.5}
+    soon = Timings(stale=0.5)
     service = start_hasty(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
     wait_for(lambda: '"listening"' in service.err, what="the source")
     fleet = [Px4(raw, namespace=f"wing{number}") for number in range(VEHICLES)]

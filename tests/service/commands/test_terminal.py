@@ -23,6 +23,7 @@ import nedbus
 from nedbus.cli.output.samples import Lines
 from nedbus.cli.output.streams import printable, to_text
 from nedbus.cli.output.table import live_table, to_table
+from nedbus.timings import Timings
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.flights.messages import VALID, VLP, message
@@ -314,14 +315,12 @@ def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bu
     assert states(hz.out).count("gone") == 1
 
 
-def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, timings: Timings) -> None:
     """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
-    hz = start_hasty(
-        start, {"nedbus.client.health.stream_health._STALE": 0.5}, "hz", "-c", endpoint, "--json", "-t", VLP
-    )
+    hz = start_hasty(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
-    monkeypatch.setattr("nedbus.client.health.stream_health._STALE", 0.5)
+    timings.stale = 0.5
     listed = run_command("list", "-c", endpoint)
     assert [line.split()[3] for line in listed.out.splitlines()[1:]] == ["stale:"] * 5
     assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from nedbus.monitoring import HttpServer, Page, http_server
+from nedbus.timings import Timings
 from tests.peers.http_pages import Pages
 from tests.waits import DEADLINE, repeating
 
@@ -123,9 +124,9 @@ def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixtur
     [(b"", b""), (b"GET /page HTTP/1.0\r\nHost:", b""), (b"GET /", b"a"), (b"GET /large HTTP/1.0\r\n\r\n", b"")],
     ids=["silent", "half a request", "byte by byte", "reads no answer"],
 )
-def test_slow_clients_are_ended(monkeypatch: pytest.MonkeyPatch, sent: bytes, each_second: bytes) -> None:
+def test_slow_clients_are_ended(timings: Timings, sent: bytes, each_second: bytes) -> None:
     """With 16 clients that send nothing, or not all, or read nothing, the next is answered when their time is over."""
-    monkeypatch.setattr(http_server._Handler, "timeout", 0.5)
+    timings.http_client = 0.5
     large = Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
     server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})
     with closing(server), ExitStack() as clients:
@@ -145,9 +146,9 @@ def test_slow_clients_are_ended(monkeypatch: pytest.MonkeyPatch, sent: bytes, ea
                 assert Pages(server.port).ask("/page") == (200, "a page\n")
 
 
-def test_close_waits_for_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_close_waits_for_no_client(timings: Timings) -> None:
     """While 16 clients do not read their answers and another waits for a free thread, it closes at once."""
-    monkeypatch.setattr(http_server, "_CLIENT_TIMEOUT", 10_000.0)  # far beyond the deadline of this test
+    timings.http_client = 10_000.0  # far beyond the deadline of this test
     made = threading.Semaphore(0)
 
     def make() -> Page:

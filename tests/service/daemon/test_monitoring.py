@@ -29,6 +29,7 @@ from nedbus.monitoring import Exporter, HttpServer, Page, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page, stream_metrics
 from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
+from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import Address, VehicleLocalPosition
 from nedbus_msgs.messages import VehicleStatus
@@ -101,10 +102,10 @@ def test_pages_of_a_service(serve: Serve, pages: Pages) -> None:
 
 
 def test_pages_of_an_exporter(
-    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An exporter sees what is published, lost and invalid, and how long messages take."""
-    monkeypatch.setattr("nedbus.client.receiving.writer_proxy.RETRANSMIT_TIMEOUT", 0.1)  # nobody keeps what is missing
+    timings.retransmit_timeout = 0.1  # nobody keeps what is missing
     publisher = raw.declare_publisher(f"nedbus/7/{VLP}")
     numbers = [1, 2, 3, 6, 7]  # 4 and 5 were lost before they came to the router
     of_stream = {"vehicle": "7", "topic": VLP}
@@ -394,9 +395,7 @@ def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus) -> None:
         exporter.run(threading.Event())
 
 
-def test_vehicle_that_was_switched_off_has_no_age(
-    bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_vehicle_that_was_switched_off_has_no_age(bus: nedbus.Bus, endpoint: str, timings: Timings) -> None:
     """A stream silent for long, without a token, has no series any more; it may come back."""
     with (
         exporting(bus) as pages,
@@ -415,7 +414,7 @@ def test_vehicle_that_was_switched_off_has_no_age(
         gone.close()
         wait_for(lambda: "gone" not in bus.vehicles(), what="the end of its token")
         assert ages() == {"here", "gone"}
-        monkeypatch.setattr("nedbus.monitoring.observer.FORGOTTEN", 0.0)
+        timings.forgotten = 0.0
         wait_for(lambda: ages() == {"here"}, what="the next look")
         assert not pages.values("nedbus_messages_received_total", vehicle="gone", topic=VLP)
         with other.publisher(VLP, vehicle="gone") as back:

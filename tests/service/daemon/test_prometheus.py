@@ -37,11 +37,11 @@ PATIENCE = 90.0  # s until all alerts have fired, or cleared
 # A nedbus that gives up what is missing, and tries failed sources again, within a second, and keeps 100 messages for a
 # reader in place of 65,536, so that a small burst is too much for it.
 HURRIED = """
-import nedbus.client.receiving.pending_queue, nedbus.client.receiving.writer_proxy, nedbus.daemon.worker
-nedbus.client.receiving.pending_queue.CAPACITY = 100
-nedbus.client.receiving.writer_proxy.RETRANSMIT_TIMEOUT = 1.0
-nedbus.daemon.worker._BACKOFF = (1.0,)
+import nedbus.client.receiving.pending_queue
 from nedbus.cli import main
+from nedbus.timings import TIMINGS
+nedbus.client.receiving.pending_queue.CAPACITY = 100
+TIMINGS.retransmit_timeout, TIMINGS.backoff = 1.0, (1.0,)
 main()
 """
 

@@ -21,10 +21,12 @@ from nedbus.cli.systemd import Notifier, NotifySocket, watchdog_interval
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
+from nedbus.timings import Timings
 from nedbus.transport import open_router
+from tests.peers.hasty import start_hasty
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, repeating, wait_for
+from tests.waits import DEADLINE, changing_timings, repeating, wait_for
 
 Datagram = dict[str, str]
 
@@ -75,17 +77,19 @@ def notified(
     thread = threading.Thread(target=daemon.run)
     thread.start()
     try:
-        with Notifier(daemon, environment=environment, patience=patience) as notifier:
-            yield daemon, notifier
+        with changing_timings() as timings:
+            timings.systemd_patience = patience
+            with Notifier(daemon, environment=environment) as notifier:
+                yield daemon, notifier
     finally:
         daemon.stop()
         thread.join(DEADLINE)
 
 
 @pytest.fixture
-def often(monkeypatch: pytest.MonkeyPatch) -> None:
+def often(timings: Timings) -> None:
     """Let the text of the status be sent five times a second, in this process."""
-    monkeypatch.setattr("nedbus.cli.systemd._STATUS_INTERVAL", 0.2)
+    timings.systemd_status = 0.2
 
 
 @pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
@@ -143,8 +147,8 @@ def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> N
     file = tmp_path / "nedbus.toml"
     text = f'listen = "{free_endpoint()}"\nsource = ["sim:"]\n'
     file.write_text(text)
-    often = "import nedbus.cli.systemd; nedbus.cli.systemd._STATUS_INTERVAL = 0.2; nedbus.cli.main()"
-    process = start("-c", often, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
+    often = Timings(systemd_status=0.2)
+    process = start_hasty(start, often, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
     systemd.receive_until(is_ready)
     for content, is_wrong in ((text, False), ("source = [", True), (text, False)):
         file.write_text(content)
@@ -191,11 +195,11 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
     ids=["replay", "live"],
 )
 def test_no_watchdog_while_a_source_is_stuck(
-    systemd: Systemd, monkeypatch: pytest.MonkeyPatch, source: str, method: str
+    systemd: Systemd, monkeypatch: pytest.MonkeyPatch, timings: Timings, source: str, method: str
 ) -> None:
     """While the loop of a source does not go round there is no ping, though all other threads work; then there is."""
     limit = 0.1  # s
-    monkeypatch.setattr("nedbus.sources.mavlink.source._TICK", limit / 2)  # how often that one goes round
+    timings.source_tick = limit / 2  # how often that one goes round
     entered, opened = block(monkeypatch, method)
     with notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier), repeating(notifier.tick):
         systemd.receive_until(is_ready)

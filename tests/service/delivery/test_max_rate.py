@@ -17,6 +17,7 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
+from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection
 from tests.flights.first_message import encode
@@ -256,7 +257,13 @@ def test_thin_link_carries_the_requested_rate(endpoint: str, clock: Clock, mode:
 
 
 def test_publisher_that_does_not_downsample_is_named(
-    endpoint: str, bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    endpoint: str,
+    bus: nedbus.Bus,
+    clock: Clock,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    timings: Timings,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A stream that is not downsampled does not arrive, which is logged once; no stream is read at full rate."""
     put, cannot = Downsampler.put, []
@@ -271,7 +278,7 @@ def test_publisher_that_does_not_downsample_is_named(
         assert not any(map(is_read, publishers))
         with pytest.raises(nedbus.NoDataError, match="/@rate/10 within"):
             subscription.receive(timeout=0.0)
-        monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
+        timings.downsampled_timeout = 0.0
         wait_for(lambda: "not downsampled" in caplog.text, what="the warning")
         assert caplog.text.count("1 streams are not received") == caplog.text.count(publishers[1].key) == 1
         assert subscription.counts == nedbus.Counts(received=2)

@@ -14,8 +14,8 @@ import pytest
 
 import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
-from nedbus.transport import LEASE, open_router
-from nedbus.transport.session import COMMON_SETTINGS
+from nedbus.timings import Timings
+from nedbus.transport import open_router
 from tests.flights.messages import VLP
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
@@ -27,10 +27,10 @@ COUNT = 3 * WINDOW
 
 READER = """
 import os, signal, sys, time, nedbus
-from nedbus.transport import session
+from nedbus.timings import TIMINGS
 endpoint, last, mode, *lease = sys.argv[1:]
 if lease:
-    session.COMMON_SETTINGS["transport/link/tx/lease"] = 1000 * int(lease[0])
+    TIMINGS.lease = int(lease[0])
 with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
     print("ready", flush=True)
     for number, sample in enumerate(subscription, 1):
@@ -94,14 +94,13 @@ def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
     ("when", "lease"), [("before", 1), ("amid", 1), pytest.param("amid", 5, marks=pytest.mark.slow)]
 )
 def test_stopped_reader_gets_everything(
-    start: Start, endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, *, when: str, lease: int
+    start: Start, endpoint: str, bus: nedbus.Bus, timings: Timings, *, when: str, lease: int
 ) -> None:
     """A reader suspended (SIGSTOP) until its lease of 5 s, here 1 s, has expired returns without losses."""
-    assert COMMON_SETTINGS["transport/link/tx/lease"] == 1000 * LEASE == 5000
+    assert timings.lease == 5
     begin = time.monotonic()
-    if lease != LEASE:
-        monkeypatch.setattr("nedbus.client.publishing.flow_control.LEASE", float(lease))
-    stopped = start("-c", READER, endpoint, str(COUNT), when, *([str(lease)] if lease != LEASE else []))
+    timings.lease = lease
+    stopped = start("-c", READER, endpoint, str(COUNT), when, str(lease))
     wait_for(lambda: "ready" in stopped.out, what="the reader")
 
     def stop() -> None:
@@ -173,12 +172,12 @@ def test_reader_that_dies_is_given_up(
     endpoint: str,
     reader: nedbus.Subscription[Any],
     bus: nedbus.Bus,
-    monkeypatch: pytest.MonkeyPatch,
+    timings: Timings,
     *,
     number: signal.Signals,
 ) -> None:
     """A replay continues without a reader that is killed or ends, and other readers miss nothing."""
-    monkeypatch.setattr("nedbus.client.publishing.flow_control.RETURN_TIMEOUT", 0.5)
+    timings.return_wait = 0.5
     dying = start("-c", READER, endpoint, str(COUNT), "slow", measured=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")
     _, sending = publish_all(bus)

@@ -16,9 +16,10 @@ import zenoh
 import nedbus
 from nedbus import Counts
 from nedbus.client.io_thread import Job
-from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
+from nedbus.client.receiving import Receiver, pending_queue, retransmission
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
+from nedbus.timings import Timings
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
 from tests.flights.first_message import encode, encoding_of
 from tests.flights.messages import VLP, message
@@ -72,11 +73,9 @@ def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pyte
     assert lossy.subscription.counts == Counts(received=4, lost=2)
 
 
-def test_publisher_without_a_cache_gets_one_request(
-    lossy: Lossy, raw: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, raw: Session, timings: Timings) -> None:
     """A publisher of another program, with sequence numbers but no cache, gets one request per gap after a timeout."""
-    monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", 0.2)
+    timings.retransmit_timeout = 0.2
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
     foreign = zenoh.ext.declare_advanced_publisher(raw, key, sample_miss_detection=misses)
@@ -95,13 +94,13 @@ def test_publisher_without_a_cache_gets_one_request(
     foreign.undeclare()
 
 
-def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, timings: Timings) -> None:
     """A publisher that timed out has lost nothing once it replies again."""
-    monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", 0.2)
+    timings.retransmit_timeout = 0.2
     lossy.queue.missing, lossy.unanswered = {1, 3, 5}, 1_000_000
     lossy.publish(0, 1, 2)
     assert lossy.receive(2) == [0, 2]
-    monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", DEADLINE)
+    timings.retransmit_timeout = DEADLINE
     lossy.unanswered = 0
     lossy.publish(3, 4)
     assert lossy.receive(2) == [3, 4]

@@ -24,6 +24,7 @@ from nedbus.doctor.prober import check_endpoint
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
+from nedbus.timings import Timings
 from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, read_router_config, router
 from nedbus.transport.router import allow_sessions
 from nedbus.transport.router_state import read_state
@@ -32,7 +33,7 @@ from tests.peers.certificates import write_config as write_shipped
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.peers.zenohd import start_zenohd
-from tests.waits import DEADLINE, wait_for
+from tests.waits import DEADLINE, changing_timings, wait_for
 
 ZID = "1ae1e25d2f7221abc366ddc8a944c8a4"
 
@@ -72,12 +73,12 @@ def router_in(endpoint: str, seen: str) -> Finding:
     found: list[Finding] = []
 
     def look() -> bool:
-        findings = check_network(Observation("nedbus", "0", None), endpoint, None, 0.0)
+        findings = check_network(Observation("nedbus", "0", None), endpoint, None)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nedbus.doctor.observation._MIN_LISTEN", 0.0)
+    with changing_timings() as timings:
+        timings.listen = timings.min_listen = 0.0
         wait_for(look, what=f"{seen}, not {found}")
     return found[0]
 
@@ -234,9 +235,9 @@ def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
         yield shows
 
 
-def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """It asks the routers now and then, keeps the first few, and knows nothing of them when they are silent."""
-    monkeypatch.setattr(exporter, "_ROUTERS_INTERVAL", 0.05)
+    timings.routers_interval = 0.05
     with nedbus.connect(small) as bus, exporting(bus) as shows:
         (state,) = ask(small)
         label = f'{{router="{state.zid}"}}'
@@ -248,10 +249,10 @@ def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> 
         wait_for(lambda: not shows(f"sessions{label}"), what="nobody")
 
 
-def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Without a session to ask with it goes on reading, and asks as soon as there is room for one."""
-    monkeypatch.setattr(exporter, "_ROUTERS_INTERVAL", 0.05)
-    monkeypatch.setattr(exporter, "_SESSION_TIMEOUT", 0.1)
+    timings.routers_interval = 0.05
+    timings.routers_session = 0.1
     where, tries, original = free_endpoint(), [], nedbus.Bus.open_session
 
     def count(bus: nedbus.Bus, *, timeout: float) -> Session:
@@ -280,7 +281,7 @@ def test_exporter_ends_while_a_router_does_not_answer(small: str) -> None:
         with exporting(bus):
             wait_for(lambda: kept, what="the question")
             begin = time.monotonic()
-        assert time.monotonic() - begin < exporter._ROUTERS_TIMEOUT / 2
+        assert time.monotonic() - begin < Timings().routers_timeout / 2
 
 
 def test_client_of_a_full_router(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.daemon.write_permission import WritePermission
 from nedbus.pki import write_access_rules
+from nedbus.timings import Timings
 from nedbus.transport import Session, open_client, open_router
 from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
@@ -348,9 +349,9 @@ def test_thinned_stream_flows_as_the_stream_does(
 
 
 PERMISSION: Final = "nedbus.daemon.write_permission."
-SOON: Final = {f"{PERMISSION}{name}": 0.3 for name in ("_CONFIRM", "_POLL", "_ARRIVED", "_UNSURE_PAUSE", "_PAUSE")} | {
-    f"{PERMISSION}_FIRST": (0.1, 0.3),
-}
+SOON: Final = Timings(
+    probe_first=(0.1, 0.3), probe_confirm=0.3, probe_poll=0.3, probe=0.3, probe_unsure=0.3, probe_pause=0.3
+)
 
 
 @pytest.mark.parametrize(
@@ -439,9 +440,9 @@ def test_refusal_is_believed_when_it_is_repeated(
     assert permission.refused == ({} if refused is None else {"1": refused})
 
 
-def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path, timings: Timings) -> None:
     """Messages of an embedded router's service pass the router that it joins, or not, by its certificate."""
-    monkeypatch.setattr(f"{PERMISSION}_ARRIVED", 0.5)
+    timings.probe = 0.5
     with open_router(listen=(free_endpoint(),), connect=(secure,), tls=tls_of(pki, "vehicle-1")) as session:
         permission = permission_of(session, secure, pki, "1", "2")
         wait_for(lambda: look(permission) == {"1": False}, what="the vehicle that is allowed")
@@ -449,11 +450,11 @@ def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path, mon
 
 
 def test_only_access_rules_are_a_refusal(
-    configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch
+    configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """A router with older rules, without any, that is away, or that is frozen, refuses nobody."""
-    for name, value in (("_OPEN", 0.1), ("_ARRIVED", 0.5), ("_BELIEVED", 1)):
-        monkeypatch.setattr(f"{PERMISSION}{name}", value)
+    timings.probe_open, timings.probe = 0.1, 0.5
+    monkeypatch.setattr(f"{PERMISSION}_BELIEVED", 1)
     file, endpoint = configured
     shipped = file.read_text()
     file.write_text(shipped.replace("@doctor", "@probe"))

@@ -18,7 +18,7 @@ from typing import Final
 import pytest
 from pyulog import ULog
 
-from nedbus.events import Event, Story, Verdict, stories_of, verdict_of
+from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
 from nedbus.sources import read_account
 from nedbus.sources.account import FileAccount
 from tests.flights.ulogs import LOGS
@@ -367,6 +367,24 @@ def test_verdict_of_a_flight_without_gps() -> None:
         "position valid throughout, but no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
     )
     assert found.text == f"{text} from the first message on, until the end (62.3 s)."
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_state_and_verdict_name_the_same_cause(name: str) -> None:
+    """While a flight goes on, the fault of the badge is the one that the live verdict names, after each event."""
+    events, (followed,) = told_in(name), account_of(name).account.vehicles.values()
+    spans, states = spans_of(events, list(followed.initial)), 0
+    for now in sorted({event.time + after for event in events for after in (0.001, 1.0)}):
+        state = state_at(spans, now)
+        if state.severity == "bad":
+            before = [event for event in events if event.time <= now]
+            found = verdict_of(
+                followed.name, before, state.conditions, topics=followed.topics, times=Times(is_live=True), end=now
+            )
+            worst = next(each for each in found.stories if each.spans[0].text == state.text)
+            assert found.text.startswith(f"not usable: {worst.what} " if state.text != "failsafe" else state.text), now
+            states += 1
+    assert bool(states) == (name != "cuav_1.16_gps_interference")
 
 
 @pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)

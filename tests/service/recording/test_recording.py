@@ -25,6 +25,7 @@ from nedbus.client import Subscription
 from nedbus.errors import OutputError, SourceError
 from nedbus.recording import Recorder, RecordingReader, RecordingWriter
 from nedbus.sources import ReplayRun, SourceMessage, convert
+from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import to_array
@@ -367,7 +368,9 @@ def test_moved_recording_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ended", ["by its duration", "by Ctrl-C"])
-def test_recording_nothing_is_said(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: str) -> None:
+def test_recording_nothing_is_said(
+    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings, ended: str
+) -> None:
     """A vehicle that is not there: stderr says after 2 s that nothing came, and at the end that no file is left.
 
     The recorder begins after the notice, so that its duration cannot end before.
@@ -387,7 +390,7 @@ def test_recording_nothing_is_said(endpoint: str, tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(Recorder, "run", record_after_notice)
     monkeypatch.setattr("nedbus.cli.commands.recordings.write_notice", end_after_notice)
-    monkeypatch.setattr("nedbus.cli.commands.recordings.SILENCE_TIMEOUT", 0.1)
+    timings.first_sample = 0.1
     duration = ["-d", "0.1"] if ended == "by its duration" else []
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1

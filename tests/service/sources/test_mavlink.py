@@ -25,6 +25,7 @@ from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink.link import open_link
 from nedbus.sources.mavlink.vehicle import ORIGIN
+from nedbus.timings import Timings
 from tests.flights.first_message import upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
@@ -241,9 +242,9 @@ def test_each_message_is_one_of_its_topic(port: int) -> None:
     }  # fmt: skip
 
 
-def test_vehicles_on_one_port(monkeypatch: pytest.MonkeyPatch, listener: Listener, port: int) -> None:
+def test_vehicles_on_one_port(timings: Timings, listener: Listener, port: int) -> None:
     """Each system id is a vehicle with requests at its own address."""
-    monkeypatch.setattr("nedbus.sources.mavlink.source._TICK", 0.01)
+    timings.source_tick = 0.01
     expected = {32: 20_000, **dict.fromkeys([33, 141, 230, 331], 119_974.875), ORIGIN: 0}
     with Autopilot(port, system=3) as one, Autopilot(port, system=250) as other:
         requested: dict[Autopilot, dict[int, float]] = {one: {}, other: {}}

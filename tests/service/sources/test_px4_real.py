@@ -36,7 +36,7 @@ from tests.peers.listening import Listener, status_of_source
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.peers.zenohd import start_zenohd
-from tests.waits import DEADLINE, repeating, wait_for
+from tests.waits import DEADLINE, changing_timings, repeating, wait_for
 
 from .test_mavlink import port
 from .test_px4_zenoh import is_read
@@ -339,7 +339,9 @@ def test_topics_that_a_px4_loses_are_named(where: str) -> None:
             last = sent
         with repeating(lambda: px4.send(last)):
             wait_for(lambda: set(status_of_source(bus).silent) == silent, what="silent topics")
-            findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__, listen=0.1)
+            with changing_timings() as timings:
+                timings.listen = 0.1
+                findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__)
             uncarried = status_of_source(bus).not_carried
     assert list(uncarried) == sorted(uncarried)
     assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(uncarried)

@@ -24,6 +24,7 @@ from tornado.ioloop import PeriodicCallback
 from websockets.sync.client import ClientConnection, connect
 
 from nedbus.monitoring import Page
+from nedbus.timings import Timings
 from nedbus.web.server import WebServer, Where, _log_once
 from tests.peers.ports import free_port
 from tests.peers.processes import Start
@@ -165,9 +166,9 @@ def test_requests_without_a_socket_take_no_place(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.fixture
-def tight(monkeypatch: pytest.MonkeyPatch) -> None:
+def tight(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Shorten the limits of a server that is started later."""
-    monkeypatch.setattr("nedbus.web.server._REQUEST_TIMEOUT", 0.3)
+    timings.page_request = 0.3
     monkeypatch.setattr("nedbus.web.server._MAX_CONNECTIONS", 3)
     _log_once.cache_clear()
 

@@ -97,13 +97,12 @@ def events(
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(files)
-    _choose_vehicles(_name(files), read.account.vehicles, vehicle)
+    _require_vehicle(_name(files), read.account.vehicles, vehicle)
     found = select(found)
     begin({read.times.clock(event) for event in found})
     show(found, read.times)
-    initial = {name: each.held_from_start for name, each in sorted(read.account.vehicles.items())}
-    texts = [f"{name}: {text}" for name, text in initial.items() if text and vehicle in (ANY, name)]
-    if texts:
+    vehicles = sorted(each for each in read.account.vehicles.items() if vehicle in (ANY, each[0]))
+    if texts := [f"{name}: {each.held_from_start}" for name, each in vehicles if each.held_from_start]:
         write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
         least = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
@@ -142,7 +141,8 @@ def why(
         raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
     if not files and not reporting:
         raise NedbusError(f"no nedbus service at {routers} has data of a vehicle: start one with 'nedbus serve'")
-    for name in _choose_vehicles(where, reporting, vehicle):
+    _require_vehicle(where, reporting, vehicle)
+    for name in reporting if vehicle == ANY else [vehicle]:
         events = [event for event in found if event.vehicle in (name, ANY)]
         known, end = reporting[name].vehicles[name], reporting[name].now
         moment = _find_moment(at, times, events)
@@ -291,10 +291,9 @@ def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
     return {"verdict": told, "faults": faults}
 
 
-def _choose_vehicles(where: object, names: Collection[str], vehicle: str) -> list[str]:
-    """Return the vehicle, or all for "*"; raise ConfigError if it is not among them."""
-    if vehicle == ANY or vehicle in names:
-        return sorted(names) if vehicle == ANY else [vehicle]
-    check_vehicle(vehicle)
-    shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
-    raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}: choose one of {shown}")
+def _require_vehicle(where: object, names: Collection[str], vehicle: str) -> None:
+    """Raise ConfigError if the vehicle is not among them."""
+    if vehicle != ANY and vehicle not in names:
+        check_vehicle(vehicle)
+        shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
+        raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}: choose one of {shown}")

@@ -15,6 +15,7 @@ from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
 from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
+from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     ANY,
     BY_TOPIC,
@@ -37,7 +38,6 @@ _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
 _SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
 _MAX_ROWS: Final = 200  # of a table, and services shown: any peer may claim to be a service
-_LIST_TIMEOUT: Final = 10.0  # s for the router to list all streams
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 
@@ -48,7 +48,7 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
     Exits with 1 if the list is incomplete, as the router is too slow or refuses.
     """
     selection = Selection(ANY, vehicle)
-    everything = bus.publishers(timeout=_LIST_TIMEOUT)
+    everything = bus.publishers(timeout=TIMINGS.list_timeout)
     published = Counter({each: count for each, count in everything.items() if selection.matches(each)})
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from nedbus import recording
-from nedbus.cli.follow import SILENCE_TIMEOUT, write_notice
+from nedbus.cli.follow import write_notice
 from nedbus.cli.options import ALL, DurationOption, InstanceOption, VehicleOption, command
 from nedbus.cli.output.progress import show_progress
 from nedbus.cli.output.streams import write, write_stderr
@@ -19,6 +19,7 @@ from nedbus.errors import ConfigError, NoDataError, SourceError
 from nedbus.events import Event, Times
 from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
 from nedbus.sources import convert as convert_messages
+from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 FlightArgument = Annotated[
@@ -38,7 +39,7 @@ def record(
 
     A power cut costs at most the last second.
     """
-    notice = time.monotonic() + SILENCE_TIMEOUT
+    notice = time.monotonic() + TIMINGS.first_sample
     with bus.subscribe_to(selection, mode="every") as subscription:
         recorder = recording.Recorder(subscription, output)
 

@@ -12,12 +12,12 @@ from typing import Final
 from nedbus.client import SourceStatus
 from nedbus.daemon import Daemon
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 
 from .streams import is_log_structured, write_stderr
 
 _log = logging.getLogger("nedbus")
-_REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports; the last one repeats
 
 _HINT: Final = """In a second terminal:
   {nedbus} list{where}  published vehicles and topics
@@ -48,7 +48,7 @@ class ProgressLog:
             if not is_log_structured() and not self._daemon.until_done:
                 write_stderr(what_to_type(self._daemon.endpoints))
         elapsed = time.monotonic() - self._reported
-        if elapsed < _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
+        if elapsed < TIMINGS.reports[min(self._reports, len(TIMINGS.reports) - 1)]:
             return
         self._reported += elapsed
         self._reports += 1

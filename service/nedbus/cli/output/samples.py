@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from nedbus.client import Sample, to_age
 from nedbus.errors import ConfigError
+from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, Message, message_doubts
 
 from .streams import csv_line
@@ -17,7 +18,6 @@ from .table import COLUMN_GAP, fit_columns, terminal_width
 _TIMES: Final = ("timestamp", "timestamp_sample")
 _DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
-_OLD: Final = 1.0  # s of latency from which it is shown: the last value of an ended stream, or a recovered message
 
 _MIN_PAGE: Final = 10  # minimum number of lines between two headings
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
@@ -120,7 +120,7 @@ def _to_summary(message: Message) -> str:
 
 def _notes(sample: Sample[Any]) -> str:
     lost = f"  [{sample.lost} lost]" if sample.lost else ""
-    old = f"  [{to_age(sample.latency)} old]" if sample.latency is not None and sample.latency > _OLD else ""
+    old = f"  [{to_age(sample.latency)} old]" if sample.latency is not None and sample.latency > TIMINGS.old else ""
     return f"{old}{lost}"
 
 

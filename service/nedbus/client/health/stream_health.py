@@ -16,6 +16,7 @@ from typing import Final, cast
 
 from nedbus.client.sample import Sample
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
 
 _log = logging.getLogger(__name__)
@@ -27,7 +28,6 @@ _SMOOTHING: Final = 0.05  # smoothing factor of the usual step and the usual rat
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 _SELDOM: Final = 1.0  # Hz; a topic without a file that comes less often may be one of events
-_STALE: Final = 3.0  # s without a message until a stream is stale and has no rate
 _COUNTER_MODULUS: Final = 256  # modulus of reset counters
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
 _MAX_STREAMS: Final = 4096  # per monitor
@@ -70,10 +70,10 @@ class Health:
     def stale_after(self) -> float:
         """Seconds without a message until this stream is stale: at least 3, infinity if it may pause forever."""
         if self.on_change:
-            return max(_STALE, 2 / self.nominal) if self.nominal else math.inf
+            return max(TIMINGS.stale, 2 / self.nominal) if self.nominal else math.inf
         if not self.nominal and (self.usual_rate or 0) < _SELDOM:
             return math.inf
-        return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
+        return max(TIMINGS.stale, 2 / self.usual_rate) if self.usual_rate else TIMINGS.stale
 
 
 _FlagCounts = Counter[tuple[str, bool]]  # messages by flag and its value, if it is known
@@ -191,7 +191,7 @@ class StreamHealth:
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
         latencies, mean = sorted(window.latencies), window.mean
-        is_live = mean > 0 and age is not None and age < max(_STALE, 2 * mean)
+        is_live = mean > 0 and age is not None and age < max(TIMINGS.stale, 2 * mean)
         return Health(
             rate=1 / mean if is_live else None,
             nominal=self._topic.rate,

@@ -12,7 +12,8 @@ from zenoh import CongestionControl
 from nedbus.client.protocol import CLOSED, write_parameters
 from nedbus.errors import ClosedError
 from nedbus.log_event import about
-from nedbus.transport import LEASE, Answers, ask
+from nedbus.timings import TIMINGS
+from nedbus.transport import Answers, ask
 from nedbus_msgs import ack_key
 
 from .writer import Writer
@@ -21,8 +22,6 @@ _log = logging.getLogger(__name__)
 
 WINDOW: Final = 2000  # unacknowledged messages of a session; this fits into the queues of a link and of a reader
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
-RETURN_TIMEOUT: Final = 5.0  # s to wait for a reader that left without closing, while there is a router
-FROZEN_TIMEOUT: Final = 90.0  # s to wait for a reader whose lease expired: its process may be suspended
 _MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages, after which not even one per trickle period is sent
 _MIN_WINDOW: Final = 100  # messages per publisher, whatever their number
 _REQUESTS_PER_WINDOW: Final = 8
@@ -32,7 +31,6 @@ _QUERY_TIMEOUT: Final = 10.0  # s before a request is repeated at most, and time
 _STALE_POLL: Final = 1.0  # s without a poll after which the replies do not show which readers exist
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
 _POLL_EVERY: Final = 16  # messages between polls
-_POLLS: Final = (0.0005, 0.005)  # s between polls while waiting: the first and the longest pause
 _DROP: Final = CongestionControl.DROP  # blocking on a full queue could make Zenoh close the link
 _UNKNOWN: Final = ""  # a reader that has never replied
 
@@ -66,7 +64,10 @@ class ReaderProxies:
         """
         if replies.keys() - self._matched - self.away.keys():
             self.away.pop(_UNKNOWN, None)
-        gone, until = self._matched - replies.keys(), now + (FROZEN_TIMEOUT if froze else RETURN_TIMEOUT)
+        gone, until = (
+            self._matched - replies.keys(),
+            now + (TIMINGS.frozen_wait if froze else TIMINGS.return_wait),
+        )
         if gone & self._suspects:  # it replied, but froze before Zenoh finalized its reply
             until = self.away.pop(_UNKNOWN, until)
         self._suspects = set()
@@ -80,7 +81,7 @@ class ReaderProxies:
         """Extend all deadlines; called while the publisher has no router or a new one. `now` in seconds."""
         if not self._matched and not self.away:
             self.away[_UNKNOWN] = now
-        self.away = {reader: max(until, now + RETURN_TIMEOUT) for reader, until in self.away.items()}
+        self.away = {reader: max(until, now + TIMINGS.return_wait) for reader, until in self.away.items()}
 
 
 class _Request:
@@ -147,7 +148,7 @@ class FlowControl:
         return not published or self._wait(published, 1, read=False, timeout=timeout)
 
     def _wait(self, published: int, window: int, *, read: bool, timeout: float) -> bool:
-        end, pause = time.monotonic() + timeout, _POLLS[0]
+        end, pause = time.monotonic() + timeout, TIMINGS.credit_polls[0]
         while True:
             if self.cancelled.is_set():
                 raise ClosedError
@@ -160,7 +161,7 @@ class FlowControl:
             if is_done or now >= end:
                 return is_done
             time.sleep(pause)
-            pause = min(2 * pause, _POLLS[1])
+            pause = min(2 * pause, TIMINGS.credit_polls[1])
 
     def _send_request(self, published: int, *, read: bool, now: float) -> None:
         """Request an acknowledgement of the first `published` messages, or repeat the open request."""
@@ -182,7 +183,7 @@ class FlowControl:
         request, is_stale, self._polled = self._request, now - self._polled > _STALE_POLL, now
         if request is None or not request.poll(now):
             return
-        froze = now - request.last_reply > LEASE / 2
+        froze = now - request.last_reply > TIMINGS.lease / 2
         if not is_stale:
             self._readers.update(request.replies, froze=froze, now=now)
         routers = self._routers()

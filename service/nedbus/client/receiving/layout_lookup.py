@@ -12,6 +12,7 @@ from typing import Any, Final
 from nedbus.client.closing import join_thread
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus_msgs import MESSAGES, Codec, Definition, UnknownLayoutError, codec_of, define, field_type
 
 _log = logging.getLogger(__name__)
@@ -25,7 +26,6 @@ _MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, t
 _PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s until the same is asked for again, by failed queries
 _PACE: Final = 0.2  # s between a query without a result and the next one
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_PATIENCE: Final = 3.0  # s that readers wait for definitions in vain
 _RECOVERY: Final = 0.1  # of the time since then becomes patience again, so that no peer can keep readers waiting
 
 Wanted = tuple[str, int | str]
@@ -56,7 +56,7 @@ class LayoutLookup:
         self._closed = False
         self._open: dict[Wanted, object] = {}  # with the publisher; those of the current query first
         self._failed: dict[Wanted, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
-        self._patience, self._waited = _PATIENCE, float("-inf")  # of readers, and the time of the last wait in vain
+        self._patience, self._waited = TIMINGS.definition_timeout, float("-inf")  # of readers; their last wait in vain
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
         """Return the newer layouts of a message found so far, in the form that `decode` expects."""
@@ -93,9 +93,10 @@ class LayoutLookup:
         """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
         with self._changed:
             start = time.monotonic()
-            patience = min(_PATIENCE, self._patience + _RECOVERY * (start - self._waited))
+            longest = TIMINGS.definition_timeout
+            patience = min(longest, self._patience + _RECOVERY * (start - self._waited))
             is_pending = self._open.__len__ if wanted is None else partial(self._open.__contains__, wanted)
-            self._changed.wait_for(lambda: self._closed or not is_pending(), _PATIENCE if wanted is None else patience)
+            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if wanted is None else patience)
             if wanted is not None and wanted not in self._codecs:
                 self._waited = time.monotonic()
                 self._patience = max(0.0, patience - (self._waited - start))
@@ -107,7 +108,7 @@ class LayoutLookup:
             self._changed.notify_all()
             thread = self._thread
         if thread is not None:
-            join_thread(thread, _PATIENCE)
+            join_thread(thread, TIMINGS.definition_timeout)
 
     def _request(self, wanted: Wanted, publisher: object = None) -> None:
         with self._changed:

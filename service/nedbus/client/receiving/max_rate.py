@@ -17,6 +17,7 @@ from nedbus.client.rate_gate import RateGate, rate_step
 from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
+from nedbus.timings import TIMINGS
 from nedbus.transport import AliveTokens, RawSample, Session, ask
 from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
 
@@ -25,9 +26,6 @@ from .pending_queue import PendingQueue
 from .receiver import Receiver
 
 _log = logging.getLogger(__name__)
-
-DOWNSAMPLED_TIMEOUT: Final = 10.0
-"""Seconds from a stream's liveliness token to the warning that no downsampled message has arrived."""
 
 _TIMEOUT: Final = 2.0  # s for the queries of last messages and liveliness tokens
 _LAST_POLL: Final = 0.02  # s between polls for last messages
@@ -113,7 +111,7 @@ class MaxRateReceiver(Receiver):
                     self._awaiting.pop(address, None)
                 elif topic.rate and not topic.on_change:  # others may pause for long
                     self._awaiting.setdefault(address, now)
-        due = [address for address, since in self._awaiting.items() if now - since >= DOWNSAMPLED_TIMEOUT]
+        due = [address for address, since in self._awaiting.items() if now - since >= TIMINGS.downsampled_timeout]
         for address in due:
             del self._awaiting[address]
         if missing := [address for address in due if not self._rate_queue.has_downsampled(address)]:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from nedbus.timings import TIMINGS
 from nedbus.transport import MAX_ANSWERS
 
 from .decoder import Arrival, KeyState, detach
@@ -21,7 +22,6 @@ MAX_GAP: Final = 2**30
 
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
 _MAX_REORDERED: Final = 2**16  # a number lower by up to this is late or a duplicate; beyond, the publisher restarted
-RETRANSMIT_TIMEOUT: Final = 20.0  # s until a gap counts as lost; publishers cache as long
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
 
 
@@ -125,7 +125,7 @@ class WriterProxy:
         while request.probe is None and last in self.held:
             last -= 1
         if request.deadline is None:
-            request.deadline = now if self.unresponsive else now + RETRANSMIT_TIMEOUT
+            request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
         request.attempts += 1
         self.account.requesting[self] = self.account.requesting.pop(self)
         request.requested = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)

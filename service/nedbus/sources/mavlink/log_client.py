@@ -5,10 +5,11 @@ Times are monotonic seconds of the caller's clock.
 
 import math
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
+
+from nedbus.timings import TIMINGS
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
 """MAV_CMD by kind of command."""
@@ -19,29 +20,6 @@ _JUDGED: Final = 32  # messages of a header after which its duration is estimate
 _EXPECTED: Final = 400  # messages of a header; 274 to 410 were seen
 _STOP_TAIL: Final = 10  # LOGGING_DATA_ACKED in a row, after which silence is a STOP; PX4 sends 44, else 2 at most
 _DECAY: Final = 0.98  # of the longest interval between messages, with each message
-
-
-@dataclass(frozen=True, slots=True)
-class LogStreamTimes:
-    """Times of the protocol [s].
-
-    `answer`: wait for a COMMAND_ACK, doubled with each repetition of START, and for the first data.
-    `timeout`: PX4 gives up a message without acknowledgement; also the pause between STOP and START.
-    `silence`: without data, after which PX4 is asked; at least three times the interval of the stream.
-    `longest_silence`: of any stream; its synchronisation records alone (22 B/s) fill a message in 11.3 s.
-    `link`: without any message, after which the link is lost.
-    `retry`, `slow_retry`: after a refusal that may pass, and after one that lies in the configuration or the link.
-    `header`: limit of the header's duration, for which PX4's logger is blocked: a hole in the vehicle's own log.
-    """
-
-    answer: float = 1.0
-    timeout: float = 2.5
-    silence: float = 1.0
-    longest_silence: float = 15.0
-    link: float = 3.0
-    retry: float = 30.0
-    slow_retry: float = 300.0
-    header: float = 10.0
 
 
 LogReason = Literal[
@@ -109,15 +87,8 @@ class LogStreamClient:
     `header_seconds`: duration of the last header; None before its end.
     """
 
-    def __init__(
-        self,
-        log: Set[Literal["1", "armed", "take"]],
-        *,
-        system: int,
-        component: int,
-        times: LogStreamTimes = LogStreamTimes(),
-    ) -> None:
-        self._log, self._ids, self._times = log, (system, component), times
+    def __init__(self, log: Set[Literal["1", "armed", "take"]], *, system: int, component: int) -> None:
+        self._log, self._ids = log, (system, component)
         self._owner = "another client"
         self.header_seconds: float | None = None
         self._is_px4 = self._armed = False
@@ -197,7 +168,7 @@ class LogStreamClient:
         if not is_for_us or self._awaited is None or command != COMMANDS.get(self._awaited):
             return []
         if result == dialect.MAV_RESULT_IN_PROGRESS:
-            self._due = now + self._times.answer
+            self._due = now + TIMINGS.log_answer
         elif self._awaited == "start":
             return self._on_start_result(result, now)
         else:
@@ -207,7 +178,7 @@ class LogStreamClient:
     def tick(self, now: float) -> list[Command]:
         """Return the commands that are due."""
         state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
-        is_lost = silence > self._times.link
+        is_lost = silence > TIMINGS.log_link
         if is_lost and state in ("header", "streaming"):
             self._awaited = None
             self._enter("ended", "link_lost", now, silence)
@@ -242,18 +213,18 @@ class LogStreamClient:
         if self._awaited is None:
             is_slow = reason in ("bandwidth", "unsupported", "slow_link")
             is_over = state in ("refused", "ended")
-            self._due = now + (self._times.slow_retry if is_slow else self._times.retry if is_over else 0.0)
+            self._due = now + (TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0)
 
     def _send(self, kind: Literal["start", "stop"], now: float, *, tries: int = 0) -> list[Command]:
         self._awaited, self._tries, self._asked = kind, tries + 1, True
-        self._due = now + self._times.answer * (2**tries if kind == "start" else 1)
+        self._due = now + TIMINGS.log_answer * (2**tries if kind == "start" else 1)
         return [Command(kind)]
 
     def _end_stop(self, now: float) -> None:
         self._awaited = None
         state, reason, _ = self.status
         self._enter("stopped" if state == "stopping" else state, reason, now)
-        self._due = max(self._due, now + self._times.timeout)
+        self._due = max(self._due, now + TIMINGS.log_timeout)
 
     def _restart(self, now: float) -> list[Command]:
         """Send STOP; START follows."""
@@ -279,7 +250,7 @@ class LogStreamClient:
         elapsed, count = now - self._header_start, self._header_messages
         round_trip = (elapsed - self._header_pause) / max(1, count - 2)
         expected = elapsed + round_trip * max(0, _EXPECTED - count)
-        if (expected if count >= _JUDGED else elapsed) <= self._times.header:
+        if (expected if count >= _JUDGED else elapsed) <= TIMINGS.log_header:
             return []
         self._has_header = False
         self._enter("refused", "slow_link", now, expected, 1e3 * round_trip)
@@ -294,7 +265,7 @@ class LogStreamClient:
                 self._enter("starting", "silent", now, now - self._last_data)
             elif self.status.reason != "no_data":  # whose attempts go on
                 self._enter("starting", None, now)
-            self._awaited, self._has_header, self._due = "data", False, now + self._times.answer
+            self._awaited, self._has_header, self._due = "data", False, now + TIMINGS.log_answer
         elif state == "stopping":
             self._enter("stopped", None, now)
         elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:  # the stream exists: it is slow
@@ -337,23 +308,23 @@ class LogStreamClient:
 
     def _patience(self) -> float:
         """Return the silence after which the stream may have ended [s]."""
-        return min(max(self._times.silence, 3 * self._interval), self._times.longest_silence / 2)
+        return min(max(TIMINGS.log_silence, 3 * self._interval), TIMINGS.log_longest_silence / 2)
 
     def _check_silence(self, now: float) -> list[Command]:
         """Ask for a silent stream with START: PX4 rejects it and goes on, or begins a new stream."""
-        state, times, patience = self.status.state, self._times, self._patience()
+        state, patience = self.status.state, self._patience()
         silence, since_acked = now - self._last_data, now - self._last_acked
-        if state == "header" and since_acked > times.timeout and since_acked - silence > times.silence:
+        if state == "header" and since_acked > TIMINGS.log_timeout and since_acked - silence > TIMINGS.log_silence:
             self._has_header = False  # only repetitions arrived
             self._enter("ended", "stalled", now, since_acked)
-        elif state == "streaming" and self._acked_in_row >= _STOP_TAIL and silence > times.silence:
+        elif state == "streaming" and self._acked_in_row >= _STOP_TAIL and silence > TIMINGS.log_silence:
             self._has_header = False
             self._enter("ended", "stopped_elsewhere", now)
         elif not self._may_start():
-            if silence > max(times.timeout, 2 * patience):
+            if silence > max(TIMINGS.log_timeout, 2 * patience):
                 self._enter("ended", "silent", now, silence)
                 self._due = now
-        elif silence > times.longest_silence:
+        elif silence > TIMINGS.log_longest_silence:
             self._has_header = False
             self._enter("refused", "taken", now)
         elif silence > patience and self._last_heartbeat > self._last_data and now >= self._due:

@@ -14,6 +14,7 @@ from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceContext, SourceMessage
+from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.ulog import SPOKEN
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -28,7 +29,6 @@ from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 
-_TICK: Final = 0.25  # s
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
 _STATUS_INTERVAL: Final = 1.0  # s between reports on ULog streams
 # Of a companion computer: unlike a ground station, its loss triggers no failsafe.
@@ -84,7 +84,7 @@ class _LinkSession:
     def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
         next_requests = next_heartbeat = next_status = 0.0
         while True:
-            for item in self._read(_TICK):
+            for item in self._read(TIMINGS.source_tick):
                 if isinstance(item, Rejection):
                     yield item
                 elif item.piece is not None:
@@ -96,7 +96,7 @@ class _LinkSession:
             yield None
             now = time.monotonic()
             if now >= next_requests:
-                next_requests = now + _TICK
+                next_requests = now + TIMINGS.source_tick
                 self._send_requests(now)
                 for log in self._logs.values():
                     log.log_changes(now)

@@ -17,6 +17,7 @@ import zenoh
 from nedbus.errors import AddressError, DecodeError
 from nedbus.log_event import about
 from nedbus.sources.source import Absence, Rejection, SourceMessage
+from nedbus.timings import TIMINGS
 from nedbus.transport import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
@@ -37,7 +38,6 @@ from .streams import Form, NotAcceptedError, Px4Stream, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
-_TICK: Final = 0.25  # s
 _REPORT_INTERVAL: Final = 1.0  # s between reports of absent topics
 _MAX_PENDING: Final = 4096  # samples waiting to be decoded
 _MAX_PENDING_BYTES: Final = 4096  # per payload
@@ -82,7 +82,7 @@ class Px4ZenohNode:
             yield from self._dropped_messages()
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
-                sample = self._pending.get(timeout=_TICK)
+                sample = self._pending.get(timeout=TIMINGS.source_tick)
             for token, alive in self._tokens.take():  # older than the sample
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)

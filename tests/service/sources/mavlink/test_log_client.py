@@ -9,7 +9,8 @@ from typing import Any, Final, Literal
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.sources.mavlink.log_client import Command, LogReason, LogState, LogStreamClient, LogStreamTimes
+from nedbus.sources.mavlink.log_client import Command, LogReason, LogState, LogStreamClient
+from nedbus.timings import TIMINGS
 from tests.peers.px4_log_stream import START, STOP, STREAMS, datagrams
 
 from .counted import CountedReassembly
@@ -20,7 +21,6 @@ PX4: Final = dialect.MAV_AUTOPILOT_PX4
 ACCEPTED: Final = dialect.MAV_RESULT_ACCEPTED
 TAKEN: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
 IN_PROGRESS: Final = dialect.MAV_RESULT_IN_PROGRESS
-TIMES: Final = LogStreamTimes()
 
 Log = Literal["1", "armed", "take"]
 Reason = tuple[LogState, LogReason | None]
@@ -138,11 +138,11 @@ def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
 @pytest.mark.parametrize(
     ("result", "reason", "retry"),
     [
-        (TAKEN, "taken", TIMES.retry),
-        (dialect.MAV_RESULT_DENIED, "bandwidth", TIMES.slow_retry),
-        (dialect.MAV_RESULT_UNSUPPORTED, "unsupported", TIMES.slow_retry),
-        (dialect.MAV_RESULT_FAILED, "failed", TIMES.retry),
-        (99, "failed", TIMES.retry),
+        (TAKEN, "taken", TIMINGS.log_retry),
+        (dialect.MAV_RESULT_DENIED, "bandwidth", TIMINGS.log_slow_retry),
+        (dialect.MAV_RESULT_UNSUPPORTED, "unsupported", TIMINGS.log_slow_retry),
+        (dialect.MAV_RESULT_FAILED, "failed", TIMINGS.log_retry),
+        (99, "failed", TIMINGS.log_retry),
     ],
 )
 def test_refusal_is_reported_once_and_retried_seldom(
@@ -228,7 +228,7 @@ class TestOwnership:
         session.wait(0.1)
         for _ in range(4):
             session.answer(START, TAKEN)
-            session.wait(TIMES.retry)
+            session.wait(TIMINGS.log_retry)
         session.answer(START, TAKEN)
         session.take(session.client.stop(session.now))
         assert set(session.commands) == {"start"}
@@ -253,7 +253,7 @@ class TestOwnership:
         session.receive(acked=True, sequence=70)
         session.answer(STOP, ACCEPTED)
         assert (session.commands, session.acknowledged) == (["start", "stop"], [70])
-        session.wait(TIMES.timeout - 0.2)
+        session.wait(TIMINGS.log_timeout - 0.2)
         assert session.commands == ["start", "stop"]
         session.wait(0.4)
         assert session.commands == ["start", "stop", "start"]
@@ -267,10 +267,10 @@ class TestOwnership:
         session.wait(0.1)
         session.answer(START, TAKEN)
         session.answer(STOP, ACCEPTED)
-        session.wait(TIMES.timeout + 0.2)
+        session.wait(TIMINGS.log_timeout + 0.2)
         for _ in range(5):
             session.answer(START, TAKEN)
-            session.wait(TIMES.retry + 0.2)
+            session.wait(TIMINGS.log_retry + 0.2)
         assert session.commands.count("stop") == 1
         assert session.states[1:] == [("starting", None), ("refused", "taken")]
 
@@ -282,7 +282,7 @@ class TestOwnership:
         assert session.commands == ["start", "stop"]
         session.answer(STOP, ACCEPTED)
         session.receive(sequence=7001)
-        session.wait(TIMES.timeout + 0.2)
+        session.wait(TIMINGS.log_timeout + 0.2)
         assert session.commands == ["start", "stop", "start"]
         session.answer(START, TAKEN)
         session.receive(sequence=7002)
@@ -295,7 +295,7 @@ class TestOwnership:
         for _ in range(44):
             session.receive(acked=True)
             session.now += 0.004
-        session.wait(TIMES.retry - 0.5)
+        session.wait(TIMINGS.log_retry - 0.5)
         assert session.states[-1] == ("ended", "stopped_elsewhere")
         assert session.commands == ["start"]
         session.wait(3)
@@ -323,7 +323,7 @@ class TestNoData:
         session.wait(0.4)
         assert session.commands == ["start", "stop"]
         session.answer(STOP, ACCEPTED)
-        session.wait(TIMES.timeout - 0.2)
+        session.wait(TIMINGS.log_timeout - 0.2)
         assert session.commands == ["start", "stop"]
         session.wait(0.4)
         session.answer(START, ACCEPTED)
@@ -371,14 +371,14 @@ class TestHeader:
         session.header(round_trip=round_trip)
         assert session.commands == ["start", "stop"]
         assert len(session.acknowledged) <= 32
-        assert session.now - began <= TIMES.header + round_trip
+        assert session.now - began <= TIMINGS.log_header + round_trip
         assert session.states[-1] == ("refused", "slow_link")
         assert f"{1e3 * round_trip:.0f} ms" in session.client.status.text
         session.receive(acked=True, sequence=40)
         assert 40 not in session.acknowledged
         session.wait(2.5)
         session.answer(STOP, ACCEPTED)
-        session.wait(TIMES.slow_retry - 10)
+        session.wait(TIMINGS.log_slow_retry - 10)
         assert session.commands.count("start") == 1
         assert session.states[-1] == ("refused", "slow_link")
 
@@ -401,7 +401,7 @@ class TestHeader:
             session.now += 0.05
         session.wait(1)
         assert session.states[-1] == ("ended", "stalled")
-        session.wait(TIMES.retry)
+        session.wait(TIMINGS.log_retry)
         assert session.commands == ["start", "start"]
 
     def test_header_before_a_slow_stream_is_complete(self, session: Session) -> None:
@@ -453,7 +453,7 @@ class TestSilence:
         session.start()
         session.wait(10)
         assert session.states[-1] == ("ended", "silent")
-        session.wait(TIMES.retry)
+        session.wait(TIMINGS.log_retry)
         session.answer(START, ACCEPTED)
         session.header()
         assert session.client.status.state == "header"
@@ -475,7 +475,7 @@ class TestSilence:
         session.wait(3)
         session.receive()
         assert session.states[-2:] == [("ended", "silent"), ("streaming", None)]
-        session.wait(TIMES.longest_silence)
+        session.wait(TIMINGS.log_longest_silence)
         assert session.commands == ["start"]
         session.armed = False
         session.wait(0.1)

@@ -8,7 +8,6 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import closing, suppress
-from functools import partial
 from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,10 +20,11 @@ from pyulog import ULog
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import log_receiver
-from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient, LogStreamTimes
+from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
 from nedbus.sources.mavlink.log_reassembly import Piece
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
+from nedbus.timings import Timings
 from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
 from tests.flights.ulogs import said_in, write_raw_log
 from tests.peers.ports import free_port
@@ -49,11 +49,10 @@ def recorded_flight(test: Any) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+def patience(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Let messages wait, as a flight is sent as fast as it is read, and let the header and answers take long."""
-    times = LogStreamTimes(answer=DEADLINE, link=DEADLINE, header=10 * DEADLINE)
+    timings.log_answer, timings.log_link, timings.log_header = DEADLINE, DEADLINE, 10 * DEADLINE
     monkeypatch.setattr(log_receiver, "_MAX_WAITING", 1_000_000)
-    monkeypatch.setattr(log_receiver, "LogStreamClient", partial(LogStreamClient, times=times))
 
 
 Attack = Callable[[bytes, int], None]
