@@ -26,21 +26,15 @@ class VehicleStatus(Message):
             onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health
             latest_arming_reason latest_disarming_reason armed_time takeoff_time"""),
         Layout("1.14", """
-            timestamp armed_time takeoff_time arming_state latest_arming_reason latest_disarming_reason
-            nav_state_timestamp nav_state_user_intention nav_state failure_detector_status hil_state vehicle_type
-            failsafe failsafe_and_user_took_over gcs_connection_lost gcs_connection_lost_counter
-            high_latency_data_link_lost is_vtol is_vtol_tailsitter in_transition_mode in_transition_to_fw
-            system_type system_id component_id safety_button_available safety_off power_input_valid usb_connected
-            open_drone_id_system_present open_drone_id_system_healthy parachute_system_present
-            parachute_system_healthy avoidance_system_required avoidance_system_valid rc_calibration_in_progress
-            calibration_enabled pre_flight_checks_pass"""),
-        Layout("1.15", """
-            1.14, nav_state: executor_in_charge valid_nav_states_mask can_set_nav_states_mask,
-            failsafe_and_user_took_over: failsafe_defer_state"""),
-        Layout("1.16", "1.15, without avoidance_system_required avoidance_system_valid"),
+            1.15, without executor_in_charge valid_nav_states_mask can_set_nav_states_mask failsafe_defer_state"""),
+        Layout("1.15", "1.16, parachute_system_healthy: avoidance_system_required avoidance_system_valid"),
+        Layout("1.16", """
+            1.18, without nav_state_display accepts_offboard_setpoints traffic_avoidance_system_present,
+            can_set_nav_states_mask: failure_detector_status"""),
         Layout("1.18", """
-            1.16, without failure_detector_status, executor_in_charge: nav_state_display accepts_offboard_setpoints,
-            parachute_system_healthy: traffic_avoidance_system_present"""),
+            *, without failure_detector_status avoidance_system_required avoidance_system_valid failsafe_timestamp
+            vtol_fw_permanent_stab rc_signal_lost engine_failure mission_failure geofence_violated
+            onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health"""),
     )  # fmt: skip
     OLDER = (
         Older("data_link_lost", "gcs_connection_lost"),
