@@ -6,7 +6,7 @@ Import this module only where arrays are used: NumPy takes longer to load than e
 
 import struct
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Generic
 
 import numpy as np
@@ -31,8 +31,6 @@ __all__ = [
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
-_CAST_FROM: Final = 256
-"""Number of messages from which a NumPy cast of all fields is faster than copying single bytes."""
 _COLUMNS_FROM: Final = 20
 """Number of messages from which checking rules by column is faster than by message."""
 
@@ -53,18 +51,12 @@ class Arrays(Generic[M]):
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size
-        # Two flat dtypes with a name for each value, also those in arrays: of the array's bytes, and of a payload.
-        named = [(f"{name}.{part}", self.dtype[name].base, offset) for name, part, offset in self._codec.offsets]
-        self._native = np.dtype([(name, kind) for name, kind, _ in named])
-        self._wire = np.dtype(
-            {
-                "names": [name for name, _, _ in named],
-                "formats": [kind.newbyteorder(">") for _, kind, _ in named],
-                "offsets": [offset for _, _, offset in named],
-                "itemsize": size,
-            }
-        )
-        self._from_wire = np.fromiter(_wire_offsets(named), np.intp, self.dtype.itemsize)
+        # The offset in a payload of each byte of an element.
+        self._from_wire = np.array([], np.intp)
+        for name, _, offset in self._codec.offsets:
+            bytes_of = np.arange(offset, offset + types[name].size)
+            is_swapped = sys.byteorder == "little" and not types[name].is_text
+            self._from_wire = np.append(self._from_wire, bytes_of[::-1] if is_swapped else bytes_of)
         self._to_wire = np.zeros(size, np.intp)
         self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
@@ -74,16 +66,13 @@ class Arrays(Generic[M]):
         self._texts = [index for index, kind in enumerate(types.values()) if kind.is_text]
         ruled = {name for rule in definition.rules for name in rule.fields}
         # A struct that unpacks the fields with rules from the bytes of an element, and the index of each.
-        steps, places, index = [], dict[str, str](), 0
+        form, places, index = "=", dict[str, str](), 0
         for name, kind in types.items():
-            if name not in ruled:
-                steps.append(f"{self.dtype[name].itemsize}x")
-                continue
-            steps.append(kind.form)
-            places[name] = f"values[{index}:{index + kind.count}]" if kind.is_array else f"values[{index}]"
-            index += kind.count
-        self._ruled = struct.Struct("=" + "".join(steps))
-        self._passes_rules = passes_all(definition.rules, places.__getitem__)
+            form += kind.form if name in ruled else f"{self.dtype[name].itemsize}x"
+            if name in ruled:
+                places[name] = f"values[{index}:{index + kind.count}]" if kind.is_array else f"values[{index}]"
+                index += kind.count
+        self._ruled, self._passes_rules = struct.Struct(form), passes_all(definition.rules, places)
         self._wrong_columns = wrong_columns(
             definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
         )
@@ -96,23 +85,16 @@ class Arrays(Generic[M]):
         # Zero where the tags are right, and 0 or 1 for bools.
         wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
         wrong = wire & self._tag_mask
-        if not np.count_nonzero(wrong):
-            array = self._to_native(wire)
-            return array, self.valid_mask(array)
-        array = self._to_native(wire & self._value_mask)
-        return array, self.valid_mask(array) & ~wrong.any(axis=1)
+        array = np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
+        valid = self.valid_mask(array)
+        if np.count_nonzero(wrong):
+            valid &= ~wrong.any(axis=1)
+        return array, valid
 
     def encode(self, array: MessageArray) -> bytes:
         """Return the concatenated payloads of messages, without validating them."""
-        if len(array) < _CAST_FROM:
-            native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
-            wire = native.take(self._to_wire, axis=1)
-            wire &= self._value_mask
-        else:
-            wire = np.zeros((len(array), self._size), np.uint8)
-            np.ndarray(len(array), self._wire, wire)[:] = array.view(self._native)
-        wire |= self._tags
-        return wire.tobytes()
+        native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
+        return (native.take(self._to_wire, axis=1) & self._value_mask | self._tags).tobytes()
 
     def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the messages in an array of this dtype that pass the rules."""
@@ -202,12 +184,6 @@ class Arrays(Generic[M]):
             }
         )
 
-    def _to_native(self, wire: npt.NDArray[np.uint8]) -> MessageArray:
-        """Return the messages of payloads without their tags, of shape (n, size)."""
-        if len(wire) < _CAST_FROM:
-            return np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
-        return np.ndarray(len(wire), self._wire, wire).astype(self._native).view(self.dtype)
-
 
 @kept
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
@@ -219,13 +195,6 @@ def _squared_norms(quaternions: npt.NDArray[np.float32]) -> Any:
     """Return the squares of the norms, in float64, of quaternions of shape (4, n)."""
     w, x, y, z = quaternions.astype(float)
     return w * w + x * x + y * y + z * z
-
-
-def _wire_offsets(named: Sequence[tuple[str, np.dtype[Any], int]]) -> Iterator[int]:
-    """Yield the offset in a payload of each byte of an element."""
-    for _, kind, offset in named:
-        indexes = range(offset, offset + kind.itemsize)
-        yield from reversed(indexes) if sys.byteorder == "little" and kind.kind != "S" else indexes
 
 
 DTYPE: Final = arrays_of(DEFAULT).dtype

@@ -34,7 +34,7 @@ class Validation:
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
         names, kinds = tuple(types), types.values()
-        self.passes_rules = passes_all(rules, lambda name: f"values[{names.index(name)}]")
+        self.passes_rules = passes_all(rules, {name: f"values[{index}]" for index, name in enumerate(names)})
         self.values_of: Callable[[Any], Values] = (
             itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         )
