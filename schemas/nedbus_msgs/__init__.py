@@ -1,6 +1,5 @@
 """The contract of nedbus: messages, layouts, topics and wire format; no I/O, no Zenoh."""
 
-from .clock import YEAR_2000, is_unix_time
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
 from .errors import (
@@ -14,12 +13,12 @@ from .errors import (
     UnknownLayoutError,
 )
 from .flags import DOUBT_FLAGS, describe_flags, message_doubts
-from .functions import DEFAULT, definition_of, json_schema_of, layout_table_of, schema_of
+from .functions import DEFAULT, definition_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
 from .model.message import Message
-from .model.px4_types import BASES, FieldType, decode_text, field_type
+from .model.px4_types import BASES, YEAR_2000, FieldType, decode_text, field_type, is_unix_time
 from .model.rules import UnitQuaternion
 from .provenance import Provenance, encoding_of, identity_of, provenance_of, short_hash
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
@@ -56,8 +55,8 @@ __all__ = [
     "ack_key", "address_of_alive_key", "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle",
     "codec_of", "dds_type", "decode_text", "decode_with", "define", "define_msg", "definition_of",
     "definition_text", "describe", "describe_flags", "encode_with", "encoding_of", "field_type", "get_topic",
-    "hash_of", "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input", "json_schema_of",
-    "layout_table_of", "message_doubts", "message_of_type_hash", "provenance_of", "read_msg", "rejected_key_expr",
-    "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "schema_of", "short_hash", "split_ros2_topic",
+    "hash_of", "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input",
+    "message_doubts", "message_of_type_hash", "provenance_of", "read_msg", "rejected_key_expr",
+    "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "short_hash", "split_ros2_topic",
     "status_key", "topic_of", "upgrade_fields", "upgrade_with", "vehicle_name",
 ]  # fmt: skip

@@ -85,11 +85,12 @@ class Arrays(Generic[M]):
         # Zero where the tags are right, and 0 or 1 for bools.
         wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
         wrong = wire & self._tag_mask
+        is_damaged = np.count_nonzero(wrong) > 0
+        if is_damaged:
+            wire &= self._value_mask
         array = np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
         valid = self.valid_mask(array)
-        if np.count_nonzero(wrong):
-            valid &= ~wrong.any(axis=1)
-        return array, valid
+        return array, valid & ~wrong.any(axis=1) if is_damaged else valid
 
     def encode(self, array: MessageArray) -> bytes:
         """Return the concatenated payloads of messages, without validating them."""
@@ -140,8 +141,7 @@ class Arrays(Generic[M]):
 
     def to_message(self, element: np.void) -> M:
         """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
-        fields: dict[str, Any] = dict(zip(self.definition.names, self.to_row(element), strict=True))
-        return self.definition.model(**fields)
+        return self.definition.model(**self.definition.validation.name(self.to_row(element)))
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
         """Return unvalidated CDR payloads, one per element; all fields of the layout are the model's."""

@@ -14,6 +14,8 @@ from pydantic_core import CoreSchema, core_schema
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
+YEAR_2000: Final = 946_684_800_000_000  # us; an earlier time is since boot
+_YEAR_2100: Final = 4_102_444_800_000_000
 LONGEST_ARRAY: Final = 1024
 """Elements of the longest array allowed; PX4's longest has 512."""
 
@@ -187,6 +189,11 @@ def field_type(text: str) -> FieldType:
     if found[2] is None:
         return FieldType(ALIASES.get(found[1], found[1]))
     return FieldType(found[1] if found[1] == "char" else ALIASES.get(found[1], found[1]), int(found[2]))
+
+
+def is_unix_time(timestamp_us: Any) -> Any:
+    """Return whether a time [us], or each of an array, is Unix time, a date from 2000 to 2100, not since boot."""
+    return (timestamp_us >= YEAR_2000) & (timestamp_us < _YEAR_2100)
 
 
 def field(meaning: str) -> Any:
