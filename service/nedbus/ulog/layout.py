@@ -115,7 +115,7 @@ class Formats:
                 if flat in fields:
                     raise ValueError(f"two fields are called {flat}, including those of nested messages")
                 array = "char" if c_type == "char" else base.base
-                fields[flat] = PayloadField(flat, FieldType(array, length) if length else base, start)
+                fields[flat] = PayloadField(flat, field_type(f"{array}[{length}]") if length else base, start)
             size = size if field.startswith("_padding") else offset
         return PayloadLayout(tuple(fields.values()), size, offset - size)
 
