@@ -15,6 +15,8 @@ from .model.message import Message
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"
+REJECTED: Final = "/@rejected"
+"""Addition to the prefix in the keys of reports on rejected messages."""
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TOPIC_LENGTH: Final = 64
@@ -70,7 +72,7 @@ class Address:
 
     def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of reports on rejected messages of this address."""
-        return f"{prefix}/@rejected/{self}"
+        return self.key(prefix=prefix + REJECTED)
 
     @classmethod
     def from_rate_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -153,16 +155,6 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     if not (alive and publisher):
         raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<publisher>/<topic>[/<instance>]")
     return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
-
-
-def rejected_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key expression of reports on rejected messages of all addresses."""
-    return f"{prefix}/@rejected/**"
-
-
-def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-    """Parse the key of a report on rejected messages; raise AddressError for any other key."""
-    return Address.from_key(key, prefix=f"{prefix}/@rejected")
 
 
 def schema_key(message: str, *, session: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:

@@ -18,12 +18,6 @@ class VehicleLocalPosition(Message):
     Frame: local NED, metres, radians, seconds; z points down.
     The origin is where EKF2 started, or the global origin once that is set.
     x, y, z, vx, vy and vz hold numbers even while they are invalid: check the flags.
-
-    A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
-    bit for bit as it was made; a number beyond float32 (1e39) is rejected.
-    A field that is not given is "not provided": NaN, false or 0, and absent from `model_fields_set`.
-
-    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
     """
 
     TOPICS = (
