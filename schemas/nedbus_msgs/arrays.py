@@ -70,8 +70,8 @@ class Arrays(Generic[M]):
         for name, kind in types.items():
             form += kind.form if name in ruled else f"{self.dtype[name].itemsize}x"
             if name in ruled:
-                places[name] = f"values[{index}:{index + kind.count}]" if kind.is_array else f"values[{index}]"
-                index += kind.count
+                places[name] = f"values[{index}:{index + kind.values}]" if kind.is_array else f"values[{index}]"
+                index += kind.values
         self._ruled, self._passes_rules = struct.Struct(form), passes_all(definition.rules, places)
         self._wrong_columns = wrong_columns(
             definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
@@ -141,7 +141,8 @@ class Arrays(Generic[M]):
 
     def to_message(self, element: np.void) -> M:
         """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
-        return self.definition.model(**self.definition.validation.name(self.to_row(element)))
+        fields: dict[str, Any] = self.definition.validation.name(self.to_row(element))
+        return self.definition.model(**fields)
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
         """Return unvalidated CDR payloads, one per element; all fields of the layout are the model's."""
@@ -169,7 +170,7 @@ class Arrays(Generic[M]):
                 array[name] = packed[name]
             if kind.base == "bool":
                 offset = cdr_layout(layout).offsets[name]
-                fits &= (bytes_of[:, offset : offset + kind.count] <= 1).all(axis=1)
+                fits &= (bytes_of[:, offset : offset + kind.values] <= 1).all(axis=1)
         return array, fits & self.valid_mask(array)
 
     @staticmethod

@@ -175,7 +175,7 @@ def _forms(
         tags, values, code = tags + own_tags, values + own_values, code + own_code
         tag = 3 * kind.is_text or int(kind.base != "bool")  # bytes of the tag besides the value
         step = tag + kind.size
-        offsets += [(name, part, len(tags) - (kind.count - part) * step + tag) for part in range(kind.count)]
+        offsets += [(name, part, len(tags) - (kind.values - part) * step + tag) for part in range(kind.values)]
     mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
     return int.from_bytes(tags, "big"), mask, struct.Struct(code), tuple(offsets)
 

@@ -42,9 +42,7 @@ class FailsafeFlags(Message):
     mode_req_mission: Uint32 = field("Modes that need a mission, as bits")
     mode_req_offboard_signal: Uint32 = field("Modes that need setpoints from a companion, as bits")
     mode_req_home_position: Uint32 = field("Modes that need home, as bits")
-    mode_req_wind_and_flight_time_compliance: Uint32 = field(
-        "Modes that need wind and time of flight within limits, as bits"
-    )
+    mode_req_wind_and_flight_time_compliance: Uint32 = field("Modes with limits of wind and time of flight, as bits")
     mode_req_prevent_arming: Uint32 = field("Modes in which the vehicle cannot be armed, as bits")
     mode_req_manual_control: Uint32 = field("Modes that need manual control, as bits")
     mode_req_other: Uint32 = field("Modes that need something else, as bits")

@@ -74,19 +74,13 @@ class VehicleStatus(Message):
     armed_time: Uint64 = field("Time of arming, since boot [us], 0 if not armed")
     takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if there was none")
 
-    arming_state: Uint8 = field(
-        "Arming: 1 disarmed, 2 armed; up to 1.14 also 0 start, 3 error, 4 shutdown, 5 restored in air"
-    )
-    latest_arming_reason: Uint8 = field(
-        "Why armed: 1 stick, 2 switch, 3, 4 command, 5 mission ..., see ARM_DISARM_REASON_"
-    )
+    arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 start, 3 error, 4 shutdown, 5 restored in air")
+    latest_arming_reason: Uint8 = field("Why armed: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
     latest_disarming_reason: Uint8 = field("Why disarmed, as latest_arming_reason: 6 landed (up to 1.17: 7) ...")
 
     nav_state_timestamp: Uint64 = field("Time of the latest change of nav_state, since boot [us]")
     nav_state_user_intention: Uint8 = field("Mode that the user chose, as nav_state")
-    nav_state: Uint8 = field(
-        "Mode in force: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ..."
-    )
+    nav_state: Uint8 = field("Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ...")
 
     executor_in_charge: Uint8 = field("Executor of modes in charge: 0 the autopilot")
     nav_state_display: Uint8 = field("Mode to show to the user, as nav_state")

@@ -162,7 +162,7 @@ class Definition(Generic[M_co]):
                 if base in direct or base in converted:
                     continue
                 if index is not None:
-                    parts.setdefault(base, [None] * self.types[base].count)[index] = old.name
+                    parts.setdefault(base, [None] * self.types[base].values)[index] = old.name
                 elif old.up:
                     converted[base] = old.name, old.up
                 else:

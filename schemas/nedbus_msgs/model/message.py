@@ -37,7 +37,9 @@ class Message(BaseModel):
     ALWAYS: ClassVar[str] = "timestamp"
     DEFINITION: ClassVar[Definition[Any]]
 
-    timestamp: Timestamp = Field(description="Time since boot [us]")
+    timestamp: Timestamp = Field(
+        description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)"
+    )
 
     if not TYPE_CHECKING:
 

@@ -54,7 +54,7 @@ class FieldType(str):
     `base`: the type of one value; `length`: the elements of an array, None for a single value.
     `is_text`: True for an array of characters. `char[127]` is a single value, a text (`str`) of at most 127 bytes of
     UTF-8. It ends at the first NUL, and bytes that are not UTF-8 become "?".
-    `is_array`: True for a type whose value is a tuple. `count`: number of values.
+    `is_array`: True for a type whose value is a tuple. `values`: number of values.
     `form`: the struct format of all values. `size`: size of one value in bytes.
     `is_float`: True for float types, whose values may be NaN. `limits`: minimum and maximum of an integer type.
     `absent`: value of a field that is not provided: NaN, false or 0; in an array, for each element.
@@ -66,10 +66,10 @@ class FieldType(str):
         self.length = int(length) if length else None
         self.is_text, self.is_float = self.base == "char", self.base.startswith("float")
         self.is_array = self.length is not None and not self.is_text
-        self.count = int(length) if self.is_array else 1
+        self.values = int(length) if self.is_array else 1
         self.form = f"{self.length or 1}{base.code}"
-        self.size = struct.calcsize("<" + self.form) // self.count
-        self.absent: object = (base.absent,) * self.count if self.is_array else base.absent
+        self.size = struct.calcsize("<" + self.form) // self.values
+        self.absent: object = (base.absent,) * self.values if self.is_array else base.absent
         bits = 8 * self.size
         self.limits = (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
@@ -97,7 +97,7 @@ class FieldType(str):
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
         value = str if self.is_text else bool if self.base == "bool" else float if self.is_float else int
-        python = tuple[(value,) * self.count] if self.is_array else value  # type: ignore[misc] # one for each
+        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one for each
         return Annotated[python, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:

@@ -102,13 +102,13 @@ def _flat_forms(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values],
     for position, kind in enumerate(kinds):
         if kind.length is not None:
             start = place + position - index
-            array, text = f"row[{start}:{start + kind.count}]", f"decode_text(row[{start}])"
+            array, text = f"row[{start}:{start + kind.values}]", f"decode_text(row[{start}])"
             flat += [
                 f"*row[{index}:{position}]",
                 f"encode_text(row[{position}])" if kind.is_text else f"*row[{position}]",
             ]
             nested += [f"*row[{place}:{start}]", text if kind.is_text else array]
-            index, place = position + 1, start + kind.count
+            index, place = position + 1, start + kind.values
     if not flat:
         return tuple, tuple
     functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ((flat, index), (nested, place))]

@@ -11,7 +11,7 @@ from nedbus import clock
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
-from nedbus.transport import Tls, check_pem, open_client, split_endpoint
+from nedbus.transport import UNKNOWN_AUTHORITY, Tls, check_pem, open_client, split_endpoint
 
 from .finding import Finding, State, brief, worst_state
 
@@ -28,8 +28,7 @@ _ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
     "": "it aborts the handshake",
 }
 _RENEW: Final = "renew it: 'nedbus pki renew', docs/security.md"
-_UNKNOWN_AUTHORITY: Final = (7, 18, 19, 20, 21)  # OpenSSL's codes
-_OTHER_HOST: Final = (62, 64)
+_OTHER_HOST: Final = (62, 64)  # OpenSSL's codes
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
@@ -96,13 +95,19 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
         yield Finding("tls", endpoint, "wrong", "cannot verify the router: no authority is given", advice)
         return
     try:
-        _shake_hands(host, port, tls)
+        with (
+            suppress(TimeoutError, ConnectionError),
+            socket.create_connection((host, port), timeout=_HANDSHAKE_TIMEOUT) as plain,
+            tls.context().wrap_socket(plain, server_hostname=host) as connection,
+        ):
+            connection.settimeout(_ALERT_TIMEOUT)
+            connection.recv(1)  # with TLS 1.3 the alert comes after the handshake
     except ssl.SSLCertVerificationError as exc:
         if exc.verify_code in _OTHER_HOST:
             names = f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}" if certificate else ""
             seen = f"the router's certificate is not for {host}{names}"
             advice = f"connect to one of its hosts, or create a certificate: 'nedbus pki cert' with --host {host}"
-        elif exc.verify_code in _UNKNOWN_AUTHORITY:
+        elif exc.verify_code in UNKNOWN_AUTHORITY:
             issuer = f", but by {brief(certificate.issuer)}" if certificate else ""
             seen = f"the router's certificate is not signed by the authority in {tls.ca}{issuer}"
             advice = "pass its authority as --tls-ca, or check that the router is yours"
@@ -121,21 +126,6 @@ def _read_certificate(host: str, port: int) -> str:
     with suppress(OSError):  # SSLError, too
         return ssl.get_server_certificate((host, port), timeout=_HANDSHAKE_TIMEOUT)
     return ""
-
-
-def _shake_hands(host: str, port: int, tls: Tls) -> None:
-    """Perform a TLS handshake as a client; raise SSLError if either side rejects the other."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.load_verify_locations(tls.ca)
-    if tls.certificate is not None:
-        context.load_cert_chain(tls.certificate, tls.key)
-    with (
-        suppress(TimeoutError, ConnectionError),
-        socket.create_connection((host, port), timeout=_HANDSHAKE_TIMEOUT) as plain,
-        context.wrap_socket(plain, server_hostname=host) as connection,
-    ):
-        connection.settimeout(_ALERT_TIMEOUT)
-        connection.recv(1)  # with TLS 1.3 the alert comes after the handshake
 
 
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:
