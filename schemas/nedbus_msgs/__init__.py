@@ -2,6 +2,7 @@
 
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
+from .definitions import DEFAULT, define, definition_of
 from .errors import (
     AddressError,
     ArgumentError,
@@ -13,7 +14,6 @@ from .errors import (
     UnknownLayoutError,
 )
 from .flags import DOUBT_FLAGS, describe_flags, message_doubts
-from .functions import DEFAULT, definition_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
@@ -43,7 +43,6 @@ from .topics import (
     topic_of,
     vehicle_name,
 )
-from .undeclared import define
 
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "MESSAGES",

@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 from .codecs.cdr import HEAD, cdr_layout
 from .codecs.msgpack import codec_of
+from .definitions import DEFAULT, M, definition_of
 from .errors import InvalidMessageError
-from .functions import DEFAULT, M, definition_of
 from .model.declaration import Layout, kept
 from .model.definition import MESSAGES, Definition
 from .model.message import Message
-from .model.px4_types import BASES, FieldType, decode_text, encode_text
+from .model.px4_types import BASES, FieldType, encode_text
 from .model.rules import passes_all, wrong_columns
 from .model.validation import Values
 
@@ -62,8 +62,7 @@ class Arrays(Generic[M]):
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
         self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
-        self._arrays = [index for index, kind in enumerate(types.values()) if kind.is_array]
-        self._texts = [index for index, kind in enumerate(types.values()) if kind.is_text]
+        self._has_text = any(kind.is_text for kind in types.values())
         ruled = {name for rule in definition.rules for name in rule.fields}
         # A struct that unpacks the fields with rules from the bytes of an element, and the index of each.
         form, places, index = "=", dict[str, str](), 0
@@ -126,16 +125,11 @@ class Arrays(Generic[M]):
 
     def to_row(self, element: np.void) -> Values:
         """Return the values of one element in PX4's order, arrays as tuples."""
-        values = list(element.item())
-        for index in self._arrays:
-            values[index] = tuple(values[index].tolist())
-        for index in self._texts:
-            values[index] = decode_text(values[index])
-        return tuple(values)
+        return self.definition.validation.unpack(element.tobytes())
 
     def to_element(self, row: Values) -> Values:
         """Return the values of all fields as an array takes them: NumPy would reject a text that is not ASCII."""
-        if not self._texts:
+        if not self._has_text:
             return row
         return tuple(encode_text(value) if isinstance(value, str) else value for value in row)
 

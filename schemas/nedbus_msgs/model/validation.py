@@ -88,6 +88,10 @@ class Validation:
         packed = self._struct.pack(*self.flatten(row))
         return self.name(self.unflatten(self._struct.unpack(packed)))
 
+    def unpack(self, packed: bytes) -> Values:
+        """Return the values of all fields from their native forms, one behind the other."""
+        return self.unflatten(self._struct.unpack(packed))
+
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the name and the reason for each number beyond the range of its float32 field."""
         for name, kind in self._types.items():

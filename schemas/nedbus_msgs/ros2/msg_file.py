@@ -6,11 +6,11 @@ from functools import lru_cache
 from itertools import islice
 from typing import Final, NamedTuple
 
+from nedbus_msgs.definitions import define
 from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
 from nedbus_msgs.model.rules import InRange
-from nedbus_msgs.undeclared import define
 
 from .types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
 
