@@ -27,6 +27,7 @@ from .ros2.types import dds_type, definition_text, hash_of, message_of_type_hash
 from .topics import (
     ANY,
     DEFAULT_PREFIX,
+    RATE,
     REJECTED,
     Address,
     Selection,
@@ -46,7 +47,7 @@ from .topics import (
 
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "MESSAGES",
-    "PAYLOAD_LIMIT", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address", "AddressError",
+    "PAYLOAD_LIMIT", "RATE", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address", "AddressError",
     "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
     "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError", "NedbusError", "Provenance", "Quantity",
     "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion", "UnknownLayoutError", "VehicleLocalPosition",
