@@ -28,10 +28,11 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
         text = f"connected sessions: {router.sessions:,}"
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-        is_nearly_full = router.load is not None and router.load >= _NEARLY_FULL
-        advice = "raise max_sessions and the limit of open files, or run a second router: docs/hosts.md"
-        state: State = "warning" if is_nearly_full else "ok"
-        yield Finding("router", router.zid, state, text, advice if is_nearly_full else "")
+        if router.load is not None and router.load >= _NEARLY_FULL:
+            advice = "raise max_sessions and the limit of open files, or run a second router: docs/hosts.md"
+            yield Finding("router", router.zid, "warning", text, advice)
+        else:
+            yield Finding("router", router.zid, "ok", text)
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
@@ -204,9 +205,8 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         others = f"{len(off)} others, which agree with each other"
         yield _judge_clock("this host", "this host's clock", -middle, others, _SYNCHRONISE)
         return
-    blame = "the other clocks agree with this host: set this one."
-    if len(clocks) == len(off):
-        blame = "either of the two may be off."
+    only = len(clocks) == len(off)
+    blame = "either of the two may be off." if only else "the other clocks agree with this host: set this one."
     for name, offset in off.items():
         yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:

@@ -13,7 +13,7 @@ from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.transport import UNKNOWN_AUTHORITY, Tls, check_pem, open_client, split_endpoint
 
-from .finding import Finding, State, brief, worst_state
+from .finding import Finding, brief, worst_state
 
 _CONNECT_TIMEOUT: Final = 2.0  # s
 _HANDSHAKE_TIMEOUT: Final = 1.5  # s
@@ -134,13 +134,12 @@ def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls 
     found = [(name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items()]
     findings = [(name, finding) for name, finding in found if finding is not None]
     wrong = {finding.seen for _, finding in findings if finding.state == "wrong"}
-    tls, advice = None, ""
+    tls, reason, advice = None, None, ""
     try:
         if settings.tls is not None:
             settings.tls.zenoh_settings()
-        tls = settings.tls
-        reason = tls.explain() if tls is not None and not wrong else None
-        advice = "use a certificate signed by the authority of the router"
+            tls, advice = settings.tls, "use a certificate signed by the authority of the router"
+            reason = None if wrong else tls.explain()
     except ConfigError as exc:
         reason = exc.reason
     if reason and reason not in wrong and not settings.left_out & _PEM_FILES.keys():
@@ -167,15 +166,14 @@ def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[F
         return Finding(check, subject, "unknown", "the expiry of the certificate is not checked", str(exc)), None
     except ValueError as exc:
         return Finding(check, subject, "wrong", f"not a valid certificate: {exc}"), None
-    now = clock.now()
+    now, seen = clock.now(), f"{whose} {brief(certificate)}"
     days = certificate.days_left(now)
-    state: State = "ok"
-    note = advice = ""
+    finding = Finding(check, subject, "ok", seen)
     if days < 0:
-        state, note, advice = "wrong", ": it has expired", _RENEW
+        finding = Finding(check, subject, "wrong", f"{seen}: it has expired", _RENEW)
     elif now < certificate.begins:
-        state, note = "wrong", ": it is not valid yet"
         advice = f"check the clock of this host: {now:%Y-%m-%d %H:%M} UTC"
+        finding = Finding(check, subject, "wrong", f"{seen}: it is not valid yet", advice)
     elif certificate.is_due(now):
-        state, note, advice = "warning", f", {days:.0f} days from now", _RENEW
-    return Finding(check, subject, state, f"{whose} {brief(certificate)}{note}", advice), certificate
+        finding = Finding(check, subject, "warning", f"{seen}, {days:.0f} days from now", _RENEW)
+    return finding, certificate
