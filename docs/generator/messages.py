@@ -70,7 +70,7 @@ def rows_of(rule: Rule) -> list[list[str]]:
         return [[names(fields), f"must be finite while `{flag}` is true"] for flag, fields in rule.flags.items()]
     if isinstance(rule, NotLater):
         return [[f"`{rule.fields[0]}`", f"must not be later than `{rule.fields[1]}`"]]
-    return [[names(rule.fields), rule.reason]]
+    return [[names(rule.fields), rule.checks[0].reason]]
 
 
 def names(fields: Iterable[str]) -> str:

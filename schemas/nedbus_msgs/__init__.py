@@ -1,8 +1,8 @@
 """The contract of nedbus: messages, layouts, topics and wire format; no I/O, no Zenoh."""
 
-from .clock import YEAR_2000, is_unix_time
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
+from .definitions import DEFAULT, define, definition_of
 from .errors import (
     AddressError,
     ArgumentError,
@@ -14,12 +14,11 @@ from .errors import (
     UnknownLayoutError,
 )
 from .flags import DOUBT_FLAGS, describe_flags, message_doubts
-from .functions import DEFAULT, definition_of, json_schema_of, layout_table_of, schema_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
 from .model.message import Message
-from .model.px4_types import BASES, FieldType, decode_text, field_type
+from .model.px4_types import BASES, YEAR_2000, FieldType, decode_text, field_type, is_unix_time
 from .model.rules import UnitQuaternion
 from .provenance import Provenance, encoding_of, identity_of, provenance_of, short_hash
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
@@ -28,16 +27,16 @@ from .ros2.types import dds_type, definition_text, hash_of, message_of_type_hash
 from .topics import (
     ANY,
     DEFAULT_PREFIX,
+    RATE,
+    REJECTED,
     Address,
     Selection,
     ack_key,
     address_of_alive_key,
-    address_of_rejected_key,
     check_prefix,
     check_vehicle,
     get_topic,
     is_vehicle_input,
-    rejected_key_expr,
     ros2_topic_of,
     schema_key,
     split_ros2_topic,
@@ -45,19 +44,17 @@ from .topics import (
     topic_of,
     vehicle_name,
 )
-from .undeclared import define
 
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "MESSAGES",
-    "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address", "AddressError",
+    "PAYLOAD_LIMIT", "RATE", "REJECTED", "RELEASES", "RESET_COUNTERS", "TOPICS", "YEAR_2000", "Address", "AddressError",
     "ArgumentError", "Codec", "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType",
     "InvalidMessageError", "Layout", "LayoutError", "Message", "MsgError", "NedbusError", "Provenance", "Quantity",
     "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion", "UnknownLayoutError", "VehicleLocalPosition",
-    "ack_key", "address_of_alive_key", "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle",
-    "codec_of", "dds_type", "decode_text", "decode_with", "define", "define_msg", "definition_of",
-    "definition_text", "describe", "describe_flags", "encode_with", "encoding_of", "field_type", "get_topic",
-    "hash_of", "hash_of_msg", "identity_of", "is_unix_time", "is_vehicle_input", "json_schema_of",
-    "layout_table_of", "message_doubts", "message_of_type_hash", "provenance_of", "read_msg", "rejected_key_expr",
-    "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "schema_of", "short_hash", "split_ros2_topic",
+    "ack_key", "address_of_alive_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of", "dds_type",
+    "decode_text", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
+    "describe_flags", "encode_with", "encoding_of", "field_type", "get_topic", "hash_of", "hash_of_msg",
+    "identity_of", "is_unix_time", "is_vehicle_input", "message_doubts", "message_of_type_hash", "provenance_of",
+    "read_msg", "ros2_topic_of", "ros2_type", "ros2_types", "schema_key", "short_hash", "split_ros2_topic",
     "status_key", "topic_of", "upgrade_fields", "upgrade_with", "vehicle_name",
 ]  # fmt: skip

@@ -6,7 +6,7 @@ Import this module only where arrays are used: NumPy takes longer to load than e
 
 import struct
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Generic
 
 import numpy as np
@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 from .codecs.cdr import HEAD, cdr_layout
 from .codecs.msgpack import codec_of
+from .definitions import DEFAULT, M, definition_of
 from .errors import InvalidMessageError
-from .functions import DEFAULT, M, definition_of
 from .model.declaration import Layout, kept
 from .model.definition import MESSAGES, Definition
 from .model.message import Message
-from .model.px4_types import BASES, FieldType, decode_text, encode_text
+from .model.px4_types import BASES, FieldType, encode_text
 from .model.rules import passes_all, wrong_columns
 from .model.validation import Values
 
@@ -31,8 +31,6 @@ __all__ = [
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
-_CAST_FROM: Final = 256
-"""Number of messages from which a NumPy cast of all fields is faster than copying single bytes."""
 _COLUMNS_FROM: Final = 20
 """Number of messages from which checking rules by column is faster than by message."""
 
@@ -53,37 +51,27 @@ class Arrays(Generic[M]):
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size
-        # Two flat dtypes with a name for each value, also those in arrays: of the array's bytes, and of a payload.
-        named = [(f"{name}.{part}", self.dtype[name].base, offset) for name, part, offset in self._codec.offsets]
-        self._native = np.dtype([(name, kind) for name, kind, _ in named])
-        self._wire = np.dtype(
-            {
-                "names": [name for name, _, _ in named],
-                "formats": [kind.newbyteorder(">") for _, kind, _ in named],
-                "offsets": [offset for _, _, offset in named],
-                "itemsize": size,
-            }
-        )
-        self._from_wire = np.fromiter(_wire_offsets(named), np.intp, self.dtype.itemsize)
+        # The offset in a payload of each byte of an element.
+        self._from_wire = np.array([], np.intp)
+        for name, _, offset in self._codec.offsets:
+            bytes_of = np.arange(offset, offset + types[name].size)
+            is_swapped = sys.byteorder == "little" and not types[name].is_text
+            self._from_wire = np.append(self._from_wire, bytes_of[::-1] if is_swapped else bytes_of)
         self._to_wire = np.zeros(size, np.intp)
         self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
         self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
         self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
-        self._arrays = [index for index, kind in enumerate(types.values()) if kind.is_array]
-        self._texts = [index for index, kind in enumerate(types.values()) if kind.is_text]
+        self._has_text = any(kind.is_text for kind in types.values())
         ruled = {name for rule in definition.rules for name in rule.fields}
         # A struct that unpacks the fields with rules from the bytes of an element, and the index of each.
-        steps, places, index = [], dict[str, str](), 0
+        form, places, index = "=", dict[str, str](), 0
         for name, kind in types.items():
-            if name not in ruled:
-                steps.append(f"{self.dtype[name].itemsize}x")
-                continue
-            steps.append(kind.form)
-            places[name] = f"values[{index}:{index + kind.count}]" if kind.is_array else f"values[{index}]"
-            index += kind.count
-        self._ruled = struct.Struct("=" + "".join(steps))
-        self._passes_rules = passes_all(definition.rules, places.__getitem__)
+            form += kind.form if name in ruled else f"{self.dtype[name].itemsize}x"
+            if name in ruled:
+                places[name] = f"values[{index}:{index + kind.values}]" if kind.is_array else f"values[{index}]"
+                index += kind.values
+        self._ruled, self._passes_rules = struct.Struct(form), passes_all(definition.rules, places)
         self._wrong_columns = wrong_columns(
             definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
         )
@@ -96,23 +84,17 @@ class Arrays(Generic[M]):
         # Zero where the tags are right, and 0 or 1 for bools.
         wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
         wrong = wire & self._tag_mask
-        if not np.count_nonzero(wrong):
-            array = self._to_native(wire)
-            return array, self.valid_mask(array)
-        array = self._to_native(wire & self._value_mask)
-        return array, self.valid_mask(array) & ~wrong.any(axis=1)
+        is_damaged = np.count_nonzero(wrong) > 0
+        if is_damaged:
+            wire &= self._value_mask
+        array = np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
+        valid = self.valid_mask(array)
+        return array, valid & ~wrong.any(axis=1) if is_damaged else valid
 
     def encode(self, array: MessageArray) -> bytes:
         """Return the concatenated payloads of messages, without validating them."""
-        if len(array) < _CAST_FROM:
-            native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
-            wire = native.take(self._to_wire, axis=1)
-            wire &= self._value_mask
-        else:
-            wire = np.zeros((len(array), self._size), np.uint8)
-            np.ndarray(len(array), self._wire, wire)[:] = array.view(self._native)
-        wire |= self._tags
-        return wire.tobytes()
+        native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
+        return (native.take(self._to_wire, axis=1) & self._value_mask | self._tags).tobytes()
 
     def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the messages in an array of this dtype that pass the rules."""
@@ -143,22 +125,17 @@ class Arrays(Generic[M]):
 
     def to_row(self, element: np.void) -> Values:
         """Return the values of one element in PX4's order, arrays as tuples."""
-        values = list(element.item())
-        for index in self._arrays:
-            values[index] = tuple(values[index].tolist())
-        for index in self._texts:
-            values[index] = decode_text(values[index])
-        return tuple(values)
+        return self.definition.validation.unpack(element.tobytes())
 
     def to_element(self, row: Values) -> Values:
         """Return the values of all fields as an array takes them: NumPy would reject a text that is not ASCII."""
-        if not self._texts:
+        if not self._has_text:
             return row
         return tuple(encode_text(value) if isinstance(value, str) else value for value in row)
 
     def to_message(self, element: np.void) -> M:
         """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
-        fields: dict[str, Any] = dict(zip(self.definition.names, self.to_row(element), strict=True))
+        fields: dict[str, Any] = self.definition.validation.name(self.to_row(element))
         return self.definition.model(**fields)
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
@@ -187,7 +164,7 @@ class Arrays(Generic[M]):
                 array[name] = packed[name]
             if kind.base == "bool":
                 offset = cdr_layout(layout).offsets[name]
-                fits &= (bytes_of[:, offset : offset + kind.count] <= 1).all(axis=1)
+                fits &= (bytes_of[:, offset : offset + kind.values] <= 1).all(axis=1)
         return array, fits & self.valid_mask(array)
 
     @staticmethod
@@ -202,12 +179,6 @@ class Arrays(Generic[M]):
             }
         )
 
-    def _to_native(self, wire: npt.NDArray[np.uint8]) -> MessageArray:
-        """Return the messages of payloads without their tags, of shape (n, size)."""
-        if len(wire) < _CAST_FROM:
-            return np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
-        return np.ndarray(len(wire), self._wire, wire).astype(self._native).view(self.dtype)
-
 
 @kept
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
@@ -219,13 +190,6 @@ def _squared_norms(quaternions: npt.NDArray[np.float32]) -> Any:
     """Return the squares of the norms, in float64, of quaternions of shape (4, n)."""
     w, x, y, z = quaternions.astype(float)
     return w * w + x * x + y * y + z * z
-
-
-def _wire_offsets(named: Sequence[tuple[str, np.dtype[Any], int]]) -> Iterator[int]:
-    """Yield the offset in a payload of each byte of an element."""
-    for _, kind, offset in named:
-        indexes = range(offset, offset + kind.itemsize)
-        yield from reversed(indexes) if sys.byteorder == "little" and kind.kind != "S" else indexes
 
 
 DTYPE: Final = arrays_of(DEFAULT).dtype

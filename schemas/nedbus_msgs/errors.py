@@ -10,15 +10,11 @@ class NedbusError(Exception):
     """Base of all errors that nedbus raises on purpose; picklable, for process pools."""
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuild, (type(self), self.args, self.__dict__)
+        return _rebuild, (type(self), self.args), self.__dict__
 
 
-def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict[str, object]) -> NedbusError:
-    """Create an error from its final text, which the constructor would format again."""
-    error = kind.__new__(kind)
-    error.args = arguments
-    error.__dict__.update(facts)
-    return error
+def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...]) -> NedbusError:
+    return kind.__new__(kind, *arguments)  # from its final text, which the constructor would format again
 
 
 class ArgumentError(NedbusError, ValueError):

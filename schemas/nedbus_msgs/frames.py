@@ -37,60 +37,37 @@ class Ned(NamedTuple):
 
 
 def ned_to_enu(vector: Vector) -> Vector:
-    """Convert a position, velocity or acceleration from NED to ENU."""
+    """Convert a position, velocity or acceleration from NED to ENU, or back."""
     north, east, down = vector
     return east, north, -down
 
 
-def enu_to_ned(vector: Vector) -> Vector:
-    """Convert a position, velocity or acceleration from ENU to NED."""
-    east, north, up = vector
-    return north, east, -up
-
-
 def frd_to_flu(vector: Vector) -> Vector:
-    """Convert a vector from the body frame FRD (PX4) to FLU (ROS)."""
+    """Convert a vector from the body frame FRD (PX4) to FLU (ROS), or back."""
     forward, right, down = vector
     return forward, -right, -down
 
 
-def flu_to_frd(vector: Vector) -> Vector:
-    """Convert a vector from the body frame FLU (ROS) to FRD (PX4)."""
-    forward, left, up = vector
-    return forward, -left, -up
-
-
 def yaw_ned_to_enu(yaw: float) -> float:
-    """Convert a heading, clockwise from north, to ENU: counterclockwise from east, within [-pi, pi]."""
-    return wrap(math.pi / 2 - yaw)
-
-
-def yaw_enu_to_ned(yaw: float) -> float:
-    """Convert a yaw, counterclockwise from east, to NED: clockwise from north, within [-pi, pi]."""
+    """Convert a heading, clockwise from north, to ENU, counterclockwise from east, or back; within [-pi, pi]."""
     return wrap(math.pi / 2 - yaw)
 
 
 def variances_ned_to_enu(variances: Vector) -> Vector:
-    """Convert variances of north, east and down to east, north and up; no sign changes."""
+    """Convert variances of north, east and down to east, north and up, or back; no sign changes."""
     north, east, down = variances
     return east, north, down
 
 
-def variances_enu_to_ned(variances: Vector) -> Vector:
-    """Convert variances of east, north and up to north, east and down; no sign changes."""
-    east, north, up = variances
-    return north, east, up
-
-
 def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
-    """Convert an attitude (w, x, y, z): PX4's rotation from FRD to NED becomes ROS's from FLU to ENU."""
+    """Convert an attitude (w, x, y, z): PX4's rotation from FRD to NED becomes ROS's from FLU to ENU, or back."""
     w, x, y, z = (value * math.sqrt(0.5) for value in q)
     return w + z, x + y, x - y, w - z
 
 
-def quaternion_enu_to_ned(q: Sequence[float]) -> _Quaternion:
-    """Convert an attitude (w, x, y, z): ROS's rotation from FLU to ENU becomes PX4's from FRD to NED."""
-    return quaternion_ned_to_enu(q)  # both changes of frame are half turns
+# Swaps of two axes, and half turns, are their own inverses.
+enu_to_ned, flu_to_frd, yaw_enu_to_ned = ned_to_enu, frd_to_flu, yaw_ned_to_enu
+variances_enu_to_ned, quaternion_enu_to_ned = variances_ned_to_enu, quaternion_ned_to_enu
 
 
 def wrap(angle: float) -> float:

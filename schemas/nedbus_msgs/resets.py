@@ -135,7 +135,12 @@ def _delta(fields: _Fields, message: Message, count: int) -> Point | None:
 def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: int) -> Point | None:
     """Return the jump at a new origin: zero, the delta or the shift of the origin, if one fits the values."""
     fields = _QUANTITIES[name]
-    candidates = [fields.zero, _delta(fields, message, count), _shift_of_origin(name, last, message)]
+    candidates = [fields.zero, _delta(fields, message, count)]
+    step = message.ref_alt - last.ref_alt
+    if name == "z" and math.isfinite(step):
+        candidates.append((step,))
+    elif name == "xy" and last.xy_global and message.xy_global:
+        candidates.append(MapProjection(message.ref_lat, message.ref_lon).project(last.ref_lat, last.ref_lon))
     seconds = (message.timestamp - last.timestamp) / 1e6
     rates = [getattr(last, rate) for rate in fields.rates]
     motion = [rate * seconds if math.isfinite(rate) else 0.0 for rate in rates]
@@ -145,16 +150,6 @@ def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: 
     tolerance = _TOLERANCE + math.hypot(*motion) / 2
     best = min((jump for jump in candidates if jump is not None), key=lambda jump: math.dist(jump, observed))
     return best if math.dist(best, observed) <= tolerance else None
-
-
-def _shift_of_origin(name: Quantity, last: Message, message: Message) -> Point | None:
-    """Return the change of a fixed point's local coordinates when the origin changes."""
-    if name == "z":
-        step = message.ref_alt - last.ref_alt
-        return (step,) if math.isfinite(step) else None
-    if not (last.xy_global and message.xy_global):
-        return None
-    return MapProjection(message.ref_lat, message.ref_lon).project(last.ref_lat, last.ref_lon)
 
 
 def _origin(message: Message) -> tuple[float | None, ...]:

@@ -15,13 +15,16 @@ from .model.message import Message
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"
+RATE: Final = "/@rate/"
+"""Between the key of a stream and its downsampled rate [messages per second]."""
+REJECTED: Final = "/@rejected"
+"""Addition to the prefix in the keys of reports on rejected messages."""
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TOPIC_LENGTH: Final = 64
 _SIMILAR: Final = 0.9  # similarity from which a name counts as a misspelling of another
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
-_RATE: Final = "/@rate/"  # between the key of a stream and its downsampled rate [messages per second]
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
 _OUT: Final = ("fmu", "out")
 _IN: Final = ("fmu", "in")
@@ -70,19 +73,11 @@ class Address:
 
     def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of reports on rejected messages of this address."""
-        return f"{prefix}/@rejected/{self}"
-
-    @classmethod
-    def from_rate_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-        """Parse the key of a downsampled stream; raise AddressError for any other key."""
-        whole, rate, _ = key.rpartition(_RATE)
-        if not rate:
-            raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]{_RATE}<messages a second>")
-        return cls.from_key(whole, prefix=prefix)
+        return self.key(prefix=prefix + REJECTED)
 
     def rate_key(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of this stream downsampled to `rate` messages per second; "*" is any rate."""
-        return f"{self.key(prefix=prefix)}{_RATE}{rate}"
+        return f"{self.key(prefix=prefix)}{RATE}{rate}"
 
     @property
     def stream(self) -> str:
@@ -143,7 +138,7 @@ class Selection:
 
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of these streams downsampled to `rate` messages per second; "*" is any rate."""
-        return f"{self.key_expr(prefix=prefix)}{_RATE}{rate}"
+        return f"{self.key_expr(prefix=prefix)}{RATE}{rate}"
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -153,16 +148,6 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     if not (alive and publisher):
         raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<publisher>/<topic>[/<instance>]")
     return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
-
-
-def rejected_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key expression of reports on rejected messages of all addresses."""
-    return f"{prefix}/@rejected/**"
-
-
-def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-    """Parse the key of a report on rejected messages; raise AddressError for any other key."""
-    return Address.from_key(key, prefix=f"{prefix}/@rejected")
 
 
 def schema_key(message: str, *, session: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:

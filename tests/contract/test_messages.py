@@ -40,7 +40,6 @@ from nedbus_msgs import (
     hash_of_msg,
     message_of_type_hash,
     messages,
-    schema_of,
     upgrade_fields,
 )
 from nedbus_msgs.arrays import arrays_of
@@ -292,7 +291,7 @@ def test_message_is_described(name: str) -> None:
     definition = MESSAGES[name]
     assert [field for field in definition.types if not definition.meaning(field)] == []
     assert {field for rule in definition.rules for field in rule.fields} <= definition.types.keys()
-    assert json.loads(json.dumps(schema_of(definition)))["json_schema"]["title"] == name
+    assert json.loads(json.dumps(definition.schema()))["json_schema"]["title"] == name
     message = definition.model(timestamp=1)
     assert isinstance(message, Message)
     for field, kind in definition.types.items():

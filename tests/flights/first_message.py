@@ -23,8 +23,6 @@ from nedbus_msgs import (
     definition_text,
     encode_with,
     hash_of,
-    json_schema_of,
-    layout_table_of,
     message_of_type_hash,
     ros2_type,
     upgrade_with,
@@ -177,12 +175,14 @@ def message_definition(layout: str, message: type[Message] | str = _FIRST) -> st
 
 def json_schema(message: type[Message] | str = _FIRST) -> dict[str, object]:
     """Return the JSON Schema (2020-12) of a message as JSON; NaN and infinities are the strings of those names."""
-    return json_schema_of(definition_of(message))
+    schema: dict[str, object] = definition_of(message).schema()["json_schema"]
+    return schema
 
 
 def layout_table(message: type[Message] | str = _FIRST) -> list[dict[str, object]]:
     """Return every layout as name, number on the wire (or None), and its fields in order, each with name and type."""
-    return layout_table_of(definition_of(message))
+    layouts: list[dict[str, object]] = definition_of(message).schema()["layouts"]
+    return layouts
 
 
 def _layout(text: str, message: type[Message] | str) -> tuple[Definition[Any], Layout]:

@@ -92,9 +92,9 @@ def cdr_layout(layout: Layout) -> CdrLayout:
         body += (f"{padding}x" if padding else "") + kind.form
         offsets[name] = len(HEAD) + size + padding
         if kind.base == "bool":
-            not_bools |= int.from_bytes(b"\xfe" * kind.count) << 8 * offsets[name]
-        size += padding + kind.size * kind.count
-        unpadded += kind.size * kind.count
+            not_bools |= int.from_bytes(b"\xfe" * kind.values) << 8 * offsets[name]
+        size += padding + kind.size * kind.values
+        unpadded += kind.size * kind.values
     px4_struct = unpadded + -unpadded % 8
     limit = len(HEAD) + max(size, px4_struct + _PX4_EXTRA)
     return CdrLayout(struct.Struct(body), offsets, limit, not_bools, Validation(layout.types, ()))

@@ -32,14 +32,12 @@ def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
     A bool is only a tag, 0xc2 or 0xc3, whose last bit is the value; a text is a str 16, filled up with NUL.
     """
     base = BASES[kind.base]
-    if kind.is_text:
-        head = bytes([base.tag]) + kind.size.to_bytes(2, "big")
-        return head + bytes(kind.size), "3x" + kind.form, b"\x00" * 3 + b"\xff" * kind.size
+    tag = bytes([base.tag]) + (kind.size.to_bytes(2, "big") if kind.is_text else b"")
+    code = f"{len(tag)}x{kind.form if kind.is_text else base.code}"
+    one = tag + bytes(kind.size), code, bytes(len(tag)) + b"\xff" * kind.size
     if kind.base == "bool":
-        one = bytes([base.tag]), "?", b"\x01"
-    else:
-        one = bytes([base.tag]) + bytes(kind.size), "x" + base.code, b"\x00" + b"\xff" * kind.size
-    if kind.length is None:
+        one = tag, "?", b"\x01"
+    if kind.length is None or kind.is_text:
         return one
     head = bytes([0x90 | kind.length]) if kind.length < 16 else b"\xdc" + kind.length.to_bytes(2, "big")
     tags, form, bits = one
@@ -175,7 +173,7 @@ def _forms(
         tags, values, code = tags + own_tags, values + own_values, code + own_code
         tag = 3 * kind.is_text or int(kind.base != "bool")  # bytes of the tag besides the value
         step = tag + kind.size
-        offsets += [(name, part, len(tags) - (kind.count - part) * step + tag) for part in range(kind.count)]
+        offsets += [(name, part, len(tags) - (kind.values - part) * step + tag) for part in range(kind.values)]
     mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
     return int.from_bytes(tags, "big"), mask, struct.Struct(code), tuple(offsets)
 

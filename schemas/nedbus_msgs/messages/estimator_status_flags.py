@@ -23,28 +23,19 @@ class EstimatorStatusFlags(Message):
     )  # fmt: skip
     LAYOUTS = (
         Layout("1.13", """
-            timestamp timestamp_sample control_status_changes cs_tilt_align cs_yaw_align cs_gps cs_opt_flow
-            cs_mag_hdg cs_mag_3d cs_mag_dec cs_in_air cs_wind cs_baro_hgt cs_rng_hgt cs_gps_hgt cs_ev_pos cs_ev_yaw
-            cs_ev_hgt cs_fuse_beta cs_mag_field_disturbed cs_fixed_wing cs_mag_fault cs_fuse_aspd cs_gnd_effect
-            cs_rng_stuck cs_gps_yaw cs_mag_aligned_in_flight cs_ev_vel cs_synthetic_mag_z cs_vehicle_at_rest
-            cs_gps_yaw_fault cs_rng_fault cs_inertial_dead_reckoning cs_wind_dead_reckoning cs_rng_kin_consistent
-            fault_status_changes fs_bad_mag_x fs_bad_mag_y fs_bad_mag_z fs_bad_hdg fs_bad_mag_decl fs_bad_airspeed
-            fs_bad_sideslip fs_bad_optflow_x fs_bad_optflow_y fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n
-            fs_bad_pos_e fs_bad_pos_d fs_bad_acc_bias fs_bad_acc_vertical fs_bad_acc_clipping
-            innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos reject_ver_pos reject_mag_x
-            reject_mag_y reject_mag_z reject_yaw reject_airspeed reject_sideslip reject_hagl reject_optflow_x
-            reject_optflow_y"""),
+            1.14, without cs_fake_pos cs_fake_hgt cs_gravity_vector,
+            reject_ver_pos: reject_mag_x reject_mag_y reject_mag_z"""),
         Layout("1.14", """
-            1.13, without reject_mag_x reject_mag_y reject_mag_z, cs_rng_kin_consistent: cs_fake_pos cs_fake_hgt
-            cs_gravity_vector"""),
+            1.15, without cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos,
+            fs_bad_optflow_y: fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d"""),
         Layout("1.15", """
-            1.14, without fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d,
-            cs_gravity_vector: cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos"""),
-        Layout("1.16", """
-            1.15, without cs_gps cs_gps_yaw cs_gps_yaw_fault fs_bad_acc_bias, cs_yaw_align: cs_gnss_pos,
-            cs_rng_stuck: cs_gnss_yaw, cs_vehicle_at_rest: cs_gnss_yaw_fault, cs_aux_gpos: cs_rng_terrain
-            cs_opt_flow_terrain cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel"""),
-        Layout("1.17", "1.16, cs_gnss_vel: cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault"),
+            1.16, without cs_gnss_pos cs_gnss_yaw cs_gnss_yaw_fault cs_rng_terrain cs_opt_flow_terrain
+            cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel, cs_yaw_align: cs_gps,
+            cs_rng_stuck: cs_gps_yaw, cs_vehicle_at_rest: cs_gps_yaw_fault, fs_bad_optflow_y: fs_bad_acc_bias"""),
+        Layout("1.16", "1.17, without cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault"),
+        Layout("1.17", """
+            *, without cs_in_transition cs_heading_observable fs_bad_acc_bias fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d
+            fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d reject_mag_x reject_mag_y reject_mag_z"""),
         Layout("1.18", """
             1.17, without innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos
             reject_ver_pos reject_yaw reject_airspeed reject_sideslip reject_hagl reject_optflow_x reject_optflow_y,

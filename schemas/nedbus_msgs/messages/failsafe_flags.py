@@ -15,23 +15,15 @@ class FailsafeFlags(Message):
 
     TOPICS = (Topic("failsafe_flags", 2.0, "the commander", on_change=True),)
     LAYOUTS = (
-        Layout("1.14", """
-            timestamp mode_req_angular_velocity mode_req_attitude mode_req_local_alt mode_req_local_position
-            mode_req_local_position_relaxed mode_req_global_position mode_req_mission mode_req_offboard_signal
-            mode_req_home_position mode_req_wind_and_flight_time_compliance mode_req_prevent_arming
-            mode_req_manual_control mode_req_other angular_velocity_invalid attitude_invalid local_altitude_invalid
-            local_position_invalid local_position_invalid_relaxed local_velocity_invalid global_position_invalid
-            auto_mission_missing offboard_control_signal_lost home_position_invalid manual_control_signal_lost
-            gcs_connection_lost battery_warning battery_low_remaining_time battery_unhealthy
-            primary_geofence_breached mission_failure vtol_fixed_wing_system_failure wind_limit_exceeded
-            flight_time_limit_exceeded local_position_accuracy_low fd_critical_failure fd_esc_arming_failure
-            fd_imbalanced_prop fd_motor_failure"""),
-        Layout("1.15", "1.14, without primary_geofence_breached, battery_unhealthy: geofence_breached"),
-        Layout("1.16", "1.15, local_position_accuracy_low: navigator_failure"),
+        Layout("1.14", "1.15, without geofence_breached, battery_unhealthy: primary_geofence_breached"),
+        Layout("1.15", "1.16, without navigator_failure"),
+        Layout("1.16", """
+            1.17, without mode_req_global_position_relaxed global_position_invalid_relaxed position_accuracy_low,
+            flight_time_limit_exceeded: local_position_accuracy_low"""),
         Layout("1.17", """
-            1.16, without local_position_accuracy_low, mode_req_global_position: mode_req_global_position_relaxed,
-            global_position_invalid: global_position_invalid_relaxed, flight_time_limit_exceeded:
-            position_accuracy_low"""),
+            main, without fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure fd_alt_loss
+            parachute_unhealthy traffic_avoidance_unhealthy remote_id_unhealthy gnss_lost,
+            navigator_failure: fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure"""),
         Layout("1.18", "main, without traffic_avoidance_unhealthy"),
         Layout("main", "*"),
     )  # fmt: skip
@@ -50,9 +42,7 @@ class FailsafeFlags(Message):
     mode_req_mission: Uint32 = field("Modes that need a mission, as bits")
     mode_req_offboard_signal: Uint32 = field("Modes that need setpoints from a companion, as bits")
     mode_req_home_position: Uint32 = field("Modes that need home, as bits")
-    mode_req_wind_and_flight_time_compliance: Uint32 = field(
-        "Modes that need wind and time of flight within limits, as bits"
-    )
+    mode_req_wind_and_flight_time_compliance: Uint32 = field("Modes with limits of wind and time of flight, as bits")
     mode_req_prevent_arming: Uint32 = field("Modes in which the vehicle cannot be armed, as bits")
     mode_req_manual_control: Uint32 = field("Modes that need manual control, as bits")
     mode_req_other: Uint32 = field("Modes that need something else, as bits")

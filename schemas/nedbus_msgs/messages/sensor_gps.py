@@ -30,13 +30,11 @@ class SensorGps(Message):
     )
     LAYOUTS = (
         Layout("1.13", """
-            timestamp device_id lat lon alt alt_ellipsoid s_variance_m_s c_variance_rad fix_type eph epv hdop vdop
-            noise_per_ms automatic_gain_control jamming_indicator jamming_state vel_m_s vel_n_m_s vel_e_m_s
-            vel_d_m_s cog_rad vel_ned_valid timestamp_time_relative time_utc_usec satellites_used heading
-            heading_offset heading_accuracy"""),
+            1.14, without timestamp_sample jamming_indicator spoofing_state rtcm_injection_rate
+            selected_rtcm_instance, automatic_gain_control: jamming_indicator"""),
         Layout("1.14", """
-            1.13, without jamming_state, timestamp: timestamp_sample, automatic_gain_control: jamming_state,
-            jamming_indicator: spoofing_state, heading_accuracy: rtcm_injection_rate selected_rtcm_instance"""),
+            1.15, without latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m rtcm_crc_failed
+            rtcm_msg_used, device_id: lat lon alt alt_ellipsoid"""),
         Layout("1.15", "1.17, without authentication_state system_error"),
         Layout("1.17", "1.18, without antenna_offset_x antenna_offset_y antenna_offset_z"),
         Layout("1.18", "*"),

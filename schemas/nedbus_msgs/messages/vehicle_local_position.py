@@ -5,11 +5,9 @@ Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition
 
 from typing import ClassVar
 
-from pydantic import Field
-
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.model import FLOAT32_PI, FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
-from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Timestamp, Uint8, Uint64, field, while_valid
+from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Uint8, Uint64, field, while_valid
 
 
 class VehicleLocalPosition(Message):
@@ -74,9 +72,6 @@ class VehicleLocalPosition(Message):
     MESSAGE_VERSION: ClassVar = 1
     DIST_BOTTOM_SENSOR_NONE, DIST_BOTTOM_SENSOR_RANGE, DIST_BOTTOM_SENSOR_FLOW = range(3)
 
-    timestamp: Timestamp = Field(
-        description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)"
-    )
     timestamp_sample: Uint64 = field("Time of the sensor data behind this estimate [us], <= timestamp")
 
     xy_valid: Bool = field("x and y are valid")

@@ -31,21 +31,10 @@ class VehicleOdometry(Message):
         Layout("1.14", "*"),
     )  # fmt: skip
     OLDER = (
-        Older(
-            "local_frame",
-            "pose_frame",
-            lambda frame: {0: 1, 1: 2}.get(frame, 0),
-            lambda frame: {1: 0, 2: 1}.get(frame, 2),
-        ),
-        Older("x", "position[0]"),
-        Older("y", "position[1]"),
-        Older("z", "position[2]"),
-        Older("vx", "velocity[0]"),
-        Older("vy", "velocity[1]"),
-        Older("vz", "velocity[2]"),
-        Older("rollspeed", "angular_velocity[0]"),
-        Older("pitchspeed", "angular_velocity[1]"),
-        Older("yawspeed", "angular_velocity[2]"),
+        Older("local_frame", "pose_frame", lambda old: {0: 1, 1: 2}.get(old, 0), lambda new: {1: 0, 2: 1}.get(new, 2)),
+        *(Older(name, f"position[{index}]") for index, name in enumerate(("x", "y", "z"))),
+        *(Older(name, f"velocity[{index}]") for index, name in enumerate(("vx", "vy", "vz"))),
+        *(Older(f"{name}speed", f"angular_velocity[{index}]") for index, name in enumerate(("roll", "pitch", "yaw"))),
     )
     RULES = (UnitQuaternion("q"),)
 

@@ -26,21 +26,15 @@ class VehicleStatus(Message):
             onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health
             latest_arming_reason latest_disarming_reason armed_time takeoff_time"""),
         Layout("1.14", """
-            timestamp armed_time takeoff_time arming_state latest_arming_reason latest_disarming_reason
-            nav_state_timestamp nav_state_user_intention nav_state failure_detector_status hil_state vehicle_type
-            failsafe failsafe_and_user_took_over gcs_connection_lost gcs_connection_lost_counter
-            high_latency_data_link_lost is_vtol is_vtol_tailsitter in_transition_mode in_transition_to_fw
-            system_type system_id component_id safety_button_available safety_off power_input_valid usb_connected
-            open_drone_id_system_present open_drone_id_system_healthy parachute_system_present
-            parachute_system_healthy avoidance_system_required avoidance_system_valid rc_calibration_in_progress
-            calibration_enabled pre_flight_checks_pass"""),
-        Layout("1.15", """
-            1.14, nav_state: executor_in_charge valid_nav_states_mask can_set_nav_states_mask,
-            failsafe_and_user_took_over: failsafe_defer_state"""),
-        Layout("1.16", "1.15, without avoidance_system_required avoidance_system_valid"),
+            1.15, without executor_in_charge valid_nav_states_mask can_set_nav_states_mask failsafe_defer_state"""),
+        Layout("1.15", "1.16, parachute_system_healthy: avoidance_system_required avoidance_system_valid"),
+        Layout("1.16", """
+            1.18, without nav_state_display accepts_offboard_setpoints traffic_avoidance_system_present,
+            can_set_nav_states_mask: failure_detector_status"""),
         Layout("1.18", """
-            1.16, without failure_detector_status, executor_in_charge: nav_state_display accepts_offboard_setpoints,
-            parachute_system_healthy: traffic_avoidance_system_present"""),
+            *, without failure_detector_status avoidance_system_required avoidance_system_valid failsafe_timestamp
+            vtol_fw_permanent_stab rc_signal_lost engine_failure mission_failure geofence_violated
+            onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health"""),
     )  # fmt: skip
     OLDER = (
         Older("data_link_lost", "gcs_connection_lost"),
@@ -57,22 +51,15 @@ class VehicleStatus(Message):
     (
         NAVIGATION_STATE_MANUAL, NAVIGATION_STATE_ALTCTL, NAVIGATION_STATE_POSCTL, NAVIGATION_STATE_AUTO_MISSION,
         NAVIGATION_STATE_AUTO_LOITER, NAVIGATION_STATE_AUTO_RTL, NAVIGATION_STATE_POSITION_SLOW,
-        NAVIGATION_STATE_GUIDED_COURSE,
-    ) = range(8)  # fmt: skip
-    (
-        NAVIGATION_STATE_ALTITUDE_CRUISE, NAVIGATION_STATE_FREE3, NAVIGATION_STATE_ACRO, NAVIGATION_STATE_FREE2,
-        NAVIGATION_STATE_DESCEND, NAVIGATION_STATE_TERMINATION, NAVIGATION_STATE_OFFBOARD, NAVIGATION_STATE_STAB,
-    ) = range(8, 16)  # fmt: skip
-    (
-        NAVIGATION_STATE_FREE1, NAVIGATION_STATE_AUTO_TAKEOFF, NAVIGATION_STATE_AUTO_LAND,
-        NAVIGATION_STATE_AUTO_FOLLOW_TARGET, NAVIGATION_STATE_AUTO_PRECLAND, NAVIGATION_STATE_ORBIT,
-        NAVIGATION_STATE_AUTO_VTOL_TAKEOFF,
-    ) = range(16, 23)  # fmt: skip
-    (
-        NAVIGATION_STATE_EXTERNAL1, NAVIGATION_STATE_EXTERNAL2, NAVIGATION_STATE_EXTERNAL3, NAVIGATION_STATE_EXTERNAL4,
-        NAVIGATION_STATE_EXTERNAL5, NAVIGATION_STATE_EXTERNAL6, NAVIGATION_STATE_EXTERNAL7, NAVIGATION_STATE_EXTERNAL8,
-        NAVIGATION_STATE_MAX,
-    ) = range(23, 32)  # fmt: skip
+        NAVIGATION_STATE_GUIDED_COURSE, NAVIGATION_STATE_ALTITUDE_CRUISE, NAVIGATION_STATE_FREE3,
+        NAVIGATION_STATE_ACRO, NAVIGATION_STATE_FREE2, NAVIGATION_STATE_DESCEND, NAVIGATION_STATE_TERMINATION,
+        NAVIGATION_STATE_OFFBOARD, NAVIGATION_STATE_STAB, NAVIGATION_STATE_FREE1, NAVIGATION_STATE_AUTO_TAKEOFF,
+        NAVIGATION_STATE_AUTO_LAND, NAVIGATION_STATE_AUTO_FOLLOW_TARGET, NAVIGATION_STATE_AUTO_PRECLAND,
+        NAVIGATION_STATE_ORBIT, NAVIGATION_STATE_AUTO_VTOL_TAKEOFF, NAVIGATION_STATE_EXTERNAL1,
+        NAVIGATION_STATE_EXTERNAL2, NAVIGATION_STATE_EXTERNAL3, NAVIGATION_STATE_EXTERNAL4,
+        NAVIGATION_STATE_EXTERNAL5, NAVIGATION_STATE_EXTERNAL6, NAVIGATION_STATE_EXTERNAL7,
+        NAVIGATION_STATE_EXTERNAL8, NAVIGATION_STATE_MAX,
+    ) = range(32)  # fmt: skip
     HIL_STATE_OFF, HIL_STATE_ON = range(2)
     VEHICLE_TYPE_UNSPECIFIED, VEHICLE_TYPE_ROTARY_WING, VEHICLE_TYPE_FIXED_WING, VEHICLE_TYPE_ROVER = range(4)
     FAILSAFE_DEFER_STATE_DISABLED, FAILSAFE_DEFER_STATE_ENABLED, FAILSAFE_DEFER_STATE_WOULD_FAILSAFE = range(3)
@@ -80,19 +67,13 @@ class VehicleStatus(Message):
     armed_time: Uint64 = field("Time of arming, since boot [us], 0 if not armed")
     takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if there was none")
 
-    arming_state: Uint8 = field(
-        "Arming: 1 disarmed, 2 armed; up to 1.14 also 0 start, 3 error, 4 shutdown, 5 restored in air"
-    )
-    latest_arming_reason: Uint8 = field(
-        "Why armed: 1 stick, 2 switch, 3, 4 command, 5 mission ..., see ARM_DISARM_REASON_"
-    )
+    arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 start, 3 error, 4 shutdown, 5 restored in air")
+    latest_arming_reason: Uint8 = field("Why armed: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
     latest_disarming_reason: Uint8 = field("Why disarmed, as latest_arming_reason: 6 landed (up to 1.17: 7) ...")
 
     nav_state_timestamp: Uint64 = field("Time of the latest change of nav_state, since boot [us]")
     nav_state_user_intention: Uint8 = field("Mode that the user chose, as nav_state")
-    nav_state: Uint8 = field(
-        "Mode in force: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ..."
-    )
+    nav_state: Uint8 = field("Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ...")
 
     executor_in_charge: Uint8 = field("Executor of modes in charge: 0 the autopilot")
     nav_state_display: Uint8 = field("Mode to show to the user, as nav_state")

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import replace
 from functools import cached_property
 from operator import attrgetter, itemgetter
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, kept
@@ -152,9 +151,24 @@ class Definition(Generic[M_co]):
             return self.current
         return next((layout for layout in self.layouts.values() if layout.types.keys() == provided), self.current)
 
-    def plan(self, names: Iterable[str]) -> Plan:
+    @kept  # all messages of a stream have the same names
+    def plan(self, names: tuple[str, ...]) -> Plan:
         """Return the mapping from these fields, of any PX4 release, to the model; unknown names are ignored."""
-        return _plan(self, tuple(names))
+        direct: dict[str, str] = {name: name for name in names if name in self.types}
+        converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
+        parts: dict[str, list[str | None]] = {}
+        for old in (self.older[name] for name in names if name in self.older):
+            for base, index in old.places:
+                if base in direct or base in converted:
+                    continue
+                if index is not None:
+                    parts.setdefault(base, [None] * self.types[base].values)[index] = old.name
+                elif old.up:
+                    converted[base] = old.name, old.up
+                else:
+                    direct[base] = old.name
+        in_order = {name: direct[name] for name in self.types if name in direct}
+        return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
         """Convert to an older layout, in its field order; fields that the model lacks are "not provided"."""
@@ -164,6 +178,24 @@ class Definition(Generic[M_co]):
         """Return unit and meaning of a field in any layout."""
         field = self.model.model_fields.get(name)
         return (field.description if field else self.older[name].doc if name in self.older else "") or ""
+
+    def schema(self) -> dict[str, Any]:
+        """Return the JSON Schema (2020-12), in which NaN and infinities are strings of those names, and the layouts.
+
+        Each layout has its name, its number on the wire (or None), and its fields in order, with name and type.
+        """
+        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **self.model.model_json_schema()}
+        for field in schema["properties"].values():
+            field.pop("default", None)  # JSON has no NaN, and a writer should omit fields that are not provided
+        layouts = [
+            {
+                "name": layout.name,
+                "wire": layout.wire,
+                "fields": [{"name": name, "type": str(kind)} for name, kind in layout.types.items()],
+            }
+            for layout in self.layouts.values()
+        ]
+        return {"json_schema": schema, "layouts": layouts}
 
     def explain_unknown_field(self, name: str) -> str:
         """Return the error text for an unknown field, with suggestions."""
@@ -218,25 +250,6 @@ class Definition(Generic[M_co]):
         return value if kind.length or kind.is_float or least <= value <= greatest else kind.absent
 
 
-@kept  # all messages of a stream have the same names
-def _plan(definition: Definition[Any], names: tuple[str, ...]) -> Plan:
-    direct: dict[str, str] = {name: name for name in names if name in definition.types}
-    converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
-    parts: dict[str, list[str | None]] = {}
-    for old in (definition.older[name] for name in names if name in definition.older):
-        for base, index in old.places:
-            if base in direct or base in converted:
-                continue
-            if index is not None:
-                parts.setdefault(base, [None] * definition.types[base].count)[index] = old.name
-            elif old.up:
-                converted[base] = old.name, old.up
-            else:
-                direct[base] = old.name
-    in_order = {name: direct[name] for name in definition.types if name in direct}
-    return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
-
-
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
     """Build a message from the fields of any PX4 release; arrays are tuples.
 
@@ -250,7 +263,7 @@ def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
 
 def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the fields of any PX4 release to those of the model, as `upgrade_with` does, without validation."""
-    plan = definition.plan(fields)
+    plan = definition.plan(tuple(fields))
     upgraded = {name: fields[old] for name, old in plan.names.items()}
     if plan.converted or plan.parts:
         upgraded |= {name: _converted(convert, fields[old]) for name, (old, convert) in plan.converted.items()}
@@ -271,22 +284,18 @@ def _row(definition: Definition[Any], values: Values) -> Row:
     return tuple.__new__(definition.row, values)
 
 
-_messages: Final[dict[str, Definition[Any]]] = {}
-_topics: Final[dict[str, Topic]] = {}
-_by_topic: Final[dict[str, Definition[Any]]] = {}
-
-MESSAGES: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_messages)
+MESSAGES: Final[dict[str, Definition[Any]]] = {}
 """Definitions by message name, of the messages with a file in `nedbus_msgs.messages`."""
-TOPICS: Final[Mapping[str, Topic]] = MappingProxyType(_topics)
+TOPICS: Final[dict[str, Topic]] = {}
 """The topics of these messages by name."""
-BY_TOPIC: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_by_topic)
+BY_TOPIC: Final[dict[str, Definition[Any]]] = {}
 """The definition of the messages on each topic."""
 
 
 def register(definition: Definition[Any]) -> None:
     """Register a message; raise ValueError if its name or one of its topics is taken."""
-    if taken := [name for name in (definition.name, *definition.topics) if name in _messages or name in _topics]:
+    if taken := [name for name in (definition.name, *definition.topics) if name in MESSAGES or name in TOPICS]:
         raise ValueError(f"{definition.name}: there is a message with {', '.join(taken)} already")
-    _messages[definition.name] = definition
+    MESSAGES[definition.name] = definition
     for topic in definition.topics.values():
-        _topics[topic.name], _by_topic[topic.name] = topic, definition
+        TOPICS[topic.name], BY_TOPIC[topic.name] = topic, definition

@@ -9,7 +9,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from .declaration import Layout, Older, Topic
 from .definition import Definition, register
-from .px4_types import FieldType, Timestamp, decode_text
+from .px4_types import FieldType, Timestamp, decode_text, field_type
 from .rules import Rule, violations
 
 _M = TypeVar("_M", bound="Message")
@@ -37,7 +37,9 @@ class Message(BaseModel):
     ALWAYS: ClassVar[str] = "timestamp"
     DEFINITION: ClassVar[Definition[Any]]
 
-    timestamp: Timestamp = Field(description="Time since boot [us]")
+    timestamp: Timestamp = Field(
+        description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)"
+    )
 
     if not TYPE_CHECKING:
 
@@ -136,7 +138,7 @@ def _to_python(value: Any, kind: FieldType | None) -> object:
     if kind and kind.is_text and isinstance(value, bytes):
         return decode_text(value)
     if kind and kind.is_array and isinstance(value, list | tuple):
-        parts = tuple(_to_python(part, FieldType(kind.base)) for part in value)
+        parts = tuple(_to_python(part, field_type(kind.base)) for part in value)
         return value if all(map(operator.is_, parts, value)) and isinstance(value, tuple) else parts
     if kind and kind.is_float and isinstance(value, str) and value in _FLOAT_NAMES:
         return float(value)

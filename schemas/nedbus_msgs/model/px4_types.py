@@ -4,7 +4,6 @@ import math
 import re
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Final, NamedTuple, TypeVar, cast
 
@@ -14,6 +13,8 @@ from pydantic_core import CoreSchema, core_schema
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
+YEAR_2000: Final = 946_684_800_000_000  # us; an earlier time is since boot
+_YEAR_2100: Final = 4_102_444_800_000_000
 LONGEST_ARRAY: Final = 1024
 """Elements of the longest array allowed; PX4's longest has 512."""
 
@@ -47,69 +48,30 @@ ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 """The types of single values with another name in PX4."""
 
 
-@dataclass(frozen=True)
-class FieldType:
-    """A PX4 field type, such as `float32[4]`; `length` is None for a single value.
+class FieldType(str):
+    """The name of a PX4 field type, such as `float32[4]`, and what follows from it; `field_type` returns them.
 
-    `char[127]` is a single value, a text (`str`) of at most 127 bytes of UTF-8. It ends at the first NUL, and bytes
-    that are not UTF-8 become "?".
-
-    Raises ValueError for an unknown base type, and for an array with no or too many elements.
+    `base`: the type of one value; `length`: the elements of an array, None for a single value.
+    `is_text`: True for an array of characters. `char[127]` is a single value, a text (`str`) of at most 127 bytes of
+    UTF-8. It ends at the first NUL, and bytes that are not UTF-8 become "?".
+    `is_array`: True for a type whose value is a tuple. `values`: number of values.
+    `form`: the struct format of all values. `size`: size of one value in bytes.
+    `is_float`: True for float types, whose values may be NaN. `limits`: minimum and maximum of an integer type.
+    `absent`: value of a field that is not provided: NaN, false or 0; in an array, for each element.
     """
 
-    base: str
-    length: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.base not in BASES or (self.is_text and self.length is None):
-            raise ValueError(f"{self.base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
-        if self.length is not None and not 0 < self.length <= LONGEST_ARRAY:
-            raise ValueError(f"an array of {self.length}: expected 1 to {LONGEST_ARRAY} elements")
-
-    def __str__(self) -> str:
-        return self.base if self.length is None else f"{self.base}[{self.length}]"
-
-    @property
-    def is_text(self) -> bool:
-        """True for an array of characters, whose value is a str."""
-        return self.base == "char"
-
-    @cached_property
-    def is_array(self) -> bool:
-        """True for a type whose value is a tuple."""
-        return self.length is not None and not self.is_text
-
-    @cached_property
-    def count(self) -> int:
-        """Number of values."""
-        return (self.length or 1) if self.is_array else 1
-
-    @cached_property
-    def form(self) -> str:
-        """The struct format of all values."""
-        return f"{self.length or 1}{BASES[self.base].code}"
-
-    @cached_property
-    def size(self) -> int:
-        """Size of one value in bytes."""
-        return struct.calcsize("<" + self.form) // self.count
-
-    @cached_property
-    def is_float(self) -> bool:
-        """True for float types, whose values may be NaN."""
-        return self.base.startswith("float")
-
-    @cached_property
-    def absent(self) -> object:
-        """Value of a field that is not provided: NaN, false or 0; in an array, for each element."""
-        absent = BASES[self.base].absent
-        return (absent,) * self.count if self.is_array else absent
-
-    @cached_property
-    def limits(self) -> tuple[int, int]:
-        """Minimum and maximum of an integer type."""
+    def __init__(self, _: str) -> None:
+        self.base, _, length = self.rstrip("]").partition("[")
+        base = BASES[self.base]
+        self.length = int(length) if length else None
+        self.is_text, self.is_float = self.base == "char", self.base.startswith("float")
+        self.is_array = self.length is not None and not self.is_text
+        self.values = int(length) if self.is_array else 1
+        self.form = f"{self.length or 1}{base.code}"
+        self.size = struct.calcsize("<" + self.form) // self.values
+        self.absent: object = (base.absent,) * self.values if self.is_array else base.absent
         bits = 8 * self.size
-        return (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        self.limits = (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
     def fit(self, value: Any) -> Any:
         """Convert a number of another type, or a tuple of at most this length; return None unless it keeps its value.
@@ -122,7 +84,7 @@ class FieldType:
         if self.length is not None:
             if not isinstance(value, tuple) or len(value) > self.length:
                 return None
-            fitted = tuple(map(FieldType(self.base).fit, value))
+            fitted = tuple(map(field_type(self.base).fit, value))
             return None if None in fitted else fitted + (base.absent,) * (self.length - len(value))
         try:
             number = value if self.is_float or self.base == "bool" else int(value)
@@ -135,7 +97,7 @@ class FieldType:
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
         value = str if self.is_text else bool if self.base == "bool" else float if self.is_float else int
-        python = tuple[(value,) * self.count] if self.is_array else value  # type: ignore[misc] # one for each
+        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one for each
         return Annotated[python, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:
@@ -145,7 +107,7 @@ class FieldType:
             return core_schema.no_info_after_validator_function(self._check_text, text)
         if self.length is not None:
             return core_schema.tuple_positional_schema(
-                [FieldType(self.base).core_schema(from_json=from_json)] * self.length
+                [field_type(self.base).core_schema(from_json=from_json)] * self.length
             )
         if self.base == "bool":
             return core_schema.bool_schema()
@@ -180,13 +142,26 @@ def decode_text(data: bytes) -> str:
 
 @cache
 def field_type(text: str) -> FieldType:
-    """Parse PX4's name of a type; raise ValueError, as FieldType does, if it is invalid."""
+    """Parse PX4's name of a type.
+
+    Raises ValueError for an unknown base type, and for an array with no or too many elements.
+    """
     found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
     if found is None:
         raise ValueError(f"{text!r} is not a type: expected one such as uint8 or float32[4]")
-    if found[2] is None:
-        return FieldType(ALIASES.get(found[1], found[1]))
-    return FieldType(found[1] if found[1] == "char" else ALIASES.get(found[1], found[1]), int(found[2]))
+    base, length = found.groups()
+    if not (base == "char" and length):
+        base = ALIASES.get(base, base)
+    if base not in BASES:
+        raise ValueError(f"{base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
+    if length and not 0 < int(length) <= LONGEST_ARRAY:
+        raise ValueError(f"an array of {int(length)}: expected 1 to {LONGEST_ARRAY} elements")
+    return FieldType(f"{base}[{int(length)}]" if length else base)
+
+
+def is_unix_time(timestamp_us: Any) -> Any:
+    """Return whether a time [us], or each of an array, is Unix time, a date from 2000 to 2100, not since boot."""
+    return (timestamp_us >= YEAR_2000) & (timestamp_us < _YEAR_2100)
 
 
 def field(meaning: str) -> Any:
@@ -224,10 +199,4 @@ Float32 = Annotated[float, field_type("float32"), Field(default=NAN)]
 Float32x2 = Annotated[tuple[float, float], field_type("float32[2]"), Field(default=(NAN,) * 2)]
 Float32x3 = Annotated[tuple[float, float, float], field_type("float32[3]"), Field(default=(NAN,) * 3)]
 Float32x4 = Annotated[tuple[float, float, float, float], field_type("float32[4]"), Field(default=(NAN,) * 4)]
-Float32x14 = Annotated[
-    tuple[
-        float, float, float, float, float, float, float,
-        float, float, float, float, float, float, float,
-    ],
-    field_type("float32[14]"), Field(default=(NAN,) * 14),
-]  # fmt: skip
+Float32x14 = Annotated[tuple[float, ...], field_type("float32[14]"), Field(default=(NAN,) * 14)]

@@ -5,8 +5,10 @@ Every rule holds on all real flights examined; docs/messages.md has the counts.
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
+from string import Formatter
 from typing import Any, Final, NamedTuple, cast
 
 FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
@@ -14,16 +16,12 @@ FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
 
 _QUATERNION: Final = struct.Struct("<4f")
 
-Place = Callable[[str], str]
-"""A function from the name of a field to the Python expression of its value."""
-
 
 class Check(NamedTuple):
     """The check of one field.
 
-    `reason`: the error text, with other fields in braces.
-    `wrong`: an expression that is true if the field breaks the rule. It has parentheses around each comparison and no
-    `if`, to be convertible to an expression on columns.
+    `reason`: the error text; `wrong`: an expression that is true if the field breaks the rule, with parentheses around
+    each comparison and no `if`, to be convertible to an expression on columns. Both have fields in braces.
     """
 
     field: str
@@ -32,71 +30,46 @@ class Check(NamedTuple):
 
 
 class Rule:
-    """A rule for each of its `fields`, or between them; values already have the right types.
+    """A rule for fields, whose values already have the right types; NaN never breaks the rule of a single field.
 
-    NaN never breaks the rule of a single field.
+    `flags`: the fields that are finite while a flag is set, by flag.
     """
 
-    reason: str
-    flags: Mapping[str, Sequence[str]] = {}
+    def __init__(self, checks: Iterable[Check], flags: Mapping[str, Sequence[str]] | None = None) -> None:
+        self.checks = tuple(checks)
+        self.flags = flags or {}
 
-    def __init__(self, *fields: str) -> None:
-        self.fields = fields
-
-    def wrong(self, value: str) -> str:
-        """Return an expression that is true if a value breaks the rule."""
-        raise NotImplementedError
-
-    def checks(self, at: Place) -> Iterator[Check]:
-        """Yield the check of each field."""
-        for name in self.fields:
-            yield Check(name, self.reason, self.wrong(at(name)))
-
-    def kept(self, at: Place) -> str:
-        """Return an expression that is true if a message obeys the rule."""
-        return f"not ({' or '.join(check.wrong for check in self.checks(at))})"
+    @property
+    def fields(self) -> Sequence[str]:
+        """All fields that the rule reads."""
+        parts = (part for check in self.checks for part in Formatter().parse(check.wrong))
+        return list(dict.fromkeys(name for _, name, _, _ in parts if name))
 
 
 class FiniteWhile(Rule):
     """Fields are finite while their flag is set; `flags` maps each flag to its fields."""
 
     def __init__(self, flags: Mapping[str, Sequence[str]]) -> None:
-        super().__init__(*(name for flag, names in flags.items() for name in (flag, *names)))
-        self.flags = flags
-
-    def checks(self, at: Place) -> Iterator[Check]:
-        """Yield the check of each field of each flag."""
-        for flag, names in self.flags.items():
-            for name in names:
-                yield Check(name, f"must be finite while {flag} is true", f"({at(flag)} and not isfinite({at(name)}))")
-
-    def kept(self, at: Place) -> str:
-        """Check all fields at once first, as they are almost always finite."""
-        fields = [at(name) for names in self.flags.values() for name in names]
-        return f"(isfinite({' + '.join(fields)}) or {super().kept(at)})"
+        checks = (
+            Check(name, f"must be finite while {flag} is true", f"({{{flag}}} and not isfinite({{{name}}}))")
+            for flag, names in flags.items()
+            for name in names
+        )
+        super().__init__(checks, flags)
 
 
 class NotNegative(Rule):
     """Variances, standard deviations and the like are not negative; NaN and infinity pass."""
 
-    reason = "must not be negative"
-
-    def wrong(self, value: str) -> str:
-        """Compare with 0."""
-        return f"({value} < 0)"
+    def __init__(self, *fields: str) -> None:
+        super().__init__(Check(name, "must not be negative", f"({{{name}}} < 0)") for name in fields)
 
 
 class Within(Rule):
     """The magnitude of a field is at most a bound; NaN passes."""
 
     def __init__(self, field: str, bound: float) -> None:
-        super().__init__(field)
-        self.bound = bound
-        self.reason = f"must be within +-{bound:.9g}"
-
-    def wrong(self, value: str) -> str:
-        """Compare the magnitude."""
-        return f"(abs({value}) > {self.bound!r})"
+        super().__init__([Check(field, f"must be within +-{bound:.9g}", f"(abs({{{field}}}) > {bound!r})")])
 
 
 class InRange(Rule):
@@ -105,65 +78,56 @@ class InRange(Rule):
     def __init__(
         self, field: str, least: float, greatest: float, *, or_: float | None = None, is_array: bool = False
     ) -> None:
-        super().__init__(field)
-        self._is_array = is_array
-        # A valid value must remain valid when it is rounded to float32.
-        self._bounds = min(least, float32(least)), max(greatest, float32(greatest))
-        self._unknown = () if or_ is None else tuple(dict.fromkeys((or_, float32(or_))))
-        unknown = "" if or_ is None else f", or {or_:g} while it is not known"
-        self.reason = f"must be {least:.9g} to {greatest:.9g}{unknown}"
-
-    def wrong(self, value: str) -> str:
-        """Compare with both bounds, which may be infinite."""
-        if self._is_array:
-            return f"any([{self._wrong('each')} for each in {value}])"
-        return self._wrong(value)
-
-    def _wrong(self, value: str) -> str:
-        least, greatest = self._bounds
-        known = [f"({value} != {each!r})" for each in self._unknown]
-        return f"({' and '.join([f'(({value} < {least!r}) or ({value} > {greatest!r}))', *known])})"
+        reason = f"must be {least:.9g} to {greatest:.9g}" + (
+            "" if or_ is None else f", or {or_:g} while it is not known"
+        )
+        # A valid value must remain valid when it is rounded to float32; the bounds may be infinite.
+        least, greatest = min(least, float32(least)), max(greatest, float32(greatest))
+        each = "each" if is_array else f"{{{field}}}"
+        known = [] if or_ is None else [f"({each} != {value!r})" for value in dict.fromkeys((or_, float32(or_)))]
+        wrong = f"({' and '.join([f'(({each} < {least!r}) or ({each} > {greatest!r}))', *known])})"
+        super().__init__([Check(field, reason, f"any([{wrong} for each in {{{field}}}])" if is_array else wrong)])
 
 
 class NotLater(Rule):
     """One time is not later than another."""
 
     def __init__(self, earlier: str, later: str) -> None:
-        super().__init__(earlier, later)
-
-    def checks(self, at: Place) -> Iterator[Check]:
-        """Yield the check of the earlier field."""
-        earlier, later = self.fields
-        yield Check(earlier, f"must not be later than {later} ({{{later}}})", f"({at(earlier)} > {at(later)})")
+        reason = f"must not be later than {later} ({{{later}}})"
+        super().__init__([Check(earlier, reason, f"({{{earlier}}} > {{{later}}})")])
 
 
 class UnitQuaternion(Rule):
     """A quaternion (w, x, y, z) has norm 1, within 0.001, or is not provided (w is NaN)."""
 
-    reason = "must have norm 1, or NaN as its first element while it is not known"
-    _SQUARE: Final = (0.999**2 + 1.001**2) / 2
-    _TOLERANCE: Final = (1.001**2 - 0.999**2) / 2
-
-    def wrong(self, value: str) -> str:
-        """Compare the square of the norm."""
-        bad = f"not (abs(squared_norm({value}) - {self._SQUARE!r}) <= {self._TOLERANCE!r})"
-        return f"(({value}[0] == {value}[0]) and {bad})"
+    def __init__(self, field: str) -> None:
+        reason = "must have norm 1, or NaN as its first element while it is not known"
+        middle, tolerance = (0.999**2 + 1.001**2) / 2, (1.001**2 - 0.999**2) / 2
+        value = f"{{{field}}}"
+        bad = f"not (abs(squared_norm({value}) - {middle!r}) <= {tolerance!r})"
+        super().__init__([Check(field, reason, f"(({value}[0] == {value}[0]) and {bad})")])
 
 
-def passes_all(rules: Sequence[Rule], at: Place) -> Callable[[Any], bool]:
-    """Return a function that checks whether `values` pass all rules; `at` gives the expression of a field in it.
+def passes_all(rules: Sequence[Rule], places: Mapping[str, str]) -> Callable[[Any], bool]:
+    """Return a function that checks whether `values` pass all rules; `places`: the expression of each field in it.
 
     It is compiled from a single expression, so it costs no more than its comparisons.
     """
-    return evaluated(f"lambda values: {' and '.join(rule.kept(at) for rule in rules) or True}")
+    passed = []
+    for rule in rules:
+        right = f"not ({' or '.join(check.wrong for check in rule.checks)})"
+        # All fields with flags at once first, as they are almost always finite.
+        finite = " + ".join(f"{{{name}}}" for fields in rule.flags.values() for name in fields)
+        passed.append(f"(isfinite({finite}) or {right})" if finite else right)
+    return evaluated(f"lambda values: {' and '.join(passed) or True}".format_map(places))
 
 
 def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the name and the reason for each field that breaks a rule, given the values of all fields."""
-    for rule in rules:
-        for field, reason, wrong in rule.checks(lambda name: f"values[{name!r}]"):
-            if evaluated(f"lambda values: {wrong}")(values):
-                yield field, reason.format_map(values)
+    places = {name: f"values[{name!r}]" for name in values}
+    for check in chain.from_iterable(rule.checks for rule in rules):
+        if evaluated(f"lambda values: {check.wrong}".format_map(places))(values):
+            yield check.field, check.reason.format_map(values)
 
 
 def wrong_columns(rules: Sequence[Rule], **functions: Callable[..., Any]) -> list[Callable[[Any], Any]]:
@@ -171,7 +135,8 @@ def wrong_columns(rules: Sequence[Rule], **functions: Callable[..., Any]) -> lis
 
     `functions`: the functions that checks call, for columns; columns of arrays are transposed.
     """
-    texts = [check.wrong for rule in rules for check in rule.checks(lambda name: f"values[{name!r}].T")]
+    places = {name: f"values[{name!r}].T" for rule in rules for name in rule.fields}
+    texts = [check.wrong.format_map(places) for rule in rules for check in rule.checks]
     for word, operator in {" or ": " | ", " and ": " & ", "not ": "~"}.items():
         texts = [text.replace(word, operator) for text in texts]
     return [evaluated(f"lambda values: {text}", **functions) for text in texts]

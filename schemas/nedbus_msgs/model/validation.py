@@ -34,7 +34,7 @@ class Validation:
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
         names, kinds = tuple(types), types.values()
-        self.passes_rules = passes_all(rules, lambda name: f"values[{names.index(name)}]")
+        self.passes_rules = passes_all(rules, {name: f"values[{index}]" for index, name in enumerate(names)})
         self.values_of: Callable[[Any], Values] = (
             itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         )
@@ -88,6 +88,10 @@ class Validation:
         packed = self._struct.pack(*self.flatten(row))
         return self.name(self.unflatten(self._struct.unpack(packed)))
 
+    def unpack(self, packed: bytes) -> Values:
+        """Return the values of all fields from their native forms, one behind the other."""
+        return self.unflatten(self._struct.unpack(packed))
+
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the name and the reason for each number beyond the range of its float32 field."""
         for name, kind in self._types.items():
@@ -102,13 +106,13 @@ def _flat_forms(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values],
     for position, kind in enumerate(kinds):
         if kind.length is not None:
             start = place + position - index
-            array, text = f"row[{start}:{start + kind.count}]", f"decode_text(row[{start}])"
+            array, text = f"row[{start}:{start + kind.values}]", f"decode_text(row[{start}])"
             flat += [
                 f"*row[{index}:{position}]",
                 f"encode_text(row[{position}])" if kind.is_text else f"*row[{position}]",
             ]
             nested += [f"*row[{place}:{start}]", text if kind.is_text else array]
-            index, place = position + 1, start + kind.count
+            index, place = position + 1, start + kind.values
     if not flat:
         return tuple, tuple
     functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ((flat, index), (nested, place))]

@@ -2,16 +2,15 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from typing import Final, NamedTuple
 
+from nedbus_msgs.definitions import define
 from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
-from nedbus_msgs.model.rules import InRange, Rule
-from nedbus_msgs.undeclared import define
+from nedbus_msgs.model.rules import InRange
 
 from .types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
 
@@ -41,14 +40,12 @@ class MsgError(ValueError):
         self.column = column
 
 
-@dataclass(frozen=True, slots=True)
-class MsgField:
-    """One field of a .msg file, with its comment and its annotated range."""
+class MsgField(NamedTuple):
+    """One field of a .msg file, with its comment."""
 
     name: str
     type: FieldType
-    comment: str = ""
-    rules: tuple[Rule, ...] = field(default=(), compare=False)
+    comment: str
 
 
 def read_msg(text: str) -> list[MsgField]:
@@ -70,9 +67,9 @@ def define_msg(name: str, text: str) -> Definition[Message]:
     try:
         return define(
             name,
-            ((each.name, each.type) for each in fields),
-            meanings={each.name: each.comment for each in fields if each.comment},
-            rules=[rule for each in fields for rule in each.rules],
+            ((name, kind) for name, kind, _ in fields),
+            meanings={name: comment for name, _, comment in fields if comment},
+            rules=list(filter(None, map(_range_of, fields))),
         )
     except ValueError as exc:
         raise MsgError(1, 1, str(exc)) from None
@@ -139,8 +136,7 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
                     parts, line.base, f"{prefix}{line.name}_" + f"{index}_" * (index is not None), level + 1
                 )
             continue
-        kind, name = _type_of(line), prefix + line.name
-        yield MsgField(name, kind, line.comment, _rules(name, kind, line.comment))
+        yield MsgField(prefix + line.name, _type_of(line), line.comment)
 
 
 def _describe(line: _Line, parts: Mapping[str, object]) -> Described:
@@ -157,10 +153,11 @@ def _type_of(line: _Line) -> FieldType:
         raise MsgError(line.number, line.column, str(exc)) from None
 
 
-def _rules(name: str, kind: FieldType, comment: str) -> tuple[Rule, ...]:
-    found, invalid = _RANGE.search(comment), _INVALID.search(comment)
-    if found is None or kind.base == "bool" or kind.is_text:
-        return ()
+def _range_of(field: MsgField) -> InRange | None:
+    found, invalid = _RANGE.search(field.comment), _INVALID.search(field.comment)
+    if found is None or field.type.base == "bool" or field.type.is_text:
+        return None
     least, greatest = float(found[1] or "-inf"), float(found[2] or "inf")
-    unknown = {"or_": float(invalid[1])} if invalid else {}
-    return (InRange(name, least, greatest, is_array=kind.length is not None, **unknown),)
+    return InRange(
+        field.name, least, greatest, or_=float(invalid[1]) if invalid else None, is_array=field.type.is_array
+    )

@@ -38,13 +38,12 @@ from nedbus.transport import (
 from nedbus_msgs import (
     ANY,
     MESSAGES,
+    REJECTED,
     Address,
     AddressError,
     Selection,
     address_of_alive_key,
-    address_of_rejected_key,
     field_type,
-    rejected_key_expr,
     schema_key,
     short_hash,
     status_key,
@@ -361,7 +360,7 @@ class Rejections:
         self._owner = owner  # keeps the bus open
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_REPORTS)
         with while_open():
-            subscriber = session.declare_subscriber(rejected_key_expr(prefix=prefix), channel)
+            subscriber = session.declare_subscriber(f"{prefix}{REJECTED}/**", channel)
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
@@ -377,7 +376,7 @@ class Rejections:
 
     def _read(self, sample: zenoh.Sample) -> RejectionReport | None:
         try:
-            address = address_of_rejected_key(str(sample.key_expr), prefix=self._prefix)
+            address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
             content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT_BYTES else None
         except (AddressError, ValueError, RecursionError):
             return None

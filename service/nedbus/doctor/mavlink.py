@@ -4,9 +4,8 @@ import errno
 import struct
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
@@ -24,32 +23,6 @@ _BAUD: Final = 57600
 _SYSTEM: Final = 245  # ours, as in the source
 _BACKEND: Final = "SDLOG_BACKEND"
 _TO_MAVLINK: Final = 2  # bit of SDLOG_BACKEND
-
-
-@dataclass(slots=True)
-class _System:
-    """Traffic of one system: messages by type, bytes, and what concerns its ULog stream.
-
-    `backend`: the value of SDLOG_BACKEND, None without an answer. `log_clients`: to whom it sends its log.
-    """
-
-    counts: Counter[str] = field(default_factory=Counter)
-    bytes: int = 0
-    is_px4: bool = False
-    backend: int | None = None
-    log_clients: set[str] = field(default_factory=set)
-
-    def add(self, message: Any) -> None:
-        """Add one message."""
-        kind = message.get_type()
-        self.counts[kind] += 1
-        self.bytes += len(message.get_msgbuf())
-        if kind == "HEARTBEAT":
-            self.is_px4 |= message.autopilot == dialect.MAV_AUTOPILOT_PX4
-        elif kind == "PARAM_VALUE" and message.param_id == _BACKEND:
-            (self.backend,) = struct.unpack("<i", struct.pack("<f", message.param_value))  # PX4 copies the bytes
-        elif kind.startswith("LOGGING_DATA"):
-            self.log_clients.add(f"system {message.target_system} component {message.target_component}")
 
 
 def check_mavlink(link: str) -> Iterator[Finding]:
@@ -77,27 +50,23 @@ def check_mavlink(link: str) -> Iterator[Finding]:
         if system not in systems or not why_ignored(system, component)
     )
     yield from limit_findings(
-        _judge_system(f"{link} system {number}", link, system.counts, TIMINGS.listen)
-        for number, system in sorted(systems.items())
+        _judge_system(f"{link} system {number}", link, messages, TIMINGS.listen)
+        for number, messages in sorted(systems.items())
     )
     yield from limit_findings(
-        _judge_log(f"{link} system {number}", link, system, TIMINGS.listen)
-        for number, system in sorted(systems.items())
-        if system.is_px4
+        _judge_log(f"{link} system {number}", link, messages, TIMINGS.listen)
+        for number, messages in sorted(systems.items())
+        if any(map(_is_px4, messages))
     )
 
 
-def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System], dict[tuple[int, int], str]]:
-    """Count packets by sender, and read what each autopilot sends; ask each PX4 for SDLOG_BACKEND.
-
-    The third result has the faults of senders by their ids.
-    """
+def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[int, int], str]]:
+    """Return packets by sender, messages by system, and faults by system and component; ask PX4s for SDLOG_BACKEND."""
     faults: dict[tuple[int, int], str] = {}
     both = Senders()
     senders: Counter[str] = Counter()
-    systems: dict[int, _System] = {}
-    end, next_heartbeat = time.monotonic() + seconds, 0.0
-    parser = _new_parser()
+    systems: dict[int, list[Any]] = {}
+    end, next_heartbeat, parser = time.monotonic() + seconds, 0.0, None
     sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
     heartbeat = dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
@@ -110,8 +79,9 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System
             name = ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
             if name in senders or len(senders) < _MAX_SENDERS:
                 senders[name] += 1
-            if not link.stream:
-                parser = _new_parser()
+            if parser is None or not link.stream:
+                parser = dialect.MAVLink(None)
+                parser.robust_parsing = True
             for message in parser.parse_buffer(data) or []:
                 if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these have no header
                     ids = message.get_srcSystem(), message.get_srcComponent()
@@ -120,15 +90,19 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System
                         faults[ids] = fault
                     if ignored:
                         continue
-                    system = systems.setdefault(ids[0], _System())
-                    system.add(message)
-                    if message.get_type() == "HEARTBEAT" and system.is_px4 and system.backend is None:
+                    systems.setdefault(ids[0], []).append(message)
+                    if _is_px4(message):
                         ask = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
                         link.send(ask.pack(sender), peer)
     return senders, systems, faults
 
 
-def _judge_system(name: str, link: str, counts: Counter[str], seconds: float) -> Finding:
+def _is_px4(message: Any) -> bool:
+    return bool(message.get_type() == "HEARTBEAT" and message.autopilot == dialect.MAV_AUTOPILOT_PX4)
+
+
+def _judge_system(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
+    counts = Counter(message.get_type() for message in messages)
     types = list_names(type_ for type_, _ in counts.most_common())
     if counts[_POSITION]:
         seen = f"{_POSITION} at {counts[_POSITION] / seconds:.0f} Hz, of {types}"
@@ -142,21 +116,21 @@ def _judge_system(name: str, link: str, counts: Counter[str], seconds: float) ->
     return Finding("mavlink", name, "warning", seen, advice)
 
 
-def _judge_log(name: str, link: str, system: _System, seconds: float) -> Finding:
+def _judge_log(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
     """Judge whether a PX4 can send its ULog stream on this link, without asking for it."""
-    if system.log_clients:
-        seen = f"sends its ULog stream to {list_names(sorted(system.log_clients))}"
+    pieces = [message for message in messages if message.get_type().startswith("LOGGING_DATA")]
+    if clients := {f"system {each.target_system} component {each.target_component}" for each in pieces}:
+        seen = f"sends its ULog stream to {list_names(sorted(clients))}"
         advice = "PX4 has one stream: 'nedbus serve' is refused while another program receives it, unless log=take"
         return Finding("mavlink", name, "ok" if f"system {_SYSTEM} " in seen else "warning", seen, advice)
-    if system.backend is not None and not system.backend & _TO_MAVLINK:
-        seen = f"{_BACKEND} is {system.backend}: it refuses to send its ULog stream"
+    values = [each.param_value for each in messages if getattr(each, "param_id", "") == _BACKEND]
+    (backend,) = (
+        struct.unpack("<i", struct.pack("<f", values[-1])) if values else (_TO_MAVLINK,)
+    )  # PX4 copies the bytes
+    if not backend & _TO_MAVLINK:
+        seen = f"{_BACKEND} is {backend}: it refuses to send its ULog stream"
         return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 for file and MAVLink, and restart it")
-    seen = f"a PX4, on a link that carries {system.bytes / seconds / 1000:.0f} KB/s now"
+    size = sum(len(message.get_msgbuf()) for message in messages)
+    seen = f"a PX4, on a link that carries {size / seconds / 1000:.0f} KB/s now"
     advice = f"for all fields of all topics, 'nedbus serve --source \"mavlink:{link}?log=1\"': docs/live.md"
     return Finding("mavlink", name, "ok", seen, advice)
-
-
-def _new_parser() -> Any:
-    parser = dialect.MAVLink(None)
-    parser.robust_parsing = True
-    return parser

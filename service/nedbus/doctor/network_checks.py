@@ -14,6 +14,7 @@ _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _MAX_TEXT: Final = 300  # characters of text from a peer
 _SILENT_PERIODS: Final = 3.0  # periods of a topic without a message
+_MAX_TIME: Final = 1e11  # s since the epoch accepted from a service
 _CLOCK_WARNING: Final = 0.5  # s
 _CLOCK_WRONG: Final = 5.0  # s
 _SYNCHRONISE: Final = "run NTP or PTP on both hosts; check them with 'timedatectl'"
@@ -27,10 +28,11 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
         text = f"connected sessions: {router.sessions:,}"
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-        is_nearly_full = router.load is not None and router.load >= _NEARLY_FULL
-        advice = "raise max_sessions and the limit of open files, or run a second router: docs/hosts.md"
-        state: State = "warning" if is_nearly_full else "ok"
-        yield Finding("router", router.zid, state, text, advice if is_nearly_full else "")
+        if router.load is not None and router.load >= _NEARLY_FULL:
+            advice = "raise max_sessions and the limit of open files, or run a second router: docs/hosts.md"
+            yield Finding("router", router.zid, "warning", text, advice)
+        else:
+            yield Finding("router", router.zid, "ok", text)
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
@@ -70,7 +72,7 @@ def _check_reading(seen: Observation) -> Finding:
 
 def check_services(seen: Observation) -> Iterator[Finding]:
     """Yield the findings on the version and the sources of each service."""
-    for service in (each.status for each in seen.services):
+    for service in seen.services:
         name = brief(service.service)
         theirs = brief(service.version or "unknown")
         if theirs.split(".")[:2] != seen.version.split(".")[:2]:
@@ -189,9 +191,9 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
 def check_clocks(seen: Observation) -> Iterator[Finding]:
     """Yield the clocks that are off; if all others agree with each other, that of this host is off."""
     clocks = {  # offset from the clock of this host, and its uncertainty [s]
-        f"service {brief(each.status.service)} on {brief(each.status.host)}": (each.offset, each.error)
+        f"service {brief(each.service)} on {brief(each.host)}": (each.now - seen.asked, seen.error)
         for each in seen.services
-        if each.offset is not None
+        if each.now is not None and abs(each.now) < _MAX_TIME  # NaN is not
     }
     for stream in seen.streams.values():
         if stream.address is not None and stream.delay is not None:
@@ -203,9 +205,8 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         others = f"{len(off)} others, which agree with each other"
         yield _judge_clock("this host", "this host's clock", -middle, others, _SYNCHRONISE)
         return
-    blame = "the other clocks agree with this host: set this one."
-    if len(clocks) == len(off):
-        blame = "either of the two may be off."
+    only = len(clocks) == len(off)
+    blame = "either of the two may be off." if only else "the other clocks agree with this host: set this one."
     for name, offset in off.items():
         yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:

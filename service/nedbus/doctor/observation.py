@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from typing import Final, TypeVar
 
@@ -32,48 +33,23 @@ T = TypeVar("T")
 
 _POLL: Final = 0.02  # s; also the error of that delay
 _QUERY_TIMEOUT: Final = 1.0  # s
-_MAX_TIME: Final = 1e11  # s since the epoch accepted from a service
 _MAX_SERVICES: Final = 20  # any peer may claim to be a service
 _MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
 _RING: Final = 16_384  # samples buffered per subscription
 
 
-@dataclass(frozen=True, slots=True)
-class Service:
-    """The status reported by a service, and its clock: `offset` +- `error` ahead of ours [s]."""
-
-    status: ServiceStatus
-    offset: float | None
-    error: float
-
-
 @dataclass(slots=True)
 class Stream:
     """Messages on one key; `address` is None for a key that is not a nedbus key.
 
-    `flows`: True once a message has arrived.
     `delay`: minimum time from sent to received, by the clocks of both hosts [s]; None without timestamps.
     `error`: the last decoding error.
     """
 
     address: Address | None
-    flows: bool = False
     delay: float | None = None
     error: str = ""
-
-    def add(self, sample: RawSample) -> None:
-        """Add a received message."""
-        self.flows = True
-        age = _age_of(sample)
-        if age is not None:
-            self.delay = age if self.delay is None else min(age, self.delay)
-        definition = BY_TOPIC.get(self.address.topic) if self.address is not None else None
-        if definition is not None and sample.kind == zenoh.SampleKind.PUT:
-            try:
-                codec_of(definition).decode(sample.payload.to_bytes())
-            except DecodeError as exc:
-                self.error = str(exc)
 
 
 @dataclass(slots=True)
@@ -81,6 +57,7 @@ class Observation:
     """A network as seen by this client, and the scope of the examination.
 
     `version`: of this nedbus; `vehicle`: the one to examine, None for all; `verdict`: its write permission.
+    `services`: their statuses, with the clocks as at `asked` +- `error` by ours [s since the epoch].
     `alive`: number of publishers of each address, by tokens.
     `ages`: age of the last message of each, at the end [s]; None without a timestamp.
     `streams`: messages by key; `listened`: duration of the observation [s].
@@ -92,7 +69,9 @@ class Observation:
     version: str
     vehicle: str | None
     verdict: Verdict | None = None
-    services: list[Service] = field(default_factory=list)
+    services: list[ServiceStatus] = field(default_factory=list)
+    asked: float = 0.0
+    error: float = 0.0
     accounts: list[AccountReport] = field(default_factory=list)
     alive: Counter[Address] = field(default_factory=Counter)
     ages: dict[Address, float | None] = field(default_factory=dict)
@@ -105,12 +84,12 @@ class Observation:
     @property
     def sources(self) -> list[SourceStatus]:
         """The sources of all services."""
-        return [source for service in self.services for source in service.status.sources]
+        return [source for service in self.services for source in service.sources]
 
     @property
     def flowing(self) -> set[Address]:
         """Addresses with at least one received message."""
-        return {each.address for each in self.streams.values() if each.flows and each.address is not None}
+        return {each.address for each in self.streams.values() if each.address is not None}
 
     def observe(self, session: Session) -> None:
         """Query, and listen for little more than 3 s."""
@@ -118,46 +97,55 @@ class Observation:
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
         self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
-        self.services = _ask_services(session, prefix)
+        before = clock.utc()
+        self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
+        self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
         self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
         tokens = alive_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
-        self.alive = Counter(_parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens))
+        self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
         tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
-            for address in _parse_each(self._address_of, [str(sample.key_expr)]):
+            if (address := self._address_of(str(sample.key_expr))) is not None:
                 ages = _age_of(sample), self.ages.get(address)  # several publishers or a storage may answer
                 self.ages[address] = min((age for age in ages if age is not None), default=None)
         queried = clock.utc()
         tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
-        self._add_messages(take_messages())
+        self._add(take_messages())
         for stream in self.streams.values():
             stream.delay = None  # these messages waited during the queries, and appear delayed
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)
-            self._add_messages(take_messages())
+            self._add(take_messages())
             keys = (key for sample in take_others() if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}"))
             others.update(islice((key for key in keys if len(key) < _MAX_KEY_LENGTH), max(0, _MAX_KEYS - len(others))))
         self.ages = {each: None if age is None else age + clock.utc() - queried for each, age in self.ages.items()}
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
-    def _add_messages(self, samples: Iterable[RawSample]) -> None:
+    def _add(self, samples: Iterable[RawSample]) -> None:
+        """Add received messages, but for those on keys beyond the limits."""
         for sample in samples:
-            if (stream := self._stream(str(sample.key_expr))) is not None:
-                stream.add(sample)
+            key = str(sample.key_expr)
+            if key not in self.streams:
+                if len(self.streams) >= _MAX_KEYS or len(key) > _MAX_KEY_LENGTH:
+                    continue
+                self.streams[key] = Stream(self._address_of(key))
+            stream, age = self.streams[key], _age_of(sample)
+            if age is not None:
+                stream.delay = age if stream.delay is None else min(age, stream.delay)
+            definition = BY_TOPIC.get(stream.address.topic) if stream.address is not None else None
+            if definition is not None and sample.kind == zenoh.SampleKind.PUT:
+                try:
+                    codec_of(definition).decode(sample.payload.to_bytes())
+                except DecodeError as exc:
+                    stream.error = str(exc)
 
-    def _stream(self, key: str) -> Stream | None:
-        """Return the stream of a key; None beyond the limit of keys."""
-        if key not in self.streams and len(self.streams) < _MAX_KEYS and len(key) <= _MAX_KEY_LENGTH:
-            self.streams[key] = Stream(next(iter(_parse_each(self._address_of, [key])), None))
-        return self.streams.get(key)
-
-    def _address_of(self, key: str) -> Address:
-        return Address.from_key(key, prefix=self.prefix)
+    def _address_of(self, key: str) -> Address | None:
+        return next(iter(_parse_each(partial(Address.from_key, prefix=self.prefix), [key])), None)
 
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
@@ -166,18 +154,6 @@ def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSamp
     with while_open():
         subscriber = session.declare_subscriber(key_expr, channel)
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
-
-
-def _ask_services(session: Session, prefix: str) -> list[Service]:
-    """Return the answering services; they read their clocks within the round-trip time."""
-    before, start = clock.utc(), time.monotonic()
-    statuses = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)
-    error = (time.monotonic() - start) / 2
-    services = []
-    for status in statuses[:_MAX_SERVICES]:
-        now = status.now if status.now is not None and abs(status.now) < _MAX_TIME else None  # NaN is not
-        services.append(Service(status, None if now is None else now - before - error, error))
-    return services
 
 
 def _age_of(sample: RawSample) -> float | None:

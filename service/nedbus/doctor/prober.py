@@ -12,9 +12,9 @@ from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import Tls, check_pem, open_client, split_endpoint
+from nedbus.transport import UNKNOWN_AUTHORITY, Tls, check_pem, open_client, split_endpoint
 
-from .finding import Finding, State, brief, worst_state
+from .finding import Finding, brief, worst_state
 
 _CONNECT_TIMEOUT: Final = 2.0  # s
 _PEM_FILES: Final = {"tls_ca": "the authority is", "tls_certificate": "this client is", "tls_key": ""}
@@ -26,8 +26,7 @@ _ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
     "": "it aborts the handshake",
 }
 _RENEW: Final = "renew it: 'nedbus pki renew', docs/security.md"
-_UNKNOWN_AUTHORITY: Final = (7, 18, 19, 20, 21)  # OpenSSL's codes
-_OTHER_HOST: Final = (62, 64)
+_OTHER_HOST: Final = (62, 64)  # OpenSSL's codes
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
@@ -94,13 +93,19 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
         yield Finding("tls", endpoint, "wrong", "cannot verify the router: no authority is given", advice)
         return
     try:
-        _shake_hands(host, port, tls)
+        with (
+            suppress(TimeoutError, ConnectionError),
+            socket.create_connection((host, port), timeout=TIMINGS.handshake) as plain,
+            tls.context().wrap_socket(plain, server_hostname=host) as connection,
+        ):
+            connection.settimeout(TIMINGS.tls_alert)
+            connection.recv(1)  # with TLS 1.3 the alert comes after the handshake
     except ssl.SSLCertVerificationError as exc:
         if exc.verify_code in _OTHER_HOST:
             names = f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}" if certificate else ""
             seen = f"the router's certificate is not for {host}{names}"
             advice = f"connect to one of its hosts, or create a certificate: 'nedbus pki cert' with --host {host}"
-        elif exc.verify_code in _UNKNOWN_AUTHORITY:
+        elif exc.verify_code in UNKNOWN_AUTHORITY:
             issuer = f", but by {brief(certificate.issuer)}" if certificate else ""
             seen = f"the router's certificate is not signed by the authority in {tls.ca}{issuer}"
             advice = "pass its authority as --tls-ca, or check that the router is yours"
@@ -121,34 +126,18 @@ def _read_certificate(host: str, port: int) -> str:
     return ""
 
 
-def _shake_hands(host: str, port: int, tls: Tls) -> None:
-    """Perform a TLS handshake as a client; raise SSLError if either side rejects the other."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.load_verify_locations(tls.ca)
-    if tls.certificate is not None:
-        context.load_cert_chain(tls.certificate, tls.key)
-    with (
-        suppress(TimeoutError, ConnectionError),
-        socket.create_connection((host, port), timeout=TIMINGS.handshake) as plain,
-        context.wrap_socket(plain, server_hostname=host) as connection,
-    ):
-        connection.settimeout(TIMINGS.tls_alert)
-        connection.recv(1)  # with TLS 1.3 the alert comes after the handshake
-
-
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:
     """Check the TLS files of these settings; return findings by setting, and the files if they can be used."""
     given = {name: path for name in _PEM_FILES if (path := getattr(settings, name)) is not None}
     found = [(name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items()]
     findings = [(name, finding) for name, finding in found if finding is not None]
     wrong = {finding.seen for _, finding in findings if finding.state == "wrong"}
-    tls, advice = None, ""
+    tls, reason, advice = None, None, ""
     try:
         if settings.tls is not None:
             settings.tls.zenoh_settings()
-        tls = settings.tls
-        reason = tls.explain() if tls is not None and not wrong else None
-        advice = "use a certificate signed by the authority of the router"
+            tls, advice = settings.tls, "use a certificate signed by the authority of the router"
+            reason = None if wrong else tls.explain()
     except ConfigError as exc:
         reason = exc.reason
     if reason and reason not in wrong and not settings.left_out & _PEM_FILES.keys():
@@ -175,15 +164,14 @@ def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[F
         return Finding(check, subject, "unknown", "the expiry of the certificate is not checked", str(exc)), None
     except ValueError as exc:
         return Finding(check, subject, "wrong", f"not a valid certificate: {exc}"), None
-    now = clock.now()
+    now, seen = clock.now(), f"{whose} {brief(certificate)}"
     days = certificate.days_left(now)
-    state: State = "ok"
-    note = advice = ""
+    finding = Finding(check, subject, "ok", seen)
     if days < 0:
-        state, note, advice = "wrong", ": it has expired", _RENEW
+        finding = Finding(check, subject, "wrong", f"{seen}: it has expired", _RENEW)
     elif now < certificate.begins:
-        state, note = "wrong", ": it is not valid yet"
         advice = f"check the clock of this host: {now:%Y-%m-%d %H:%M} UTC"
+        finding = Finding(check, subject, "wrong", f"{seen}: it is not valid yet", advice)
     elif certificate.is_due(now):
-        state, note, advice = "warning", f", {days:.0f} days from now", _RENEW
-    return Finding(check, subject, state, f"{whose} {brief(certificate)}{note}", advice), certificate
+        finding = Finding(check, subject, "warning", f"{seen}, {days:.0f} days from now", _RENEW)
+    return finding, certificate

@@ -175,7 +175,7 @@ def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
     """Decode the messages of a log vectorized; decode those with fields of another type one by one."""
     table: npt.NDArray[np.void] = np.frombuffer(payloads, np.dtype(stream.subscription.layout.dtype))
     definition, columns = stream.definition, {name: table[name] for name in stream.names}
-    decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(columns)
+    decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(tuple(columns))
     messages = decoded.messages
     for name in definition.all_fields - plan.provided:
         decoded.absent[name] = True

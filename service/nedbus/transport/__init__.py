@@ -32,7 +32,7 @@ from .session import (
     translate_error,
     while_open,
 )
-from .tls import Tls, check_pem
+from .tls import UNKNOWN_AUTHORITY, Tls, check_pem
 from .write_probe import Verdict, probe_writes
 from .zenoh_ext import (
     Heartbeats,

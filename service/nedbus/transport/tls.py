@@ -11,10 +11,12 @@ from nedbus import clock
 from nedbus.errors import ConfigError
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
+UNKNOWN_AUTHORITY: Final = (7, 18, 19, 20, 21)
+"""OpenSSL's codes for a certificate of another authority."""
 _VERIFY_REASONS: Final = {  # by OpenSSL's codes
     9: "or its authority is not valid yet: check the clock of this host",
     10: "or its authority has expired",
-    **dict.fromkeys((7, 18, 19, 20, 21), "is not signed by the authority in tls_ca"),
+    **dict.fromkeys(UNKNOWN_AUTHORITY, "is not signed by the authority in tls_ca"),
 }
 
 
@@ -51,22 +53,47 @@ class Tls:
             settings |= {**own, "enable_mtls": True}
         return settings
 
+    def context(self, *, server: bool = False) -> ssl.SSLContext:
+        """Return the context of one side of a connection, which trusts the authority and shows the certificate.
+
+        Raises OSError, also as SSLError, unless `ca` is a certificate, ConfigError for a key that does not match.
+        """
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
+        context.load_verify_locations(self.ca)
+        if self.certificate is not None and self.key is not None:
+            _load_pair(context, self.certificate, self.key)
+        return context
+
     def explain(self) -> str | None:
         """Return the reason if a router would refuse these files, such as an expired certificate; else None.
 
         Needs no network and no other package: performs a handshake in memory, with a server that trusts the authority.
         """
         try:
-            authority = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            authority.load_verify_locations(self.ca)
-        except (OSError, ssl.SSLError):
+            own, authority = self.context(), self.context(server=True)
+        except OSError:
             return f"{self.ca} is not the certificate of an authority"
-        if self.certificate is not None and self.key is not None:
-            return _verify(authority, self.certificate, self.key)
-        if not authority.get_ca_certs():
-            return f"{self.ca} is not the certificate of an authority: it cannot sign others"
-        until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
-        return f"{self.ca} has expired" if until < clock.utc() else None
+        if self.certificate is None:
+            if not authority.get_ca_certs():
+                return f"{self.ca} is not the certificate of an authority: it cannot sign others"
+            until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
+            return f"{self.ca} has expired" if until < clock.utc() else None
+        own.check_hostname = False
+        own.verify_mode = ssl.CERT_NONE  # of the server, which is in this process
+        authority.verify_mode = ssl.CERT_REQUIRED
+        to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+        client = own.wrap_bio(to_client, to_server)
+        server = authority.wrap_bio(to_server, to_client, server_side=True)
+        for side in (client, server, client, server):  # the steps of a handshake
+            try:
+                side.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+            except ssl.SSLCertVerificationError as exc:
+                return f"{self.certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
+            except ssl.SSLError:
+                break
+        return None
 
 
 def check_pem(path: str | Path, kind: str) -> None:
@@ -89,26 +116,3 @@ def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path
         if exc.reason == "KEY_VALUES_MISMATCH":
             reason = f"{key} is not the key of {certificate}: give the two that were made together"
         raise ConfigError("tls", reason) from exc
-
-
-def _verify(authority: ssl.SSLContext, certificate: str | Path, key: str | Path) -> str | None:
-    """Return the reason if a server with this authority refuses the certificate, else None."""
-    own = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    own.check_hostname = False
-    own.verify_mode = ssl.CERT_NONE  # of the server, which is in this process
-    authority.verify_mode = ssl.CERT_REQUIRED
-    for context in (authority, own):
-        _load_pair(context, certificate, key)
-    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = own.wrap_bio(to_client, to_server)
-    server = authority.wrap_bio(to_server, to_client, server_side=True)
-    for side in (client, server, client, server):  # the steps of a handshake
-        try:
-            side.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
-        except ssl.SSLCertVerificationError as exc:
-            return f"{certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
-        except ssl.SSLError:
-            break
-    return None

@@ -45,9 +45,9 @@ class PayloadLayout:
         self._places: list[tuple[str, int | slice]] = []  # of each field in the unpacked values
         form, end, count = "<", 0, 0
         for name, kind, offset in fields:
-            self._places.append((name, slice(count, count + kind.count) if kind.is_array else count))
+            self._places.append((name, slice(count, count + kind.values) if kind.is_array else count))
             form += f"{offset - end}x{_form(kind)}"
-            end, count = offset + kind.count * kind.size, count + kind.count
+            end, count = offset + kind.values * kind.size, count + kind.values
         self._unpack = struct.Struct(form).unpack_from
 
     def decode(self, payload: bytes) -> dict[str, Any]:
@@ -115,7 +115,7 @@ class Formats:
                 if flat in fields:
                     raise ValueError(f"two fields are called {flat}, including those of nested messages")
                 array = "char" if c_type == "char" else base.base
-                fields[flat] = PayloadField(flat, FieldType(array, length) if length else base, start)
+                fields[flat] = PayloadField(flat, field_type(f"{array}[{length}]") if length else base, start)
             size = size if field.startswith("_padding") else offset
         return PayloadLayout(tuple(fields.values()), size, offset - size)
 

@@ -95,7 +95,7 @@ def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArra
                 field, scale = CONVERTED[name]
                 expected, fields = values / scale, [field]
             elif name not in BY_TOPIC[topic].types:
-                fields = list(BY_TOPIC[topic].plan([name]).provided)
+                fields = list(BY_TOPIC[topic].plan((name,)).provided)
                 assert fields or name in DROPPED[topic], (stream, column)
         for field in fields:
             ours = array[field]

@@ -19,7 +19,7 @@ from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
 from nedbus.timings import Timings
 from nedbus.transport import Session
-from nedbus_msgs import Address, AddressError, Selection
+from nedbus_msgs import RATE, Address, AddressError, Selection
 from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.peers.processes import Start
@@ -303,7 +303,7 @@ def test_rate_keys() -> None:
     """The key of a downsampled stream is the key of the stream, a chunk that no wildcard matches, and the rate."""
     address = Address("7", "estimator_local_position", 1)
     assert address.rate_key(5) == "nedbus/7/estimator_local_position/1/@rate/5"
-    assert Address.from_rate_key("nedbus/7/estimator_local_position/1/@rate/5") == address
+    assert Address.from_key(address.rate_key(5).partition(RATE)[0]) == address
     assert Selection().rate_key_expr(5) == "nedbus/*/**/@rate/5"
     assert Selection(VLP, "7").rate_key_expr("*", prefix="a/b") == f"a/b/7/{VLP}/@rate/*"
     assert Selection(VLP, "7").alive_key_expr(prefix="a/b") == f"a/b/7/@alive/*/{VLP}"
@@ -312,4 +312,4 @@ def test_rate_keys() -> None:
     assert not zenoh.KeyExpr("nedbus/**").intersects(address.rate_key(5))
     assert zenoh.KeyExpr(Selection().rate_key_expr(5)).intersects(address.rate_key(5))
     with pytest.raises(AddressError):
-        Address.from_rate_key(address.key())
+        Address.from_key(address.rate_key(5))

@@ -27,8 +27,6 @@ from nedbus_msgs import (
     Selection,
     definition_of,
     get_topic,
-    json_schema_of,
-    layout_table_of,
 )
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
@@ -145,7 +143,7 @@ def schema(
         definition: Definition[Any] = definition_of(message)
     except KeyError:
         definition = _ask_publisher(open_bus, message)
-    write(json.dumps((layout_table_of if layouts else json_schema_of)(definition), indent=2))
+    write(json.dumps(definition.schema()["layouts" if layouts else "json_schema"], indent=2))
 
 
 def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:

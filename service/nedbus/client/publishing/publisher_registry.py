@@ -18,7 +18,7 @@ from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
-from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, schema_of, short_hash
+from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
@@ -187,7 +187,7 @@ def _reply_schemas(
     wanted = query.parameters.get("hash")
     for (name, short), definition in tuple(definitions.items()):
         if wanted in (None, short) and query.key_expr.intersects(key_of(name)):
-            query.reply(key_of(name), json.dumps({**schema_of(definition), "hash": short}), encoding=JSON)
+            query.reply(key_of(name), json.dumps({**definition.schema(), "hash": short}), encoding=JSON)
 
 
 def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:

@@ -19,6 +19,7 @@ from nedbus.transport import RawSample
 from nedbus_msgs import (
     BY_TOPIC,
     PAYLOAD_LIMIT,
+    RATE,
     Address,
     AddressError,
     Codec,
@@ -106,7 +107,7 @@ class Decoder:
 
     def open(self, key: str) -> KeyState:
         """Return the state of a new stream; raise AddressError if the key has no address."""
-        address = (Address.from_rate_key if "/@" in key else Address.from_key)(key, prefix=self.prefix)  # with max_rate
+        address = Address.from_key(key.partition(RATE)[0], prefix=self.prefix)
         stream = KeyState(address.key(prefix=self.prefix), key, address)
         if address.topic in BY_TOPIC:
             stream.codec = codec_of(BY_TOPIC[address.topic])

@@ -1,14 +1,16 @@
-"""Define messages without a file at run time, by field names and types, from a log, a .msg file or a publisher."""
+"""Definitions: of messages with a file, by class, name or topic, and of others at run time, by their fields."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from pydantic import Field, create_model
+from typing_extensions import TypeVar
 
 from .codecs.msgpack import PAYLOAD_LIMIT, full_width
-from .model.declaration import Layout
-from .model.definition import Definition
+from .messages.vehicle_local_position import VehicleLocalPosition
+from .model.declaration import DEFAULT_TOPIC, Layout
+from .model.definition import BY_TOPIC, MESSAGES, Definition
 from .model.message import Message
 from .model.px4_types import FieldType, Timestamp
 from .model.rules import Rule
@@ -19,6 +21,18 @@ PX4: Final = "PX4"
 _NAME = re.compile(r"[A-Z][A-Za-z0-9]{0,63}")
 _FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _MOST: Final = 256  # fields per message; PX4's largest has a third of that
+M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
+
+
+def definition_of(message: type[M] | str) -> Definition[M]:
+    """Return the definition of a message by class, name or topic; raise KeyError if it is unknown."""
+    if isinstance(message, str):
+        return MESSAGES[message] if message in MESSAGES else BY_TOPIC[message]
+    return message.DEFINITION
+
+
+DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
+"""The default message of functions that take one."""
 
 
 def define(
@@ -28,7 +42,7 @@ def define(
     meanings: Mapping[str, str] | None = None,
     rules: Sequence[Rule] = (),
 ) -> Definition[Message]:
-    """Define a message with these fields, in the order of its CDR.
+    """Define a message without a file, from a log, a .msg file or a publisher; `fields`: in the order of its CDR.
 
     `meanings`: unit and meaning of fields, by name.
 
