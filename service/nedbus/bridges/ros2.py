@@ -55,6 +55,10 @@ _log = logging.getLogger(__name__)
 _POLL: Final = 1.0  # s between queries for addresses and for publishers of other nodes
 _MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; publishers keep 20 s for recovery
 _MAX_LEFT_OUT: Final = 1000  # addresses logged as unsupported
+_REFUSALS: Final = {
+    "conflict": "%s is not published: %s already uses the topic /%s: set --namespace",
+    "defer": "%s is left to node %s, which already publishes /%s",
+}  # by action
 _VISIBLE_TIMEOUT: Final = 5.0  # s for a token to become visible to other sessions; later counts as denied
 
 
@@ -85,8 +89,7 @@ class Ros2Bridge:
         hashed: bool = True,
         namespaces: Mapping[str, str] | None = None,
     ) -> None:
-        known = dict.fromkeys((*RELEASES, *DEFAULT.layouts))
-        if layout not in known:
+        if layout not in (known := dict.fromkeys((*RELEASES, *DEFAULT.layouts))):
             raise LayoutError(f"unknown layout {layout!r}: choose from {', '.join(known)}")
         self._bus = bus
         self._session = session
@@ -94,11 +97,11 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {
-            topic: (definition, found, hash_of(found, ros2_type(definition)) if hashed else NO_HASH)
-            for topic, definition in BY_TOPIC.items()
-            if (found := definition.layout_of_release(layout))
-        }  # messages of the workspace
+        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # messages of the workspace
+        for topic, definition in BY_TOPIC.items():
+            if found := definition.layout_of_release(layout):
+                type_hash = hash_of(found, ros2_type(definition)) if hashed else NO_HASH
+                self._types[topic] = definition, found, type_hash
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
@@ -161,8 +164,7 @@ class Ros2Bridge:
 
     def _poll(self) -> None:
         """Report late samples, query the addresses of the bus and the nodes of ROS 2, and apply the decisions."""
-        held_back = self._late_filter.report()
-        if held_back:
+        if held_back := self._late_filter.report():
             _log.warning("%s: ROS 2 would take them for the current estimate", held_back, extra=about("held-back"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
@@ -172,7 +174,12 @@ class Ros2Bridge:
         addresses = list(filter(self._is_bridged, published))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
-        nodes = self._other_nodes()
+        nodes, own = dict[TopicKey, str](), self._zid  # other nodes by the topic that they publish
+        for text in alive_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
+            with suppress(DecodeError):
+                token = PublisherToken.parse(text)
+                if token.session != own:
+                    nodes.setdefault(token.key, token.node)
         others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
         for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
             self._apply(decision)
@@ -187,29 +194,15 @@ class Ros2Bridge:
             _log.info("%s -> /%s, %s of layout %s", address, topic, name, layout.name, extra=about("bridged", address))
             if address in self._held:
                 self._put(self._held.pop(address))
-        elif decision.action == "conflict":
-            text = "%s is not published: %s already uses the topic /%s: set --namespace"
-            _log.warning(text, address, other, topic, extra=about("conflict", address))
-        elif decision.action == "defer":
+        elif decision.action in _REFUSALS:
             self._close(address)
-            text = "%s is left to node %s, which already publishes /%s"
-            _log.warning(text, address, other, topic, extra=about("conflict", address))
+            _log.warning(_REFUSALS[decision.action], address, other, topic, extra=about("conflict", address))
         else:
             self._close(address)
             # After a router restart the address soon returns, followed by the messages of the outage.
             self._withdrawn[address] = time.monotonic()
             text = "%s is no longer on the bus: /%s is withdrawn"
             _log.info(text, address, topic, extra=about("withdrawn", address))
-
-    def _other_nodes(self) -> dict[TopicKey, str]:
-        """Return the publishing node of each topic of another node, with a single query: there may be thousands."""
-        nodes, own = dict[TopicKey, str](), self._zid
-        for text in alive_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
-            with suppress(DecodeError):
-                token = PublisherToken.parse(text)
-                if token.session != own:
-                    nodes.setdefault(token.key, token.node)
-        return nodes
 
     def _open(self, address: Address) -> None:
         key = self._key(address)
