@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -47,7 +47,6 @@ MAX_STREAMS: Final = len(_COLORS)
 _FLAGS: Final = (  # estimator flags
     "xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning",
 )  # fmt: skip
-_HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
 _COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy", "vz", "heading")}
 
 
@@ -64,13 +63,10 @@ class _Stream(NamedTuple):
         return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
 
 
-@dataclass(frozen=True, slots=True)
-class _Mark:
-    """An event of a vehicle, from begin to end [s]; both are equal for an instantaneous event."""
+class _Mark(NamedTuple):
+    """An event with its text, from begin to end [s]; both are equal for an instantaneous event."""
 
-    vehicle: str
-    row: str
-    severity: Severity
+    event: Event
     text: str
     begin: float
     end: float
@@ -113,10 +109,8 @@ def draw_figure(
         _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
         for (address, messages), color in zip(streams, _COLORS, strict=False)
     ]
-    rows = _rows(drawn)
-    marks = _marks(drawn, start / 1e6, events)
-    by_row = _by_row(marks)
-    heights = [_FRAME + _ROW * len(each) for each in (rows, by_row) if each]
+    rows, marks = _rows(drawn), _marks(drawn, start / 1e6, events)
+    heights = [_FRAME + _ROW * len(each) for each in (rows, marks) if each]
     figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     mosaic: list[HashableList[str]] = [
@@ -124,71 +118,65 @@ def draw_figure(
     ]  # fmt: skip
     ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights]
     axes = figure.subplot_mosaic(mosaic[: len(ratios)], height_ratios=ratios, width_ratios=[1, 1.2])
-    _draw_track(axes["track"], drawn)
-    _draw_altitude(axes["altitude"], drawn)
-    _draw_speed(axes["speed"], drawn)
-    _draw_rows(axes["flags"], rows)
-    _mark_events(axes, drawn, marks)
-    for name in ("track", "altitude", "speed"):
-        axes[name].grid(alpha=0.3)
+    for name in axes.keys() - {"track", "altitude"}:
+        axes[name].sharex(axes["altitude"])
+    _draw_estimates(axes, drawn)
+    _draw_flags(axes["flags"], rows)
+    by_time = sorted((mark for own in marks.values() for mark in own), key=lambda mark: mark.begin)
+    _mark_events(axes, drawn, by_time)
     axes["track"].legend(fontsize="small", loc="best")
-    seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in marks)])
+    seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in by_time)])
     margin = 0.02 * (np.ptp(seconds) or 1.0)
-    for name in axes.keys() - {"track"}:
-        axes[name].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
-    label = _label_times([axes[name] for name in axes.keys() - {"track"}], drawn, start / 1e6, times)
-    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
-    figure.supxlabel(_explain_missing(drawn), fontsize="small")
-    for name in ("speed", "events" if by_row else "flags"):
+    axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
+    label = _label_times(axes["altitude"], drawn, start / 1e6, times)
+    for name in ("speed", "events" if marks else "flags"):
         axes[name].set_xlabel(label)
-    if by_row:
-        _draw_events(figure, axes["events"], by_row)
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
+    missing = {each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))] for each in drawn}
+    notes = (f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)
+    figure.supxlabel("\n".join(notes), fontsize="small")
+    if marks:
+        _draw_events(figure, axes["events"], marks)
     return figure
 
 
-def _label_times(axes: Iterable[Any], streams: Iterable[_Stream], start: float, times: Times) -> str:
+def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Times) -> str:
     """Put ticks on time axes that begin at `start` [s since boot], in UTC if it is one for all; return their label."""
     found = [times.utc_of_boot(stream.address.vehicle, start) for stream in streams]
     utc = [each for each in found if each is not None]
     has_utc = len(utc) == len(found) and max(utc) - min(utc) < 1.0
     shift = utc[0] if has_utc else start
-    for each in axes:
-        low, high = (limit + shift for limit in each.get_xlim())
-        step = next((step for step in _STEPS if high - low < _TICKS * step), _STEPS[-1])
-        ticks = np.arange(np.ceil(low / step), high / step) * step
-        each.set_xticks(
-            ticks - shift, [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
-        )
+    low, high = (limit + shift for limit in axes.get_xlim())
+    step = next((step for step in _STEPS if high - low < _TICKS * step), _STEPS[-1])
+    ticks = np.arange(np.ceil(low / step), high / step) * step
+    texts = [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
+    axes.set_xticks(ticks - shift, texts)
     return f"time [{unit_of('vehicle' if has_utc else 'boot')}]"
 
 
-def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
-    """Plot the tracks, with a circle at the start and a square at the end of each."""
+def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None:
+    """Plot the tracks, with a circle at the start and a square at the end of each, altitude and speed."""
     tracks = [(each.messages["y"], each.messages["x"]) for each in streams]
-    _draw_lines(axes, streams, "xy_valid", tracks, width=1.2)
+    _draw_lines(axes["track"], streams, "xy_valid", tracks, width=1.2)
+    altitudes = [(each.seconds, -each.messages["z"]) for each in streams]
+    _draw_lines(axes["altitude"], streams, "z_valid", altitudes, width=1.0)
+    speeds = [(each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams]
+    _draw_lines(axes["speed"], streams, "v_xy_valid", speeds, width=0.9)
     for stream in streams:
         track = stream.messages[stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])]
         if len(track):
-            axes.plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
-            axes.plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
-    axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
-    axes.locator_params(axis="x", nbins=6)  # more labels may overlap
-    axes.set_title("track; circle: start, square: end, thin: xy invalid")
-
-
-def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
-    _draw_lines(axes, streams, "z_valid", [(each.seconds, -each.messages["z"]) for each in streams], width=1.0)
-    for stream in streams:
-        for time in np.unique(np.concatenate([stream.resets(each) for each in _HEIGHT_COUNTERS])):
-            axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
+            axes["track"].plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
+            axes["track"].plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
+        for time in np.union1d(stream.resets("z_reset_counter"), stream.resets("vz_reset_counter")):
+            axes["altitude"].axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
+    axes["track"].set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
+    axes["track"].locator_params(axis="x", nbins=6)  # more labels may overlap
+    axes["track"].set_title("track; circle: start, square: end, thin: xy invalid")
     title = "altitude; thin: z invalid, dashed: z or vz reset"
-    axes.set(ylabel="altitude above origin, -z [m]", title=title)
-
-
-def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
-    speed = [(each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams]
-    _draw_lines(axes, streams, "v_xy_valid", speed, width=0.9)
-    axes.set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
+    axes["altitude"].set(ylabel="altitude above origin, -z [m]", title=title)
+    axes["speed"].set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
+    for name in ("track", "altitude", "speed"):
+        axes[name].grid(alpha=0.3)
 
 
 def _draw_lines(
@@ -197,12 +185,11 @@ def _draw_lines(
     """Plot a line per stream, thin where its flag is not set; thin parts scale the axes only if no part is valid."""
     valid = [stream.messages[flag] for stream in streams]
     in_scale = not any(np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True))
-    for stream, (x, y) in zip(streams, lines, strict=True):
-        thin = Line2D(x, y, color=stream.color, linewidth=0.5, alpha=0.6)
-        (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
     for stream, each, line in zip(streams, valid, lines, strict=True):
-        x, y = (np.where(each, values, np.nan) for values in line)
-        axes.plot(x, y, color=stream.color, linewidth=width, label=str(stream.address))
+        thin = Line2D(*line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)  # below all others
+        (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
+        thick = (np.where(each, values, np.nan) for values in line)
+        axes.plot(*thick, color=stream.color, linewidth=width, label=str(stream.address))
 
 
 def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
@@ -217,7 +204,7 @@ def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
     return rows
 
 
-def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
+def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
     for number, (_, stream, field) in enumerate(rows):
         if field in _COUNTERS:
             times = stream.resets(field)
@@ -231,15 +218,17 @@ def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
     axes.grid(axis="x", alpha=0.3)
 
 
-def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> list[_Mark]:
-    """Return the marks of the streams' vehicles by time; skip events far from all messages: their time is damaged."""
+def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> dict[str, list[_Mark]]:
+    """Return the marks of the streams' vehicles by row, the most severe first, each row in order of time.
+
+    Events far from all messages are left out: their time is damaged.
+    """
     timed = [event for event in events if event.boot is not None]
-    marks: list[_Mark] = []
+    rows = defaultdict[str, dict[Event, _Mark]](dict)
     vehicles = sorted({stream.address.vehicle for stream in streams})
     for vehicle in vehicles:
         seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
         first, last = float(seconds.min()), float(seconds.max())
-        found: dict[Event, _Mark] = {}  # conditions that began together share a mark until the last of them ends
         for span in spans_of([event for event in timed if event.vehicle == vehicle]):
             event = span.begin
             if span.initial or event.boot is None or (event.severity == "info" and not KINDS[event.kind].phase):
@@ -250,20 +239,16 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
                 continue
             row = KINDS[event.kind].row or event.kind.replace("_", " ")
             text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
-            row += f" {vehicle}" if len(vehicles) > 1 else ""
+            marks = rows[f"{row} {vehicle}" if len(vehicles) > 1 else row]
             end = max(begin, last if span.until is None else min(span.until + offset, last))
-            end = max(end, found[event].end) if event in found else end
-            found[event] = _Mark(vehicle, row, event.severity, text, begin, end)
-        marks += found.values()
-    return sorted(marks, key=lambda mark: mark.begin)
+            # Conditions that began together share a mark until the last of them ends.
+            marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
 
+    def order(marks: list[_Mark]) -> tuple[int, float]:
+        return min((SEVERITIES.index(mark.event.severity), mark.begin) for mark in marks)
 
-def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
-    """Return the marks by row label, rows with the most severe marks first."""
-    rows: dict[str, list[_Mark]] = {}
-    for mark in sorted(marks, key=lambda mark: SEVERITIES.index(mark.severity)):
-        rows.setdefault(mark.row, []).append(mark)
-    return {label: sorted(own, key=lambda mark: mark.begin) for label, own in rows.items()}
+    by_row = {row: sorted(marks.values(), key=lambda mark: mark.begin) for row, marks in rows.items()}
+    return dict(sorted(by_row.items(), key=lambda row: order(row[1])))
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
@@ -272,13 +257,13 @@ def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Ite
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():
         marker, color, size = _MARKERS[severity]
-        own = [mark for mark in marks if mark.severity == severity]
+        own = [mark for mark in marks if mark.event.severity == severity]
         if not own:
             continue
         style: dict[str, Any] = {"marker": marker, "color": color, "fillstyle": "none", "linestyle": "none"}
         places = []
         for mark in own:
-            stream = main[mark.vehicle]
+            stream = main[mark.event.vehicle]
             nearest = np.abs(stream.seconds - mark.begin).argmin()
             if abs(stream.seconds[nearest] - mark.begin) <= _NEAR:
                 places.append((stream.messages["y"][nearest], stream.messages["x"][nearest]))
@@ -293,39 +278,26 @@ def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Ite
 
 
 def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
-    """Plot the marks row by row, with labels where there is room."""
+    """Plot the marks row by row, and label each if the text fits before the next mark."""
     for number, marks in enumerate(rows.values()):
         for mark in marks:
-            marker, color, size = _MARKERS[mark.severity]
-            axes.broken_barh(
-                [(mark.begin, mark.end - mark.begin)], (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0
-            )
+            marker, color, size = _MARKERS[mark.event.severity]
+            bar = [(mark.begin, mark.end - mark.begin)]
+            axes.broken_barh(bar, (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0)
             axes.plot(mark.begin, number, marker, color=color, markersize=size)
     axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
     axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
     figure.draw_without_rendering()  # lays out the axes, which determines the room for labels
-    for number, marks in enumerate(rows.values()):
-        _label(axes, number, marks)
-
-
-def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
-    """Label each mark if the text fits before the next mark."""
     gap = _GAP * _DPI / 72
-    places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
-    for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
-        text = axes.annotate(
-            mark.text, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
-            fontsize="x-small", parse_math=False,
-        )  # fmt: skip
-        text.set_in_layout(False)
-        box = text.get_window_extent()
-        if box.x0 + 1.05 * box.width > after - gap:  # text width differs slightly between file formats
-            text.remove()
-
-
-def _explain_missing(streams: Sequence[_Stream]) -> str:
-    """Return a note on the rows that are not plotted because the flight lacks their fields."""
-    drawn = [*_FLAGS, *_COUNTERS]
-    missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
-    return "\n".join(f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)
+    for number, marks in enumerate(rows.values()):
+        places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
+        for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
+            text = axes.annotate(
+                mark.text, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
+                fontsize="x-small", parse_math=False,
+            )  # fmt: skip
+            text.set_in_layout(False)
+            box = text.get_window_extent()
+            if box.x0 + 1.05 * box.width > after - gap:  # text width differs slightly between file formats
+                text.remove()
