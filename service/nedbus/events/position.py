@@ -51,7 +51,7 @@ class PositionDetector(ChangeDetector):
     """Detector of a VehicleLocalPosition, or of another estimate with the same fields."""
 
     def __init__(self) -> None:
-        super().__init__(_COMPARED, self._detect_position, context=_CONTEXT)
+        super().__init__(_COMPARED, _CONTEXT, self._detect_position)
         self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()

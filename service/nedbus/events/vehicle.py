@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final
 
 from nedbus_msgs import BY_TOPIC, Address
@@ -15,12 +16,15 @@ from .detectors import (
     EKF_SELECTOR,
     HEALTHY,
     ChangeDetector,
-    EstimateDetector,
+    Detect,
+    FieldReader,
+    Fields,
     Finding,
     TextDetector,
     detect_selection,
-    flags_detector,
-    make_detector,
+    detect_unused,
+    detection_of,
+    selected,
 )
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
@@ -36,6 +40,8 @@ _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference: the best one that arrives gives the conditions of its message.
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _GROUPS: Final = (POSITIONS, _RECEIVERS)
+_SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # by which two estimates are equal
+_read_sample: Final = FieldReader(_SAMPLE)
 
 
 class Vehicle:
@@ -249,26 +255,44 @@ class Vehicle:
         if topic == EKF_SELECTOR:
             unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
-            return ChangeDetector(["primary_instance"], detect_selection)
-        if topic == _EKF:
-            return flags_detector(instance, lambda: self._ekf)
-        if instance and topic not in POSITIONS:  # only the first sensor and battery
+            return ChangeDetector(["primary_instance"], (), detect_selection)
+        if instance and topic not in (*POSITIONS, _EKF):  # only the first sensor and battery
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.get(group)
             if current is not None and _rank(group, current) <= _rank(group, address):
                 is_sought = topic == POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
-                equals = EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
-                return equals if is_sought else None
+                detect = partial(self._detect_equal, instance)
+                return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
             if current is not None:
                 self._supersede(current, address)
             self._preferred[group] = address
         if group is POSITIONS:
             self.main = address
             return PositionDetector()
-        detector = make_detector(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
-        return ReferenceDetector(topic, self._comparison, detector) if topic in REFERENCES else detector
+        own = detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        if topic in REFERENCES:
+            return ReferenceDetector(topic, self._comparison, own)
+        if own is not None and topic == _EKF:
+            own = *own[:2], partial(self._detect_flags, instance, own[2])
+        detector = TextDetector if topic == "log_message" else ChangeDetector
+        return None if own is None else detector(*own)
+
+    def _detect_flags(self, instance: int, detect: Detect, before: Fields, after: Fields) -> Iterator[Finding]:
+        return detect(before, after) if instance == self._ekf else detect_unused(instance, before, after)
+
+    def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
+        """Yield the EKF whose estimates equal those of the vehicle, if those of the one in use do not.
+
+        For the EKF in use where no selector names it.
+        """
+        position = self._position()
+        vehicle = _read_sample(None if position is None else position.last)
+        if before and before["timestamp_sample"] == vehicle[0]:
+            self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
+        if self._equal.get(instance) and not self._equal.get(self._ekf, True):
+            yield selected(instance, None)
 
     def _position(self) -> ChangeDetector | None:
         """Return the detector of the position estimate in use."""
