@@ -41,17 +41,12 @@ _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 _FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, start of summary and summary offsets, CRC, magic
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK_INDEX: ChunkIndex,
-    Opcode.STATISTICS: Statistics,
-}
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
+}  # fmt: skip
 _MAX_SMALL_CHUNK: Final = 2**26  # bytes uncompressed, at any ratio; ROS 2 writes 768 kB, nedbus 8 MiB plus a message
 _MAX_CHUNK: Final = 2**30  # bytes uncompressed
 _MAX_RATIO: Final = 100  # compression ratio of chunks above _MAX_SMALL_CHUNK
 _MAX_WARNINGS: Final = 100
-
-_Place = tuple[int, int, int]  # a record: opcode, offset, and offset of the next record
 
 
 class ChunkFile:
@@ -86,7 +81,13 @@ class ChunkFile:
 
         `only`: channels of interest; chunks without any of them may be skipped.
         """
-        for opcode, offset, end in self._indexed(only) if self._chunks else self._follow():
+        chunks = (
+            (Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length)
+            for chunk in self._chunks
+            # A chunk that lists no channels may contain any.
+            if only is None or not (own := chunk.message_index_offsets.keys()) or not own.isdisjoint(only)
+        )
+        for opcode, offset, end in chunks if self._chunks else self._follow():
             record = self._read(offset, end - offset)
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
@@ -141,15 +142,8 @@ class ChunkFile:
             raise ValueError(places)
         self._chunks, self.summary = chunks, records
 
-    def _indexed(self, only: Collection[int] | None) -> Iterator[_Place]:
-        """Yield the chunks listed in the summary."""
-        for chunk in self._chunks:
-            channels = chunk.message_index_offsets.keys()  # a chunk that lists no channels may contain any
-            if only is None or not channels or not channels.isdisjoint(only):
-                yield Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
-
-    def _follow(self) -> Iterator[_Place]:
-        """Scan the file record by record; yield each chunk, and each schema, channel and message outside of chunks."""
+    def _follow(self) -> Iterator[tuple[int, int, int]]:
+        """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages outside."""
         offset, after_chunk = len(MCAP0_MAGIC), False
         while True:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
@@ -162,11 +156,8 @@ class ChunkFile:
             if opcode in _LENGTHS:
                 return
             # The index after a chunk has no checksum: one flipped bit makes its opcode that of a message.
-            if (
-                after_chunk
-                and opcode == Opcode.MESSAGE
-                and _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :]) == length
-            ):
+            is_index = length == _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :])
+            if after_chunk and opcode == Opcode.MESSAGE and is_index:
                 opcode = Opcode.MESSAGE_INDEX
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
                 self.warn(f"damaged: skipped the chunk before byte {offset}", lost=True)
