@@ -79,7 +79,8 @@ class Vehicle:
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
         self._bursts: dict[str, _Burst] = {}  # of messages lost or rejected, and ms of dropouts, by kind
         self._ekf = 0  # instance of the EKF in use
-        self._comparison = Comparison(self._position)
+        self._position: PositionDetector | None = None  # of `main`
+        self._comparison = Comparison(lambda: self._position)
         self._equal: dict[int, bool] = {}  # by EKF, if its estimate is the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
@@ -189,7 +190,9 @@ class Vehicle:
         for event in reversed(self.recent):
             if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
-            elif event.change == "begin" and event.kind not in kinds and self._is_suppressed(event):
+                continue
+            keys = {(event.kind, event.names), (event.kind, None)}
+            if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
                 kinds.add(event.kind)
                 text = f"{event.text} (flapping)"
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
@@ -233,8 +236,7 @@ class Vehicle:
     @property
     def unknown(self) -> tuple[str, ...]:
         """The flags that the position estimate in use does not provide."""
-        detector = self._position()
-        return detector.unknown if isinstance(detector, PositionDetector) else ()
+        return () if self._position is None else self._position.unknown
 
     @property
     def held_from_start(self) -> str:
@@ -260,17 +262,18 @@ class Vehicle:
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
-            current = self._preferred.get(group)
-            if current is not None and _rank(group, current) <= _rank(group, address):
+            current = self._preferred.setdefault(group, address)
+            if min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0)) != address:
                 is_sought = topic == POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
-            if current is not None:
-                self._supersede(current, address)
-            self._preferred[group] = address
+            if current != address:  # open unused streams anew, and end the conditions
+                self._preferred[group], kinds = address, kinds_of(BY_TOPIC[topic].name)
+                self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
+                self._end(address, lambda kind, _: kind in kinds)
         if group is POSITIONS:
-            self.main = address
-            return PositionDetector()
+            self.main, self._position = address, PositionDetector()
+            return self._position
         own = detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
         if topic in REFERENCES:
             return ReferenceDetector(topic, self._comparison, own)
@@ -287,16 +290,11 @@ class Vehicle:
 
         For the EKF in use where no selector names it.
         """
-        position = self._position()
-        vehicle = _read_sample(None if position is None else position.last)
+        vehicle = _read_sample(None if self._position is None else self._position.last)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
         if self._equal.get(instance) and not self._equal.get(self._ekf, True):
             yield selected(instance, None)
-
-    def _position(self) -> ChangeDetector | None:
-        """Return the detector of the position estimate in use."""
-        return None if self.main is None else self._detectors.get(self.main)
 
     def _use_ekf(self, instance: int) -> None:
         """Use the flags of another EKF: those of both that are set begin conditions anew."""
@@ -309,12 +307,6 @@ class Vehicle:
             detector = self._detectors.get(replace(stream, instance=each))
             for found in () if detector is None else detector.again(HEALTHY):
                 self.emit(found, _EKF, self.time)
-
-    def _supersede(self, old: Address, new: Address) -> None:
-        """Stop using a stream as before, and end its conditions, when a better one arrives; open unused ones anew."""
-        self._detectors = {each: found for each, found in self._detectors.items() if found and each != old}
-        kinds = kinds_of(BY_TOPIC[new.topic].name)
-        self._end(new, lambda kind, _: kind in kinds)
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
         """End the conditions whose kind and flag are over, as a better stream is in use."""
@@ -345,9 +337,6 @@ class Vehicle:
         held = [each for each in conditions if each.begin is not event]
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
-    def _is_suppressed(self, event: Event) -> bool:
-        return (event.kind, event.names) in self._suppressed or (event.kind, None) in self._suppressed
-
     def _is_flapping(self, event: Event) -> bool:
         """Return True if there are too many of such events to report each; `settle` reports the last one."""
         keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in combinations
@@ -370,7 +359,3 @@ class _Burst:
     end: float
     count: int = 0
     topics: set[str] = field(default_factory=set)
-
-
-def _rank(topics: tuple[str, ...], address: Address) -> tuple[int, int]:
-    return topics.index(address.topic), address.instance or 0
