@@ -249,7 +249,8 @@ def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
 
 def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the battery warnings of a BatteryStatus."""
-    warning, was = _warning_of(after), _warning_of(before) if before else 0
+    known = ({"connected": True, "warning": 0} | before, after)
+    was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
     if warning is None or was is None or was == warning:
         return
     remaining, numbers, left = after["remaining"], {"warning": warning}, ""
@@ -262,10 +263,6 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     else:
         text = f"battery no longer {rules.WARNINGS.get(was, was)}{left}"
         yield Finding("battery", "end", text, numbers=numbers)
-
-
-def _warning_of(battery: Fields) -> int | None:
-    return 0 if battery["connected"] is False else cast("int | None", battery["warning"])
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:

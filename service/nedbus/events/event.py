@@ -65,11 +65,6 @@ class Event:
         evidence = tuple(each.later(seconds) for each in self.evidence)
         return replace(self, time=max(0.0, self.time + seconds), evidence=evidence)
 
-    @property
-    def is_notable(self) -> bool:
-        """True if a story includes it: a begin or single event of severity bad or watch, or a change of mode."""
-        return self.change != "end" and (self.severity != "info" or self.kind == "mode")
-
 
 @dataclass(frozen=True, slots=True)
 class Condition:

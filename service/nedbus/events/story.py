@@ -171,7 +171,8 @@ def _make_story(
     if not before and not span.initial:
         before = unused(e for e in near if e.change != "end" and not (KINDS[e.kind].phase and e.severity == "info"))
     after = unused(explain(end, events)) if end else []
-    notable = [each for each in events if each not in used and each.is_notable]
+    begun = [each for each in events if each not in used and each.change != "end"]
+    notable = [each for each in begun if each.severity != "info" or each.kind == "mode"]
     stop = math.inf if until is None else until
     after += [each for each in notable if stop <= each.time <= stop + TOGETHER and each.change == "once"]
     lacking: list[str] = []
