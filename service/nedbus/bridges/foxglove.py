@@ -16,18 +16,8 @@ import time
 from typing import Any, Final
 
 import foxglove
+from foxglove import messages
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
-from foxglove.messages import (
-    FrameTransform,
-    FrameTransforms,
-    LocationFix,
-    LocationFixPositionCovarianceType,
-    Pose,
-    PoseInFrame,
-    Quaternion,
-    Timestamp,
-    Vector3,
-)
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
@@ -50,7 +40,7 @@ from . import FOXGLOVE_PORT
 _ATTITUDE: Final = "vehicle_attitude"
 _POLL: Final = 1.0  # s between queries for the published addresses
 _MAX_APART: Final = 500_000  # us between a position and the attitude paired with it
-_NO_ROTATION: Final = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+_NO_ROTATION: Final = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 class FoxgloveServer:
@@ -71,7 +61,7 @@ class FoxgloveServer:
         self._attitudes: dict[str, Any] = {}  # last message of each vehicle
         self._map: MapProjection | None = None  # at the first global origin of any vehicle
         self._altitude = math.nan  # of the first origin that has one
-        self._local_in_map: dict[str, Vector3] = {}  # the last known translation of each vehicle's local frame
+        self._local_in_map: dict[str, messages.Vector3] = {}  # the last known translation of each vehicle's local frame
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
         except RuntimeError as exc:  # "...: Address already in use (os error 98)"
@@ -136,30 +126,30 @@ class FoxgloveServer:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
             self._channels[vehicle] = pose, LocationFixChannel(f"/{vehicle}/location", context=self._context)
         poses, locations = self._channels[vehicle]
-        stamp = Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
+        stamp = messages.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         if math.isfinite(message.x + message.y + message.z):
             east, north, up = ned_to_enu((message.x, message.y, message.z))
             x, y, z, w = orientation_of(message, self._attitudes.get(vehicle))
-            position, orientation = Vector3(x=east, y=north, z=up), Quaternion(x=x, y=y, z=z, w=w)
-            local, pose_in_local = f"{vehicle}/local", Pose(position=position, orientation=orientation)
-            poses.log(PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local), log_time=time_ns)
+            position, orientation = messages.Vector3(x=east, y=north, z=up), messages.Quaternion(x=x, y=y, z=z, w=w)
+            local, pose_in_local = f"{vehicle}/local", messages.Pose(position=position, orientation=orientation)
+            poses.log(messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local), log_time=time_ns)
             if message.xy_global:
                 self._local_in_map[vehicle] = self._locate(message)
-            origin = self._local_in_map.get(vehicle, Vector3(x=0.0, y=0.0, z=0.0))
+            origin = self._local_in_map.get(vehicle, messages.Vector3(x=0.0, y=0.0, z=0.0))
             frames = (("map", local, origin, _NO_ROTATION), (local, vehicle, position, orientation))
             transforms = [
-                FrameTransform(
+                messages.FrameTransform(
                     timestamp=stamp, parent_frame_id=parent, child_frame_id=child, translation=moved, rotation=turned
                 )
                 for parent, child, moved, turned in frames
             ]
-            self._transforms.log(FrameTransforms(transforms=transforms), log_time=time_ns)
+            self._transforms.log(messages.FrameTransforms(transforms=transforms), log_time=time_ns)
         place = to_global(message)
         if place and message.xy_valid:
             variance = message.eph**2 / 2
             is_known = math.isfinite(variance + message.epv)
-            types = LocationFixPositionCovarianceType
-            fix = LocationFix(
+            types = messages.LocationFixPositionCovarianceType
+            fix = messages.LocationFix(
                 timestamp=stamp,
                 frame_id=vehicle,
                 latitude=place.latitude,
@@ -170,7 +160,7 @@ class FoxgloveServer:
             )
             locations.log(fix, log_time=time_ns)
 
-    def _locate(self, message: VehicleLocalPosition) -> Vector3:
+    def _locate(self, message: VehicleLocalPosition) -> messages.Vector3:
         """Return the translation of a local frame with a global origin in the map, in ENU [m]."""
         if self._map is None:
             self._map = MapProjection(message.ref_lat, message.ref_lon)
@@ -178,7 +168,7 @@ class FoxgloveServer:
             self._altitude = message.ref_alt
         north, east = self._map.project(message.ref_lat, message.ref_lon)
         up = message.ref_alt - self._altitude
-        return Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
+        return messages.Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
 
     def _close_unpublished(self) -> None:
         """Close the channels of addresses that are no longer published."""
