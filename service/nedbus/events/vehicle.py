@@ -11,21 +11,9 @@ from typing import Final
 
 from nedbus_msgs import BY_TOPIC, Address
 
+from . import detectors
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
-from .detectors import (
-    EKF_SELECTOR,
-    HEALTHY,
-    ChangeDetector,
-    Detect,
-    FieldReader,
-    Fields,
-    Finding,
-    TextDetector,
-    detect_selection,
-    detect_unused,
-    detection_of,
-    selected,
-)
+from .detectors import ChangeDetector, Fields, Finding
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
@@ -41,7 +29,7 @@ _MAX_TOPICS: Final = 20  # named in one event
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _GROUPS: Final = (POSITIONS, _RECEIVERS)
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # by which two estimates are equal
-_read_sample: Final = FieldReader(_SAMPLE)
+_read_sample: Final = detectors.FieldReader(_SAMPLE)
 
 
 class Vehicle:
@@ -108,7 +96,7 @@ class Vehicle:
                     self.emit(Finding(kind, "end", f"{address.stream} is back"), address.topic, time)
         # If the message before the last one is close in time, the last one was damaged: no reboot.
         # PX4's texts wait in queues, and a log may begin with old ones.
-        is_earlier = stamp < before - _REBOOT and type(detector) is not TextDetector
+        is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
         if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
             found = detector.add(message, missing)
@@ -254,17 +242,17 @@ class Vehicle:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
-        if topic == EKF_SELECTOR:
+        if topic == detectors.EKF_SELECTOR:
             unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
-            return ChangeDetector(["primary_instance"], (), detect_selection)
+            return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
         if instance and topic not in (*POSITIONS, _EKF):  # only the first sensor and battery
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
             current = self._preferred.setdefault(group, address)
             if min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0)) != address:
-                is_sought = topic == POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
+                is_sought = topic == POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
             if current != address:  # open unused streams anew, and end the conditions
@@ -274,16 +262,16 @@ class Vehicle:
         if group is POSITIONS:
             self.main, self._position = address, PositionDetector()
             return self._position
-        own = detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
         if topic in REFERENCES:
             return ReferenceDetector(topic, self._comparison, own)
         if own is not None and topic == _EKF:
             own = *own[:2], partial(self._detect_flags, instance, own[2])
-        detector = TextDetector if topic == "log_message" else ChangeDetector
+        detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
         return None if own is None else detector(*own)
 
-    def _detect_flags(self, instance: int, detect: Detect, before: Fields, after: Fields) -> Iterator[Finding]:
-        return detect(before, after) if instance == self._ekf else detect_unused(instance, before, after)
+    def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
+        return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
         """Yield the EKF whose estimates equal those of the vehicle, if those of the one in use do not.
@@ -294,7 +282,7 @@ class Vehicle:
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
         if self._equal.get(instance) and not self._equal.get(self._ekf, True):
-            yield selected(instance, None)
+            yield detectors.selected(instance, None)
 
     def _use_ekf(self, instance: int) -> None:
         """Use the flags of another EKF: those of both that are set begin conditions anew."""
@@ -305,7 +293,7 @@ class Vehicle:
         self._end(stream, lambda kind, flag: kind in kinds or flag.startswith(f"{instance}:"))
         for each in (old, instance):
             detector = self._detectors.get(replace(stream, instance=each))
-            for found in () if detector is None else detector.again(HEALTHY):
+            for found in () if detector is None else detector.again(detectors.HEALTHY):
                 self.emit(found, _EKF, self.time)
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:

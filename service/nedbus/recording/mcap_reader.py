@@ -164,7 +164,12 @@ class _RecordedFile:
                 for record in records_of(part):
                     if not isinstance(record, Message):
                         self._learn(record)
-                    elif (stream := self._stream(record)) and (only is None or stream.address in only):
+                        continue
+                    if (number := record.channel_id) not in self._streams:
+                        self._streams[number] = None
+                        lost = f"skipped the messages of channel {number}: its channel record is lost"
+                        self.chunks.warn(lost, lost=True)
+                    if (stream := self._streams[number]) and (only is None or stream.address in only):
                         yield RecordedMessage(stream, _unpack(record.data), record.log_time)
             except READ_ERRORS:
                 self.chunks.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
@@ -182,12 +187,6 @@ class _RecordedFile:
             self._schemas.setdefault(record.id, record)
         elif isinstance(record, Channel) and record.id not in self._streams:
             self._streams[record.id] = self._describe(self._schemas.get(record.schema_id), record)
-
-    def _stream(self, message: Message) -> RecordedStream | None:
-        if (number := message.channel_id) not in self._streams:
-            self._streams[number] = None
-            self.chunks.warn(f"skipped the messages of channel {number}: its channel record is lost", lost=True)
-        return self._streams[number]
 
     def _describe(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
         if schema is None or not schema.name.startswith(("px4_msgs/", "px4_msgs_old/")):
