@@ -10,14 +10,14 @@ Vehicles with different origins share the frame `map`; its origin is the first g
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import foxglove
+from foxglove import messages
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
-from foxglove.messages import Quaternion, Vector3
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
@@ -34,11 +34,13 @@ from nedbus_msgs import (
     get_topic,
     ros2_type,
 )
+from nedbus_msgs.frames import MapProjection, ned_to_enu, quaternion_ned_to_enu, to_global, yaw_ned_to_enu
 
 from . import FOXGLOVE_PORT
-from .foxglove_messages import MapFrame, has_position, orientation_of, to_location, to_pose, to_transforms
 
 _ATTITUDE: Final = "vehicle_attitude"
+_MAX_APART: Final = 500_000  # us between a position and the attitude paired with it
+_NO_ROTATION: Final = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 class FoxgloveServer:
@@ -55,9 +57,11 @@ class FoxgloveServer:
         self._fields: dict[tuple[Address, Definition[Any]], foxglove.Channel] = {}
         # The last message of each stream without a rate, until a client subscribes.
         self._unseen: dict[Address, tuple[Message, int]] = {}
-        self._vehicles: dict[str, _Vehicle] = {}
+        self._channels: dict[str, tuple[PoseInFrameChannel, LocationFixChannel]] = {}  # of each vehicle
         self._attitudes: dict[str, Any] = {}  # last message of each vehicle
-        self._map = MapFrame()
+        self._map: MapProjection | None = None  # at the first global origin of any vehicle
+        self._altitude = math.nan  # of the first origin that has one
+        self._local_in_map: dict[str, messages.Vector3] = {}  # the last known translation of each vehicle's local frame
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
         except RuntimeError as exc:  # "...: Address already in use (os error 98)"
@@ -118,21 +122,53 @@ class FoxgloveServer:
             self._unseen[address] = message, time_ns  # there may be no further message
 
     def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
-        shown = self._vehicles.get(vehicle)
-        if shown is None:
+        if vehicle not in self._channels:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
-            location = LocationFixChannel(f"/{vehicle}/location", context=self._context)
-            shown = self._vehicles[vehicle] = _Vehicle(pose, location)
-        if has_position(message):
+            self._channels[vehicle] = pose, LocationFixChannel(f"/{vehicle}/location", context=self._context)
+        poses, locations = self._channels[vehicle]
+        stamp = messages.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
+        if math.isfinite(message.x + message.y + message.z):
+            east, north, up = ned_to_enu((message.x, message.y, message.z))
             x, y, z, w = orientation_of(message, self._attitudes.get(vehicle))
-            orientation = Quaternion(x=x, y=y, z=z, w=w)
-            shown.pose.log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
-            local = shown.local_in_map = self._map.locate(message) or shown.local_in_map
-            transforms = to_transforms(vehicle, message, orientation, local_in_map=local, time_ns=time_ns)
-            self._transforms.log(transforms, log_time=time_ns)
-        fix = to_location(vehicle, message, time_ns=time_ns)
-        if fix is not None:
-            shown.location.log(fix, log_time=time_ns)
+            position, orientation = messages.Vector3(x=east, y=north, z=up), messages.Quaternion(x=x, y=y, z=z, w=w)
+            local, pose_in_local = f"{vehicle}/local", messages.Pose(position=position, orientation=orientation)
+            poses.log(messages.PoseInFrame(timestamp=stamp, frame_id=local, pose=pose_in_local), log_time=time_ns)
+            if message.xy_global:
+                self._local_in_map[vehicle] = self._locate(message)
+            origin = self._local_in_map.get(vehicle, messages.Vector3(x=0.0, y=0.0, z=0.0))
+            frames = (("map", local, origin, _NO_ROTATION), (local, vehicle, position, orientation))
+            transforms = [
+                messages.FrameTransform(
+                    timestamp=stamp, parent_frame_id=parent, child_frame_id=child, translation=moved, rotation=turned
+                )
+                for parent, child, moved, turned in frames
+            ]
+            self._transforms.log(messages.FrameTransforms(transforms=transforms), log_time=time_ns)
+        place = to_global(message)
+        if place and message.xy_valid:
+            variance = message.eph**2 / 2
+            is_known = math.isfinite(variance + message.epv)
+            types = messages.LocationFixPositionCovarianceType
+            fix = messages.LocationFix(
+                timestamp=stamp,
+                frame_id=vehicle,
+                latitude=place.latitude,
+                longitude=place.longitude,
+                altitude=place.altitude,
+                position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2] if is_known else [],
+                position_covariance_type=types.Approximated if is_known else types.Unknown,
+            )
+            locations.log(fix, log_time=time_ns)
+
+    def _locate(self, message: VehicleLocalPosition) -> messages.Vector3:
+        """Return the translation of a local frame with a global origin in the map, in ENU [m]."""
+        if self._map is None:
+            self._map = MapProjection(message.ref_lat, message.ref_lon)
+        if math.isnan(self._altitude) and message.z_global:
+            self._altitude = message.ref_alt
+        north, east = self._map.project(message.ref_lat, message.ref_lon)
+        up = message.ref_alt - self._altitude
+        return messages.Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
 
     def _close_unpublished(self) -> None:
         """Close the channels of addresses that are no longer published."""
@@ -145,16 +181,21 @@ class FoxgloveServer:
             if address.topic == _ATTITUDE:
                 self._attitudes.pop(address.vehicle, None)
         vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}
-        for name in self._vehicles.keys() - vehicles:
-            vehicle = self._vehicles.pop(name)
-            vehicle.pose.close()
-            vehicle.location.close()
+        for name in self._channels.keys() - vehicles:
+            for channel in self._channels.pop(name):
+                channel.close()
+            self._local_in_map.pop(name, None)
 
 
-@dataclass(slots=True)
-class _Vehicle:
-    """Channels of a vehicle, and the last known translation of its local frame in the map."""
+def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
+    """Return the rotation from FLU to ENU as (x, y, z, w).
 
-    pose: PoseInFrameChannel
-    location: LocationFixChannel
-    local_in_map: Vector3 = field(default_factory=lambda: Vector3(x=0.0, y=0.0, z=0.0))
+    Taken from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, facing east.
+    """
+    if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
+        w, x, y, z = quaternion_ned_to_enu(attitude.q)
+        if math.isfinite(w + x + y + z):
+            return x, y, z, w
+    yaw = yaw_ned_to_enu(message.heading)
+    half = yaw / 2 if math.isfinite(yaw) else 0.0
+    return 0.0, 0.0, math.sin(half), math.cos(half)

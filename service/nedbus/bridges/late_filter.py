@@ -17,7 +17,7 @@ class LateFilter:
     """Pass the current samples of each address, and count the late ones, and retained ones, whose age is unknown."""
 
     def __init__(self) -> None:
-        self._clocks: dict[Address, tuple[str, PublisherClock]] = {}
+        self._clocks: dict[Address, tuple[str, _PublisherClock]] = {}  # and the session that stamps
         self._held = Counter[Address]()
         self._latest = 0  # ns, greatest lateness among these
         self._limit = round(1e9 * TIMINGS.lateness)  # ns
@@ -27,15 +27,14 @@ class LateFilter:
 
         `arrived`: arrival time by this host's monotonic clock [ns].
         """
-        sent, address, publisher, late = sample.sent, sample.address, _publisher(sample), 0
-        if sent is None:
+        sent, stamp, address, late = sample.sent, sample.stamp, sample.address, 0
+        if sent is None or stamp is None:
             return True
-        known, clock = self._clocks.get(address, ("", None))
         if not sample.retained:
-            if clock is None or known != publisher:
-                clock = PublisherClock(sent, arrived)
-                self._clocks[address] = publisher, clock
-            late = clock.lateness(sent, arrived)
+            session = str(stamp.get_id())  # a restarted publisher may have another clock
+            if self._clocks.get(address, ("",))[0] != session:
+                self._clocks[address] = session, _PublisherClock(sent, arrived)
+            late = self._clocks[address][1].lateness(sent, arrived)
             if late <= self._limit:
                 return True
         self._held[address] += 1
@@ -51,7 +50,7 @@ class LateFilter:
         if not self._held:
             return None
         first, *others = sorted(self._held)
-        of = f"{first}" + (f" and {len(others)} others" if others else "")
+        of = f"{first} and {len(others)} others" if others else f"{first}"
         by = f", up to {self._latest / 1e9:.1f} s late" if self._latest else ""
         count = self._held.total()
         text = f"{of}: {count} old message{'s' if count > 1 else ''} held back{by}"
@@ -60,7 +59,7 @@ class LateFilter:
         return text
 
 
-class PublisherClock:
+class _PublisherClock:
     """Clock offset of one publisher, estimated from timestamps and arrival times [ns].
 
     The smallest arrival minus timestamp is the clock offset plus the transit time of the fastest sample. The lateness
@@ -84,8 +83,3 @@ class PublisherClock:
             self._before, self._smallest, self._since = self._smallest, offset, arrived
         self._smallest = min(self._smallest, offset)
         return offset - min(self._before, self._smallest)
-
-
-def _publisher(sample: Sample[Any]) -> str:
-    """Return the session that stamped a sample; a restarted publisher may have another clock."""
-    return "" if sample.stamp is None else str(sample.stamp.get_id())

@@ -11,25 +11,11 @@ from typing import Any, Final
 
 import zenoh
 
-from nedbus import clock
+from nedbus import clock, transport
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import (
-    BRIDGED_ENCODING,
-    NO_HASH,
-    Attachment,
-    PublisherToken,
-    Session,
-    TopicKey,
-    alive_keys,
-    gid_of_token,
-    node_token,
-    publisher_token,
-    px4_publishers_key_expr,
-    while_open,
-)
 from nedbus_msgs import (
     BY_TOPIC,
     DEFAULT,
@@ -55,6 +41,10 @@ _log = logging.getLogger(__name__)
 
 _MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; publishers keep 20 s for recovery
 _MAX_LEFT_OUT: Final = 1000  # addresses logged as unsupported
+_REFUSALS: Final = {
+    "conflict": "%s is not published: %s already uses the topic /%s: set --namespace",
+    "defer": "%s is left to node %s, which already publishes /%s",
+}  # by action
 
 
 class Ros2Bridge:
@@ -75,17 +65,16 @@ class Ros2Bridge:
     def __init__(
         self,
         bus: Bus,
-        session: Session,
+        session: transport.Session,
         *,
-        observer: Session | None = None,
+        observer: transport.Session | None = None,
         selection: Selection | None = None,
         layout: str = RELEASES[-1],
         domain: int = 0,
         hashed: bool = True,
         namespaces: Mapping[str, str] | None = None,
     ) -> None:
-        known = dict.fromkeys((*RELEASES, *DEFAULT.layouts))
-        if layout not in known:
+        if layout not in (known := dict.fromkeys((*RELEASES, *DEFAULT.layouts))):
             raise LayoutError(f"unknown layout {layout!r}: choose from {', '.join(known)}")
         self._bus = bus
         self._session = session
@@ -93,11 +82,11 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {
-            topic: (definition, found, hash_of(found, ros2_type(definition)) if hashed else NO_HASH)
-            for topic, definition in BY_TOPIC.items()
-            if (found := definition.layout_of_release(layout))
-        }  # messages of the workspace
+        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # messages of the workspace
+        for topic, definition in BY_TOPIC.items():
+            if found := definition.layout_of_release(layout):
+                type_hash = hash_of(found, ros2_type(definition)) if hashed else transport.NO_HASH
+                self._types[topic] = definition, found, type_hash
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
@@ -113,8 +102,8 @@ class Ros2Bridge:
         Raises ClosedError when the bus or the session is closed meanwhile, NedbusError when access control hides the
         bridge from the observer.
         """
-        key = node_token(self._domain, self._zid, self._node)
-        with while_open():
+        key = transport.node_token(self._domain, self._zid, self._node)
+        with transport.while_open():
             token = self._session.liveliness().declare_token(key)
         try:
             if self._observer is not None:
@@ -126,10 +115,10 @@ class Ros2Bridge:
                 self._close(address)
             token.undeclare()
 
-    def _require_visible(self, observer: Session, token: str, stop: threading.Event) -> None:
+    def _require_visible(self, observer: transport.Session, token: str, stop: threading.Event) -> None:
         """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
         end = time.monotonic() + TIMINGS.token_visible
-        while not stop.is_set() and not alive_keys(observer, token, timeout=0.5):
+        while not stop.is_set() and not transport.alive_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
                 end = time.monotonic() + TIMINGS.token_visible  # without a link the token cannot be visible
             elif time.monotonic() > end:
@@ -160,8 +149,7 @@ class Ros2Bridge:
 
     def _poll(self) -> None:
         """Report late samples, query the addresses of the bus and the nodes of ROS 2, and apply the decisions."""
-        held_back = self._late_filter.report()
-        if held_back:
+        if held_back := self._late_filter.report():
             _log.warning("%s: ROS 2 would take them for the current estimate", held_back, extra=about("held-back"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
@@ -171,7 +159,12 @@ class Ros2Bridge:
         addresses = list(filter(self._is_bridged, published))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
-        nodes = self._other_nodes()
+        nodes, own = dict[transport.TopicKey, str](), self._zid  # other nodes by the topic that they publish
+        for text in transport.alive_keys(self._session, transport.px4_publishers_key_expr(self._domain), timeout=0.5):
+            with suppress(DecodeError):
+                token = transport.PublisherToken.parse(text)
+                if token.session != own:
+                    nodes.setdefault(token.key, token.node)
         others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
         for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
             self._apply(decision)
@@ -186,13 +179,9 @@ class Ros2Bridge:
             _log.info("%s -> /%s, %s of layout %s", address, topic, name, layout.name, extra=about("bridged", address))
             if address in self._held:
                 self._put(self._held.pop(address))
-        elif decision.action == "conflict":
-            text = "%s is not published: %s already uses the topic /%s: set --namespace"
-            _log.warning(text, address, other, topic, extra=about("conflict", address))
-        elif decision.action == "defer":
+        elif decision.action in _REFUSALS:
             self._close(address)
-            text = "%s is left to node %s, which already publishes /%s"
-            _log.warning(text, address, other, topic, extra=about("conflict", address))
+            _log.warning(_REFUSALS[decision.action], address, other, topic, extra=about("conflict", address))
         else:
             self._close(address)
             # After a router restart the address soon returns, followed by the messages of the outage.
@@ -200,24 +189,15 @@ class Ros2Bridge:
             text = "%s is no longer on the bus: /%s is withdrawn"
             _log.info(text, address, topic, extra=about("withdrawn", address))
 
-    def _other_nodes(self) -> dict[TopicKey, str]:
-        """Return the publishing node of each topic of another node, with a single query: there may be thousands."""
-        nodes, own = dict[TopicKey, str](), self._zid
-        for text in alive_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
-            with suppress(DecodeError):
-                token = PublisherToken.parse(text)
-                if token.session != own:
-                    nodes.setdefault(token.key, token.node)
-        return nodes
-
     def _open(self, address: Address) -> None:
         key = self._key(address)
         self._entities += 1
-        token, drop = publisher_token(key, self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
-        with while_open():
-            publisher = self._session.declare_publisher(str(key), encoding=BRIDGED_ENCODING, congestion_control=drop)
+        token = transport.publisher_token(key, self._zid, self._node, self._entities)
+        encoding, drop = transport.BRIDGED_ENCODING, zenoh.CongestionControl.DROP
+        with transport.while_open():
+            publisher = self._session.declare_publisher(str(key), encoding=encoding, congestion_control=drop)
             declared = self._session.liveliness().declare_token(token)
-        self._publishers[address] = _Ros2Publisher(gid_of_token(token), publisher, declared)
+        self._publishers[address] = _Ros2Publisher(transport.gid_of_token(token), publisher, declared)
 
     def _close(self, address: Address) -> None:
         if publisher := self._publishers.pop(address, None):
@@ -229,13 +209,14 @@ class Ros2Bridge:
         definition, layout, _ = self._types[sample.topic]
         payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
         publisher.sequence += 1
-        attachment = bytes(Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
-        with while_open():
+        attachment = bytes(transport.Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
+        with transport.while_open():
             publisher.publisher.put(payload, attachment=attachment)
 
-    def _key(self, address: Address) -> TopicKey:
+    def _key(self, address: Address) -> transport.TopicKey:
         definition, _, type_hash = self._types[address.topic]
-        return TopicKey(self._domain, self._arbiter.topic_of(address), dds_type(ros2_type(definition)), type_hash)
+        name = dds_type(ros2_type(definition))
+        return transport.TopicKey(self._domain, self._arbiter.topic_of(address), name, type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
         """Return whether an address is selected and the workspace has its message; warn once if it has not."""

@@ -63,17 +63,12 @@ class Ros2Arbiter:
         `now`: seconds on any monotonic clock.
         """
         present = set(addresses)
-        decisions = [
-            Decision("withdraw", address, self._published.pop(address))
-            for address in sorted(self._published.keys() - present)
-        ]
+        gone = sorted(self._published.keys() - present)
+        decisions = [Decision("withdraw", address, self._published.pop(address)) for address in gone]
         self._deferred = {address: seen for address, seen in self._deferred.items() if address in present}
         self._conflicts &= present
-        for address in sorted(present):
-            decision = self._decide(address, other_nodes.get(address), now)
-            if decision is not None:
-                decisions.append(decision)
-        return decisions
+        decided = (self._decide(address, other_nodes.get(address), now) for address in sorted(present))
+        return decisions + [decision for decision in decided if decision]
 
     def publishes(self, address: Address) -> bool:
         """Return whether an address is published."""

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections import Counter, defaultdict, deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from itertools import takewhile
 from typing import Final
@@ -115,15 +115,22 @@ class Account:
         with self._lock:
             change: Change = "begin" if link else "end"
             self._common.emit(Finding("link_down", change, link or "link is back", switch=True), "", time)
-            self._update_reader(time, dropped, is_behind=is_behind)
+            if dropped > self._dropped or is_behind:
+                self._last_overload = time
+                text = "the reader is slower than the data: messages are dropped"
+                self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
+            elif time - self._last_overload > PAUSE:
+                text = f"the reader keeps up again: {dropped} messages were dropped"
+                ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
+                self._common.emit(ended, "", time, changed=self._last_overload)
+            self._dropped = dropped
             if present is not None:
                 for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
                     here.heard = time
                 self._most_present = max(self._most_present, len(present))
                 gone = self._gone(time)
                 beyond = gone[: -max(MAX_GONE, self._most_present)]
-                for _, name in [each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond:
-                    self._forget(name)
+                self._forget([each for each in gone if time - each[0] > TIMINGS.forgotten] or beyond)
             if self.overload is not None:
                 self._settled = time + MAX_SILENCE  # delayed messages need time to arrive
             if time < self._settled:
@@ -167,8 +174,7 @@ class Account:
         if known is None:
             if self.is_full and time >= self._full_until:
                 self._full_until = time + 1.0
-                for _, oldest in self._gone(time)[:1]:
-                    self._forget(oldest)
+                self._forget(self._gone(time)[:1])
             if self.is_full:
                 if not self.refused:
                     text = "more than %d vehicles: further ones have no events; follow some of them with --vehicle"
@@ -183,10 +189,11 @@ class Account:
         """Return when vehicles that have been gone for a minute were heard, and their names, the longest gone first."""
         return sorted((each.heard, name) for name, each in self.vehicles.items() if time - each.heard > RECENT)
 
-    def _forget(self, name: str) -> None:
-        del self.vehicles[name]
-        for severity in SEVERITIES:
-            del self.counts[name, severity]
+    def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:
+        for _, name in vehicles:
+            del self.vehicles[name]
+            for severity in SEVERITIES:
+                del self.counts[name, severity]
 
     def _record(self, event: Event) -> None:
         self._events[self.reported] = event
@@ -200,14 +207,3 @@ class Account:
             del self._events[self._numbers[name].popleft()]
             if not self._numbers[name]:
                 del self._numbers[name]
-
-    def _update_reader(self, time: float, dropped: int, *, is_behind: bool) -> None:
-        if dropped > self._dropped or is_behind:
-            self._last_overload = time
-            text = "the reader is slower than the data: messages are dropped"
-            self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
-        elif time - self._last_overload > PAUSE:
-            text = f"the reader keeps up again: {dropped} messages were dropped"
-            ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
-            self._common.emit(ended, "", time, changed=self._last_overload)
-        self._dropped = dropped

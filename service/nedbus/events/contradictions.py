@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, Final, cast
+from typing import Final
 
 from nedbus_msgs.frames import MapProjection
 
 from . import rules
-from .detectors import ChangeDetector, FieldReader, Finding
+from .detectors import ChangeDetector, Detection, FieldReader, Finding
 
 AIR_DATA: Final = "vehicle_air_data"
 _GNSS: Final = ("GNSS", ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv"))
@@ -29,35 +29,31 @@ _TWO_G: Final = 19.6  # m/s^2
 
 
 class ReferenceDetector(ChangeDetector):
-    """Detector of a topic in REFERENCES: compares the estimate with it, beside the `own` detector of the topic."""
+    """Detector of a topic in REFERENCES: compares the estimate with it, beside the `own` detection of the topic."""
 
-    def __init__(self, topic: str, comparison: Comparison, own: ChangeDetector | None) -> None:
+    def __init__(self, topic: str, comparison: Comparison, own: Detection | None) -> None:
         self._name, fields = REFERENCES[topic]
-        self._read = FieldReader(fields, math.nan)
-        self._comparison, self._own = comparison, own
+        super().__init__(*(own or (fields, (), lambda _, __: iter(()))))
+        self._read_reference = FieldReader(fields, math.nan)
+        self._comparison, self._compared = comparison, 0
         self.pause = 0.0 if own else 1.05e-6 * _INTERVAL
-        self.stamp = self.earlier = self._compared = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the findings of a message, None if there are none."""
-        found = None if self._own is None else self._own.add(message, missing)
-        stamp = message["timestamp"] if isinstance(message, dict) else cast("Any", message).timestamp
-        self.earlier, self.stamp = self.stamp, stamp
-        if 0 <= stamp - self._compared < _INTERVAL:
+        found = super().add(message, missing)
+        if 0 <= self.stamp - self._compared < _INTERVAL:
             return found
-        self._compared, values = stamp, self._read(message)
+        self._compared, values = self.stamp, self._read_reference(message)
         if not all(isinstance(each, int | float) for each in values):  # AIR_DATA is what its publisher defines
             return found
-        new = self._comparison.add(self._name, stamp, values)
+        new = self._comparison.add(self._name, self.stamp, values)
         return chain(found or (), new) if new else found
 
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
-        self.stamp = self.earlier = self._compared = 0
-        self.due = -math.inf
+        super().reset()
+        self._compared, self.due = 0, -math.inf
         self._comparison.reset()
-        if self._own is not None:
-            self._own.reset()
 
 
 class Comparison:

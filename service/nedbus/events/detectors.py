@@ -21,8 +21,7 @@ _INTERFERENCE: Final = ("jamming_indicator", "jamming_state", "spoofing_state")
 EKF_SELECTOR: Final = "estimator_selector_status"
 """The topic that names the EKF in use."""
 
-_EKF: Final = flagged("EstimatorStatusFlags")
-_EKF_FAULTS: Final = [kind for kind in _EKF if kind.name != "not_fused"]
+_EKF_FAULTS: Final = [kind for kind in flagged("EstimatorStatusFlags") if kind.name != "not_fused"]
 HEALTHY: Final[Fields] = {flag: not kind.bad for kind in _EKF_FAULTS for flag in kind.flags}
 """The flags of an EKF without a fault."""
 
@@ -52,6 +51,12 @@ class Finding:
     switch: bool = False
 
 
+Detect = Callable[[Fields, Fields], Iterator[Finding]]
+"""Yields findings from the fields of two messages, by name; those of the first are empty at the first message."""
+Detection = tuple[Sequence[str], Sequence[str], Detect]
+"""Fields whose changes are detected, further fields that this needs, and the function."""
+
+
 class FieldReader:
     """Fast access to fields of a model, a row, or a dict; fields that it lacks have the value `absent`."""
 
@@ -73,8 +78,7 @@ class FieldReader:
 class ChangeDetector:
     """Detector of one stream; fast as long as none of the `compared` fields changes.
 
-    `detect(before, after)` yields findings from the fields of two messages, by name: None for fields that were not
-    provided; `before` is empty at the first message. `context`: names of further fields that `detect` gets.
+    `detect` gets None for fields that were not provided. `context`: names of further fields that it gets.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: its timestamp and that of the one before [us].
     `pause`: seconds after a message in which further ones are not needed, until `due` by the account's clock.
@@ -83,13 +87,7 @@ class ChangeDetector:
     pause = 0.0
     due = -math.inf
 
-    def __init__(
-        self,
-        compared: Sequence[str],
-        detect: Callable[[Fields, Fields], Iterator[Finding]],
-        *,
-        context: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, compared: Sequence[str], context: Sequence[str], detect: Detect) -> None:
         self._read = FieldReader(("timestamp", *compared))
         self._read_all = FieldReader(("timestamp", *compared, *context))
         self._detect = detect
@@ -132,21 +130,18 @@ class TextDetector(ChangeDetector):
         return super().add(message, missing)
 
 
-def make_detector(message: str) -> ChangeDetector | None:
-    """Return a detector for a message type, None if it has no events; a PositionDetector is for the estimate in use."""
+def detection_of(message: str) -> Detection | None:
+    """Return the detection of a message type, None if it has no events; positions have a detector of their own."""
     kinds = flagged(message)
-    fields, context, detect = _FURTHER.get(message, ((), (), None))
-    compared = [*fields, *(flag for kind in kinds for flag in kind.flags)]
-    if message == "VehicleLocalPosition" or not compared:
-        return None
+    fields, context, further = _FURTHER.get(message, ((), (), None))
+    compared = *fields, *(flag for kind in kinds for flag in kind.flags)
 
-    def detect_all(before: Fields, after: Fields) -> Iterator[Finding]:
+    def detect(before: Fields, after: Fields) -> Iterator[Finding]:
         yield from detect_flags(kinds, before, after)
-        if detect is not None:
-            yield from detect(before, after)
+        if further is not None:
+            yield from further(before, after)
 
-    make = TextDetector if message == "LogMessage" else ChangeDetector
-    return make(compared, detect_all, context=context)
+    return (compared, context, detect) if compared and message != "VehicleLocalPosition" else None
 
 
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
@@ -254,7 +249,8 @@ def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
 
 def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the battery warnings of a BatteryStatus."""
-    warning, was = _warning_of(after), _warning_of(before) if before else 0
+    known = ({"connected": True, "warning": 0} | before, after)
+    was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
     if warning is None or was is None or was == warning:
         return
     remaining, numbers, left = after["remaining"], {"warning": warning}, ""
@@ -269,65 +265,22 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
         yield Finding("battery", "end", text, numbers=numbers)
 
 
-def _warning_of(battery: Fields) -> int | None:
-    return 0 if battery["connected"] is False else cast("int | None", battery["warning"])
-
-
-def flags_detector(instance: int, used: Callable[[], int]) -> ChangeDetector:
-    """Return a detector of the flags of an EKF; `used` returns the instance in use."""
-
-    def detect(before: Fields, after: Fields) -> Iterator[Finding]:
-        if instance == used():
-            yield from detect_flags(_EKF, before, after)
-            yield from detect_aiding(before, after)
-        else:
-            yield from _detect_unused(instance, before, after)
-
-    return ChangeDetector([*(flag for kind in _EKF for flag in kind.flags), *rules.FAKE_AIDING], detect)
-
-
-class EstimateDetector(ChangeDetector):
-    """Detector of an estimator_local_position, to find the EKF in use where no selector names it.
-
-    `position` returns the detector of vehicle_local_position, which follows the estimate that it equals.
-    `equal`: by instance, if the last estimate of the same sample equalled it; shared by all instances.
-    `used` returns the instance in use.
-    """
-
-    def __init__(
-        self, instance: int, position: Callable[[], ChangeDetector | None], equal: dict[int, bool],
-        used: Callable[[], int],
-    ) -> None:  # fmt: skip
-        super().__init__(("timestamp_sample", "x", "y", "z"), lambda _, __: iter(()))
-        self._instance, self._position, self._equal, self._used = instance, position, equal, used
-
-    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return a finding if this EKF is in use, and the one that was taken to be is not."""
-        values, before, position = self._read(message), self._state, self._position()
-        self.earlier, self.stamp, self._state = self.stamp, values[0], values[1:]
-        vehicle = self._read(None if position is None else position.last)[1:]
-        if before and before[0] == vehicle[0]:
-            self._equal[self._instance] = before == vehicle
-        if not self._equal.get(self._instance) or self._equal.get(self._used(), True):
-            return None
-        return iter([_selected(self._instance, None)])
-
-
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the EKF that an EKF_SELECTOR names; its fields are whatever its publisher defines."""
     was, now = (each.get("primary_instance") for each in (before, after))
     if type(now) is int and now in range(_MAX_EKFS):
-        yield _selected(now, was if type(was) is int and was in range(_MAX_EKFS) else None)
+        yield selected(now, was if type(was) is int and was in range(_MAX_EKFS) else None)
 
 
-def _selected(now: int, was: int | None) -> Finding:
+def selected(now: int, was: int | None) -> Finding:
     """Return the finding of an EKF that is in use now, which is no event if the one before is unknown."""
     numbers = {"to": now} if was is None else {"from": was, "to": now}
     text = f"EKF {now} in use, was EKF {was}"
     return Finding("ekf_changed", "once", text, numbers=numbers, initial=was is None)
 
 
-def _detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Finding]:
+def detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the faults of an EKF that is not in use."""
     for each in detect_flags(_EKF_FAULTS, before, after):
         names = tuple(f"{instance}:{name}" for name in each.names)
         text = f"EKF {instance}, not in use: {each.text.removeprefix('EKF ')}"
@@ -335,7 +288,8 @@ def _detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Fin
 
 
 # Further detection in a message, beyond flags: the fields that it compares, and those that it needs besides.
-_FURTHER: Final[Mapping[str, tuple[Sequence[str], Sequence[str], Callable[[Fields, Fields], Iterator[Finding]]]]] = {
+_FURTHER: Final[Mapping[str, Detection]] = {
+    "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), detect_aiding),
     "LogMessage": (("severity", "text"), (), detect_text),
     "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), detect_gps),
     "VehicleStatus": (("arming_state", "nav_state"), (), detect_status),

@@ -20,29 +20,28 @@ _COMPARED: Final = (
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; a smaller step cannot be a jump at any velocity
 _MAX_INTERVAL: Final = 0.5  # s between two messages; longer intervals are not checked for jumps
 _SURE_INTERVAL: Final = 0.1  # s; over a longer one, motion by the rates at its ends is less certain
-# Of each quantity that may be reset: its values, the rates that may have moved each of them, and its delta.
-_STEPS: Final[Mapping[Quantity, tuple[tuple[str, ...], tuple[tuple[str, ...], ...], str]]] = {
-    "xy": (("x", "y"), (("vx",), ("vy",)), "delta_xy"),
-    "z": (("z",), (("z_deriv", "vz"),), "delta_z"),
-    "vxy": (("vx", "vy"), (("ax",), ("ay",)), "delta_vxy"),
-    "vz": (("vz",), (("az",),), "delta_vz"),
-    "heading": (("heading",), ((),), "delta_heading"),
-}
-# The numbers of a reset, and its text.
-_RESETS: Final[Mapping[Quantity, tuple[tuple[str, ...], str]]] = {
-    "xy": (("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)"),
-    "z": (("up",), "height by {up:z.1f} m"),
-    "vxy": (("v_north", "v_east"), "vxy by {size:.1f} m/s"),
-    "vz": (("v_up",), "vz by {v_up:z.1f} m/s"),
-    "heading": (("heading",), "heading by {degrees:z.0f} deg"),
-}
+# Of each quantity that may be reset: its values, the rates that may have moved each of them, the numbers of its event,
+# and the text.
+_Quantity = tuple[tuple[str, ...], tuple[tuple[str, ...], ...], tuple[str, ...], str]
+_RESETS: Final[Mapping[Quantity, _Quantity]] = {
+    "xy": (
+        ("x", "y"), (("vx",), ("vy",)), ("north", "east"), "xy by {size:.1f} m ({north:z.1f} north, {east:z.1f} east)",
+    ),
+    "z": (("z",), (("z_deriv", "vz"),), ("up",), "height by {up:z.1f} m"),
+    "vxy": (("vx", "vy"), (("ax",), ("ay",)), ("v_north", "v_east"), "vxy by {size:.1f} m/s"),
+    "vz": (("vz",), (("az",),), ("v_up",), "vz by {v_up:z.1f} m/s"),
+    "heading": (("heading",), ((),), ("heading",), "heading by {degrees:z.0f} deg"),
+}  # fmt: skip
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-# Fields read when a compared one changes.
-_CONTEXT: Final = (
-    *dict.fromkeys(name for values, rates, delta in _STEPS.values() for name in (*values, *chain(*rates), delta)),
-    *_ORIGIN,
+# Fields read when a compared one changes, with their values if absent.
+_CONTEXT: Final = dict.fromkeys(
+    (
+        *(f"delta_{name}" for name in _RESETS),
+        *chain(*(chain(each[0], *each[1]) for each in _RESETS.values())),
+        *_ORIGIN,
+    ),
+    math.nan,
 )
-_ABSENT: Final = dict.fromkeys(_CONTEXT, math.nan)
 
 Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
@@ -51,7 +50,7 @@ class PositionDetector(ChangeDetector):
     """Detector of a VehicleLocalPosition, or of another estimate with the same fields."""
 
     def __init__(self) -> None:
-        super().__init__(_COMPARED, self._detect_position, context=_CONTEXT)
+        super().__init__(_COMPARED, [*_CONTEXT], self._detect_position)
         self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
@@ -80,15 +79,17 @@ class PositionDetector(ChangeDetector):
 
     def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
         if before:
-            earlier, values = _fill_missing(before), _fill_missing(after)
+            earlier, values = (
+                {name: _CONTEXT.get(name, 0) if value is None else value for name, value in fields.items()}
+                for fields in (before, after)
+            )
             yield from _detect_origin(earlier, values)
-            quantities = [name for name in _STEPS if earlier[RESET_COUNTERS[name]] != values[RESET_COUNTERS[name]]]
+            quantities = [name for name in _RESETS if earlier[RESET_COUNTERS[name]] != values[RESET_COUNTERS[name]]]
             if quantities:
                 yield _reset(quantities, earlier, values)
-            step = None
-            if values["xy_valid"] and "xy" not in quantities and _origin(earlier) == _origin(values):
-                step = self._unexplained_step()
-            yield from self._track_jump(step)
+            is_same_origin = all(str(earlier[name]) == str(values[name]) for name in _ORIGIN)  # NaN equals NaN
+            is_comparable = values["xy_valid"] and "xy" not in quantities and is_same_origin
+            yield from self._track_jump(self._unexplained_step() if is_comparable else None)
         yield from detect_flags(_KINDS, before, after)
 
     def _unexplained_step(self) -> Step | None:
@@ -121,7 +122,7 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         if (size := _size_of_reset(name, before, after)) is None:
             unknown.append(f"{name} by an unknown amount")
             continue
-        names, text = _RESETS[name]
+        *_, names, text = _RESETS[name]
         values = dict(zip(names, (-each if name in ("z", "vz") else each for each in size), strict=True))
         numbers |= values
         known.append(text.format(**values, size=math.hypot(*size), degrees=math.degrees(size[0])))
@@ -136,12 +137,13 @@ def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float
 
     It is the delta if the data agrees with it, else the difference of the two samples less the motion meanwhile.
     """
-    values, rates, delta = _STEPS[name]
+    values, rates, *_ = _RESETS[name]
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
     observed = [after[value] - before[value] for value in values]
     observed = observed if name != "heading" else [*map(wrap, observed)]
     count = (after[RESET_COUNTERS[name]] - before[RESET_COUNTERS[name]]) % 256
-    told = after[delta] if isinstance(after[delta], tuple) else (after[delta],)
+    delta = after[f"delta_{name}"]
+    told = delta if isinstance(delta, tuple) else (delta,)
     is_told = count == 1 and all(map(math.isfinite, told))
     if not all(map(math.isfinite, observed)):
         return told if is_told else None
@@ -176,12 +178,3 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
             severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
             numbers = {"distance": distance, "up": up}
             yield Finding("origin_moved", "once", text, numbers=numbers, severity=severity)
-
-
-def _origin(fields: Fields) -> list[float | None]:
-    """Return the origin with None for NaN, which makes two missing origins equal."""
-    return [fields[name] if math.isfinite(fields[name]) else None for name in _ORIGIN]
-
-
-def _fill_missing(fields: Fields) -> Fields:
-    return {name: _ABSENT.get(name, 0) if value is None else value for name, value in fields.items()}

@@ -107,7 +107,11 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
     `conditions`: active or initial conditions; those whose begin is not among the events are added.
     """
     known = {event.identity for event in events}
-    unreported = [each for each in conditions if each.begin.identity not in known]
+    unreported = [
+        Span(each.kind, each.severity, each.text, each.since, each.begin, each.initial)
+        for each in conditions
+        if each.begin.identity not in known
+    ]
     spans: list[Span] = []
     active: dict[tuple[str, str], Span] = {}  # by kind and flag
 
@@ -115,12 +119,15 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
         ended = dict.fromkeys([active.pop(key) for key in keys if key in active])
         spans.extend(replace(span, until=event.time, end=event) for span in ended)
 
-    steps: list[Event | Condition] = [*events, *(each for each in unreported if each.initial)]
-    for step in sorted(steps, key=_order):
-        event = step.begin if isinstance(step, Condition) else step
+    def order(step: Event | Span) -> tuple[float, bool, bool]:  # at equal times reboots, initial conditions, others
+        return (step.since, True, False) if isinstance(step, Span) else (step.time, step.kind != "reboot", True)
+
+    steps: list[Event | Span] = [*events, *(each for each in unreported if each.initial)]
+    for step in sorted(steps, key=order):
+        event = step.begin if isinstance(step, Span) else step
         keys = [(step.kind, flag) for flag in KINDS[step.kind].conditions(event.names)]
-        if isinstance(step, Condition):
-            active |= dict.fromkeys(keys, _span(step))
+        if isinstance(step, Span):
+            active |= dict.fromkeys(keys, step)
         elif step.change == "end":
             end(keys, step)
         elif step.change == "once":
@@ -132,7 +139,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
             since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
             active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))
     spans += dict.fromkeys(active.values())
-    spans += [_span(each) for each in dict.fromkeys(unreported) if not each.initial]
+    spans += [each for each in dict.fromkeys(unreported) if not each.initial]
     return sorted(spans, key=lambda span: span.since)
 
 
@@ -207,14 +214,3 @@ def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
         return span.initial and each.initial and each.severity == span.severity == "watch"
 
     return [span, *(each for each in spans if each is not span and is_part(each))]
-
-
-def _span(condition: Condition) -> Span:
-    return Span(condition.kind, condition.severity, condition.text, condition.since, condition.begin, condition.initial)
-
-
-def _order(step: Event | Condition) -> tuple[float, bool, bool]:
-    """Return the sort key: by time, at equal times reboots first, then initial conditions, then other events."""
-    if isinstance(step, Condition):
-        return step.since, True, False
-    return step.time, step.kind != "reboot", True

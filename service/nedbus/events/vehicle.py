@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final
 
 from nedbus_msgs import BY_TOPIC, Address
 
+from . import detectors
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
-from .detectors import (
-    EKF_SELECTOR,
-    HEALTHY,
-    ChangeDetector,
-    EstimateDetector,
-    Finding,
-    TextDetector,
-    detect_selection,
-    flags_detector,
-    make_detector,
-)
+from .detectors import ChangeDetector, Fields, Finding
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
@@ -36,6 +28,8 @@ _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference: the best one that arrives gives the conditions of its message.
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _GROUPS: Final = (POSITIONS, _RECEIVERS)
+_SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # by which two estimates are equal
+_read_sample: Final = detectors.FieldReader(_SAMPLE)
 
 
 class Vehicle:
@@ -73,7 +67,8 @@ class Vehicle:
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
         self._bursts: dict[str, _Burst] = {}  # of messages lost or rejected, and ms of dropouts, by kind
         self._ekf = 0  # instance of the EKF in use
-        self._comparison = Comparison(self._position)
+        self._position: PositionDetector | None = None  # of `main`
+        self._comparison = Comparison(lambda: self._position)
         self._equal: dict[int, bool] = {}  # by EKF, if its estimate is the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
@@ -101,7 +96,7 @@ class Vehicle:
                     self.emit(Finding(kind, "end", f"{address.stream} is back"), address.topic, time)
         # If the message before the last one is close in time, the last one was damaged: no reboot.
         # PX4's texts wait in queues, and a log may begin with old ones.
-        is_earlier = stamp < before - _REBOOT and type(detector) is not TextDetector
+        is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
         if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
             found = detector.add(message, missing)
@@ -183,7 +178,9 @@ class Vehicle:
         for event in reversed(self.recent):
             if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
-            elif event.change == "begin" and event.kind not in kinds and self._is_suppressed(event):
+                continue
+            keys = {(event.kind, event.names), (event.kind, None)}
+            if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
                 kinds.add(event.kind)
                 text = f"{event.text} (flapping)"
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
@@ -227,8 +224,7 @@ class Vehicle:
     @property
     def unknown(self) -> tuple[str, ...]:
         """The flags that the position estimate in use does not provide."""
-        detector = self._position()
-        return detector.unknown if isinstance(detector, PositionDetector) else ()
+        return () if self._position is None else self._position.unknown
 
     @property
     def held_from_start(self) -> str:
@@ -246,33 +242,47 @@ class Vehicle:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
-        if topic == EKF_SELECTOR:
+        if topic == detectors.EKF_SELECTOR:
             unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
-            return ChangeDetector(["primary_instance"], detect_selection)
-        if topic == _EKF:
-            return flags_detector(instance, lambda: self._ekf)
-        if instance and topic not in POSITIONS:  # only the first sensor and battery
+            return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
+        if instance and topic not in (*POSITIONS, _EKF):  # only the first sensor and battery
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
-            current = self._preferred.get(group)
-            if current is not None and _rank(group, current) <= _rank(group, address):
-                is_sought = topic == POSITIONS[-1] != current.topic and EKF_SELECTOR not in self.topics
-                equals = EstimateDetector(instance, self._position, self._equal, lambda: self._ekf)
-                return equals if is_sought else None
-            if current is not None:
-                self._supersede(current, address)
-            self._preferred[group] = address
+            current = self._preferred.setdefault(group, address)
+            if min(current, address, key=lambda each: (group.index(each.topic), each.instance or 0)) != address:
+                is_sought = topic == POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
+                detect = partial(self._detect_equal, instance)
+                return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
+            if current != address:  # open unused streams anew, and end the conditions
+                self._preferred[group], kinds = address, kinds_of(BY_TOPIC[topic].name)
+                self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
+                self._end(address, lambda kind, _: kind in kinds)
         if group is POSITIONS:
-            self.main = address
-            return PositionDetector()
-        detector = make_detector(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
-        return ReferenceDetector(topic, self._comparison, detector) if topic in REFERENCES else detector
+            self.main, self._position = address, PositionDetector()
+            return self._position
+        own = detectors.detection_of(BY_TOPIC[topic].name) if topic in BY_TOPIC else None
+        if topic in REFERENCES:
+            return ReferenceDetector(topic, self._comparison, own)
+        if own is not None and topic == _EKF:
+            own = *own[:2], partial(self._detect_flags, instance, own[2])
+        detector = detectors.TextDetector if topic == "log_message" else ChangeDetector
+        return None if own is None else detector(*own)
 
-    def _position(self) -> ChangeDetector | None:
-        """Return the detector of the position estimate in use."""
-        return None if self.main is None else self._detectors.get(self.main)
+    def _detect_flags(self, instance: int, detect: detectors.Detect, *both: Fields) -> Iterator[Finding]:
+        return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
+
+    def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
+        """Yield the EKF whose estimates equal those of the vehicle, if those of the one in use do not.
+
+        For the EKF in use where no selector names it.
+        """
+        vehicle = _read_sample(None if self._position is None else self._position.last)
+        if before and before["timestamp_sample"] == vehicle[0]:
+            self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
+        if self._equal.get(instance) and not self._equal.get(self._ekf, True):
+            yield detectors.selected(instance, None)
 
     def _use_ekf(self, instance: int) -> None:
         """Use the flags of another EKF: those of both that are set begin conditions anew."""
@@ -283,14 +293,8 @@ class Vehicle:
         self._end(stream, lambda kind, flag: kind in kinds or flag.startswith(f"{instance}:"))
         for each in (old, instance):
             detector = self._detectors.get(replace(stream, instance=each))
-            for found in () if detector is None else detector.again(HEALTHY):
+            for found in () if detector is None else detector.again(detectors.HEALTHY):
                 self.emit(found, _EKF, self.time)
-
-    def _supersede(self, old: Address, new: Address) -> None:
-        """Stop using a stream as before, and end its conditions, when a better one arrives; open unused ones anew."""
-        self._detectors = {each: found for each, found in self._detectors.items() if found and each != old}
-        kinds = kinds_of(BY_TOPIC[new.topic].name)
-        self._end(new, lambda kind, _: kind in kinds)
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
         """End the conditions whose kind and flag are over, as a better stream is in use."""
@@ -321,9 +325,6 @@ class Vehicle:
         held = [each for each in conditions if each.begin is not event]
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
-    def _is_suppressed(self, event: Event) -> bool:
-        return (event.kind, event.names) in self._suppressed or (event.kind, None) in self._suppressed
-
     def _is_flapping(self, event: Event) -> bool:
         """Return True if there are too many of such events to report each; `settle` reports the last one."""
         keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in combinations
@@ -346,7 +347,3 @@ class _Burst:
     end: float
     count: int = 0
     topics: set[str] = field(default_factory=set)
-
-
-def _rank(topics: tuple[str, ...], address: Address) -> tuple[int, int]:
-    return topics.index(address.topic), address.instance or 0

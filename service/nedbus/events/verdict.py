@@ -65,30 +65,27 @@ def verdict_of(
     of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
     head = "position valid throughout, but " if usable else "not usable: " * of_estimate
     head = head if is_then else "no fault then; the nearest: "
-    cause = _cause(worst, events, stories[0].since)
+    # What preceded the fault, and texts of PX4 until a second after it, of a bad fault that held in the first message
+    # until its end; without those that PX4 had said before all faults.
+    said = [event for event in events if event.kind == "text"]
+    earlier = {each.text for each in said if each.time < stories[0].since - WINDOW}
+    late = TOGETHER if worst.begin else math.inf if worst.is_bad else -WINDOW
+    near = (e for e in said if e.severity != "info" and -WINDOW <= e.time - worst.since <= late)
+    found = [each for each in near if each.text not in earlier] + [e for e in worst.before if e.kind != "text"]
+    cause = tuple(sorted(found, key=lambda each: each.time))
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
     room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # the rest for others
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
-    also = ""
-    for part in _also(ranked, cause, times):
+    largest = {each.spans[0].kind: each for each in reversed(ranked)}
+    also = ""  # the worst other fault of each kind, those near in time first
+    for each in sorted(largest.values(), key=lambda each: abs(each.since - worst.since)):
+        if each.begin is None or each.begin in (worst.begin, *cause):
+            continue
+        part = f"{times.text(each.begin)} {_cut(each.what, 60)}{_count(each, stories)}"
         longer = f"{also}; {part}" if also else f" Also {part}"
         also = longer if len(textwrap.wrap(f"{text}{longer}.", _WIDTH)) < 4 else also
     text += f"{also}." * bool(also)
     return Verdict(text, usable, worst.begin, worst.end, cause, tuple(stories))
-
-
-def _cause(story: Story, events: Iterable[Event], first: float) -> tuple[Event, ...]:
-    """Return the evidence of a fault in order of time: what preceded it, and texts of PX4 until a second after it.
-
-    Texts that PX4 had said before the `first` of all faults are left out. A bad fault that held in the first message
-    has those until its end.
-    """
-    texts = [event for event in events if event.kind == "text"]
-    earlier = {each.text for each in texts if each.time < first - WINDOW}
-    late = TOGETHER if story.begin else math.inf if story.is_bad else -WINDOW
-    near = (e for e in texts if e.severity != "info" and -WINDOW <= e.time - story.since <= late)
-    found = [each for each in near if each.text not in earlier] + [e for e in story.before if e.kind != "text"]
-    return tuple(sorted(found, key=lambda each: each.time))
 
 
 def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[str]:
@@ -110,17 +107,6 @@ def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[
             return [f"Evidence: {listed}", *missing]
         ranked.pop()
     return [*([f"No evidence in the {WINDOW:.0f} s before"] if story.begin and not cause else []), *missing]
-
-
-def _also(ranked: Sequence[Story], cause: Iterable[Event], times: Times) -> list[str]:
-    """Return the worst other fault of each kind, those near in time first."""
-    told = {ranked[0].begin, *cause}
-    largest = {each.spans[0].kind: each for each in reversed(ranked)}.values()
-    return [
-        f"{times.text(each.begin)} {_cut(each.what, 60)}{_count(each, ranked)}"
-        for each in sorted(largest, key=lambda each: abs(each.since - ranked[0].since))
-        if each.begin is not None and each.begin not in told
-    ]
 
 
 def _count(story: Story, stories: Iterable[Story]) -> str:

@@ -27,11 +27,8 @@ _STALE: Final = 1_000_000  # us; a message that is older than the start of recor
 _STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
-
 _Floats = npt.NDArray[np.float64]
 _Ints = npt.NDArray[np.int64]
-
-
 _Flights = FlightPath | Sequence[FlightPath] | Mapping[str, MessageArray]
 
 
@@ -85,9 +82,8 @@ def align(
         raise ArgumentError("method", method, f"one of {', '.join(_METHODS)}")
     reference = [on] if isinstance(on, str) else []
     topics = [topics] if isinstance(topics, str) else topics
-    names = [*reference, *(topics or ())]
+    names, start = [*reference, *(topics or ())], 0
     streams: Streams
-    start = 0
     if not isinstance(flight, Mapping):
         streams, start = read_streams(flight, names if topics else None, vehicle=vehicle)
     elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
@@ -96,8 +92,11 @@ def align(
         everything = not topics or ANY in topics
         streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
     if isinstance(on, str):
-        on = _find_stream(on, streams)
-        reference = [on]
+        found = [name for name in streams if f"/{name}".endswith(f"/{on}")]
+        if not found:
+            expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
+            raise ArgumentError("on", on, expected, problem="is not in this flight")
+        on, *_ = reference = found[:1]  # of the first vehicle that has it
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
@@ -105,21 +104,20 @@ def align(
     if utc:
         several = {name: messages for name, (messages, _) in streams.items()}
         offset = utc_of(flight if isinstance(flight, FlightPath | Mapping) else several, vehicle=vehicle)
-        columns["utc"] = np.full(len(times), np.datetime64("NaT", "us"))
-        if offset:
-            unix = offset.unix_us(times)
-            columns["utc"] = np.where(is_unix_time(unix), unix.astype("M8[us]"), columns["utc"])
+        unix = offset.unix_us(times) if offset else 0 * times
+        columns["utc"] = np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT", "us"))
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
         padded = np.append(messages, np.zeros(1, messages.dtype))  # row -1: no message
-        for field, kind in _fields(messages):
-            padded[field][-1] = np.nan if kind.base.kind == "f" else kind.base.type()
+        for field in messages.dtype.names or ():
+            kind = messages.dtype[field].base
+            padded[field][-1] = np.nan if kind.kind == "f" else kind.type()
         values = padded[rows]
         if method == "linear":
             _interpolate(name, values, padded[following], weight)
         columns[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
-        for field, _ in _fields(messages):
+        for field in messages.dtype.names or ():
             columns[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
     columns = columns if fields is None else _choose(columns, fields)
@@ -132,15 +130,6 @@ def align(
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
 
 
-def _find_stream(on: str, streams: Streams) -> str:
-    """Return the stream of this name, of the first vehicle that has it; raise ArgumentError if there is none."""
-    for name in streams:
-        if f"/{name}".endswith(f"/{on}"):
-            return name
-    expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
-    raise ArgumentError("on", on, expected, problem="is not in this flight")
-
-
 def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Return the columns that these fields select, and the times; raise ArgumentError for an unknown field."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
@@ -148,10 +137,6 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
         raise ArgumentError("fields", sorted(unknown), f"some of {', '.join(columns)}", problem="are in no stream")
     times = {"timestamp", "utc"}
     return {name: column for name, column in columns.items() if name in times or known[name] & {*fields}}
-
-
-def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
-    return [(name, messages.dtype[name]) for name in messages.dtype.names or ()]
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
@@ -175,12 +160,13 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
     definition = next((BY_TOPIC[part] for part in stream.split("/") if part in BY_TOPIC), None)
     rules = definition.rules if definition else ()
     quaternions = {name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields}
-    for name, _ in _fields(values):
+    names = values.dtype.names or ()
+    for name in names:
         if name.endswith("reset_counter"):
             weight = np.where(values[name] == following[name], weight, 0.0)
     between = weight > 0
-    for name, kind in _fields(values):
-        if kind.base.kind != "f":
+    for name in names:
+        if values.dtype[name].base.kind != "f":
             continue
         first, second = values[name][between].astype(float), following[name][between].astype(float)
         parts = weight[between].reshape(-1, *[1] * (first.ndim - 1))
@@ -191,10 +177,7 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
-    """Interpolate linearly, angles the shorter way around.
-
-    Angles stay in the range of the inputs: from minus half a period if one is negative, else from 0.
-    """
+    """Interpolate linearly, angles the shorter way around: from minus half a period if one is negative, else from 0."""
     with np.errstate(invalid="ignore"):  # infinity minus infinity, and an infinite period
         step = second - first
         turned = first + weight * (step - np.sign(step) * period)
@@ -238,9 +221,8 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
     first = start if first + _STALE < start <= last else first
     count = max(0.0, (last - first) / 1e6 * rate + 1)
     if count > _MAX_ROWS:
-        ends = (
-            f"{min(firsts, key=firsts.__getitem__)} begins at {first / 1e6:.0f} s, {max(lasts, key=lasts.__getitem__)}"
-        )
-        problem = f"Hz has too many rows: {ends} ends at {last / 1e6:.0f} s"
+        earliest, latest = min(firsts, key=firsts.__getitem__), max(lasts, key=lasts.__getitem__)
+        ends = f"{earliest} begins at {first / 1e6:.0f} s, {latest} ends at {last / 1e6:.0f} s"
+        problem = f"Hz has too many rows: {ends}"
         raise ArgumentError("on", rate, "topics on one clock, a lower rate, or times", problem=problem)
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
@@ -53,7 +53,7 @@ def addresses_of(path: str | Path) -> list[Address]:
         return flight.addresses
 
 
-class Flight:
+class Flight(ExitStack):
     """A .ulg log, an .mcap recording or a .tlog open for reading: its addresses, and the messages of each.
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
@@ -63,16 +63,16 @@ class Flight:
     """
 
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
+        super().__init__()
         self.definitions: dict[Address, Definition[Any]]
         self._file: Any
-        self._opened = ExitStack()
         self._payloads = defaultdict[LoggedStream, bytearray](bytearray)  # of a log
         self._converted = defaultdict[Address, list[_Decoded]](list)  # of a .tlog
         self._invalid: list[str] = []
         self.start = 0
         if (form := find_format(path)) == "mcap":
             reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
-            self._file = self._opened.enter_context(reader)
+            self._file = self.enter_context(reader)
             self.definitions = {stream.address: stream.definition for stream in reader.counts}
         elif form == "tlog":  # converted by the source, which is above this package
             self._file = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
@@ -86,12 +86,6 @@ class Flight:
             self.start = log.start
             self.definitions = {address: stream.definition for address, stream in log.streams.items()}
         self.addresses = sorted(self.definitions)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._opened.close()
 
     @property
     def boot_utc(self) -> int:
@@ -110,16 +104,16 @@ class Flight:
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
-        return {address: self._valid(address, decoded) for address, decoded in self._decode(addresses)}
-
-    def _decode(self, addresses: Collection[Address]) -> Iterator[tuple[Address, _Decoded]]:
+        found = dict[Address, tuple[MessageArray, Absent]]()
         if isinstance(self._file, UlogReader):
-            for stream in map(self._file.streams.__getitem__, addresses):
-                yield stream.address, _decode_ulog(stream, self._payloads[stream])
-            return
+            for address in addresses:
+                stream = self._file.streams[address]
+                found[address] = self._valid(address, _decode_ulog(stream, self._payloads[stream]))
+            return found
         parts = self._converted or self._decode_recording(addresses)
         for address in addresses:
-            yield address, _Decoded(*map(np.concatenate, zip(*parts[address], strict=True)))
+            found[address] = self._valid(address, _Decoded(*map(np.concatenate, zip(*parts[address], strict=True))))
+        return found
 
     def _decode_recording(self, addresses: Collection[Address]) -> dict[Address, list[_Decoded]]:
         parts = {address: [_Decoded.empty(self.definitions[address], 0)] for address in addresses}
@@ -147,10 +141,9 @@ class Flight:
         return messages, masks
 
 
-def _by_address(messages: Iterable[Any]) -> Iterator[tuple[Address, list[Any]]]:
+def _by_address(messages: Iterator[Any]) -> Iterator[tuple[Address, list[Any]]]:
     """Yield the messages of each address, chunk by chunk."""
-    remaining = iter(messages)
-    while chunk := list(islice(remaining, _CHUNK)):
+    while chunk := list(islice(messages, _CHUNK)):
         by_address = defaultdict[Address, list[Any]](list)
         for each in chunk:
             by_address[each.address].append(each)

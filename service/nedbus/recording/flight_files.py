@@ -80,9 +80,8 @@ def _why_unreadable(path: Path) -> str:
         return ""
     with path.open("rb") as file:
         head = file.read(32)
-    return next(
-        (text for first, text in _UNREADABLE.items() if head.startswith(first) and bool(head) == bool(first)), ""
-    )
+    known = (text for first, text in _UNREADABLE.items() if head.startswith(first) and bool(head) == bool(first))
+    return next(known, "")
 
 
 def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict[str, str]]:
@@ -106,9 +105,8 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
     steps = {"vehicle": Selection(vehicle=vehicle), "topic": Selection(topic, vehicle), "instance": selection}
     for part, step in steps.items():
         if not any(map(step.matches, addresses)):
-            raise AddressError(
-                part, getattr(selection, part), f"one of {_list(addresses)}", problem=f"is not in {path}"
-            )
+            expected = f"one of {_list(addresses)}"
+            raise AddressError(part, getattr(selection, part), expected, problem=f"is not in {path}")
     return list(filter(selection.matches, addresses))
 
 

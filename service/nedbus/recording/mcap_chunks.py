@@ -36,22 +36,18 @@ ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 """The first bytes of zstd frames."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
+_SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that a record may be longer than its fields: no other one fits
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of the compression's name
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 _FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, start of summary and summary offsets, CRC, magic
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK_INDEX: ChunkIndex,
-    Opcode.STATISTICS: Statistics,
-}
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
+}  # fmt: skip
 _MAX_SMALL_CHUNK: Final = 2**26  # bytes uncompressed, at any ratio; ROS 2 writes 768 kB, nedbus 8 MiB plus a message
 _MAX_CHUNK: Final = 2**30  # bytes uncompressed
 _MAX_RATIO: Final = 100  # compression ratio of chunks above _MAX_SMALL_CHUNK
 _MAX_WARNINGS: Final = 100
-
-_Place = tuple[int, int, int]  # a record: opcode, offset, and offset of the next record
 
 
 class ChunkFile:
@@ -86,7 +82,13 @@ class ChunkFile:
 
         `only`: channels of interest; chunks without any of them may be skipped.
         """
-        for opcode, offset, end in self._indexed(only) if self._chunks else self._follow():
+        chunks = (
+            (Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length)
+            for chunk in self._chunks
+            # A chunk that lists no channels may contain any.
+            if only is None or not (own := chunk.message_index_offsets.keys()) or not own.isdisjoint(only)
+        )
+        for opcode, offset, end in chunks if self._chunks else self._follow():
             record = self._read(offset, end - offset)
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
@@ -141,32 +143,22 @@ class ChunkFile:
             raise ValueError(places)
         self._chunks, self.summary = chunks, records
 
-    def _indexed(self, only: Collection[int] | None) -> Iterator[_Place]:
-        """Yield the chunks listed in the summary."""
-        for chunk in self._chunks:
-            channels = chunk.message_index_offsets.keys()  # a chunk that lists no channels may contain any
-            if only is None or not channels or not channels.isdisjoint(only):
-                yield Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
-
-    def _follow(self) -> Iterator[_Place]:
-        """Scan the file record by record; yield each chunk, and each schema, channel and message outside of chunks."""
+    def _follow(self) -> Iterator[tuple[int, int, int]]:
+        """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages outside."""
         offset, after_chunk = len(MCAP0_MAGIC), False
         while True:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
             opcode, length = _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
             end = offset + _RECORD_HEAD.size + length
-            own_length = _own_length(opcode, begin[_RECORD_HEAD.size :])
-            if opcode == 0 or end > self._size or not _is_length(length, own_length):
+            surplus = length - _own_length(opcode, begin[_RECORD_HEAD.size :], length)
+            if opcode == 0 or end > self._size or surplus not in _SURPLUS:
                 self.warn(f"truncated or damaged: skipped from byte {offset} of {self._size} to the end", lost=True)
                 return
             if opcode in _LENGTHS:
                 return
             # The index after a chunk has no checksum: one flipped bit makes its opcode that of a message.
-            if (
-                after_chunk
-                and opcode == Opcode.MESSAGE
-                and _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :]) == length
-            ):
+            is_index = length == _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length)
+            if after_chunk and opcode == Opcode.MESSAGE and is_index:
                 opcode = Opcode.MESSAGE_INDEX
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
                 self.warn(f"damaged: skipped the chunk before byte {offset}", lost=True)
@@ -176,19 +168,14 @@ class ChunkFile:
             offset = end
 
 
-def _own_length(opcode: int, body: bytes) -> int | None:
-    """Return the record length implied by its first fields, None for record types without length fields."""
+def _own_length(opcode: int, body: bytes, length: int) -> int:
+    """Return the record length implied by its first fields, `length` for record types without length fields."""
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:
         before = _CHUNK_HEAD.size + int.from_bytes(body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size], "little")
         return before + 8 + int.from_bytes(body[before : before + 8], "little")
-    return _LENGTHS.get(opcode)
-
-
-def _is_length(length: int, own_length: int | None) -> bool:
-    """Return whether a record has its own length, or a few bytes more, in which no other record fits."""
-    return own_length is None or 0 <= length - own_length < _RECORD_HEAD.size
+    return _LENGTHS.get(opcode, length)
 
 
 def records_of(part: bytes) -> Iterator[McapRecord]:
@@ -215,7 +202,7 @@ def _unpack_chunk(record: bytes) -> bytes:
     body = ReadDataStream(BytesIO(record[_RECORD_HEAD.size :]))
     chunk = Chunk.read(body)
     opcode, length = _RECORD_HEAD.unpack_from(record)
-    if opcode != Opcode.CHUNK or not _is_length(length, body.count):  # all zeros would parse as an empty chunk
+    if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:  # all zeros would parse as an empty chunk
         raise ValueError(len(record))
     size, packed = chunk.uncompressed_size, chunk.data
     if size > max(_MAX_SMALL_CHUNK, min(_MAX_CHUNK, _MAX_RATIO * len(packed))):

@@ -139,6 +139,7 @@ class _RecordedFile:
         self._left = _MAX_DEFINITIONS
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
+        self.counts: Mapping[RecordedStream, int]
         for record in sorted(self.chunks.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
             # A summary may repeat channels without their schemas, which are then in the chunks.
             if not isinstance(record, Channel) or record.schema_id in {0, *self._schemas}:
@@ -149,13 +150,13 @@ class _RecordedFile:
         if self._all_known:
             self.counts = {stream: total for number, total in totals.items() if (stream := self._streams[number])}
         else:
-            self.counts = self._count()
+            self.counts = Counter(each.stream for each in self.messages())
 
     def check(self) -> None:
         for _ in self.chunks.parts(self._channels()):
             pass
         if self.chunks.damaged:
-            self.counts = self._count()
+            self.counts = Counter(each.stream for each in self.messages())
 
     def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
         for part in self.chunks.parts(self._channels(only)):
@@ -163,7 +164,12 @@ class _RecordedFile:
                 for record in records_of(part):
                     if not isinstance(record, Message):
                         self._learn(record)
-                    elif (stream := self._stream(record)) and (only is None or stream.address in only):
+                        continue
+                    if (number := record.channel_id) not in self._streams:
+                        self._streams[number] = None
+                        lost = f"skipped the messages of channel {number}: its channel record is lost"
+                        self.chunks.warn(lost, lost=True)
+                    if (stream := self._streams[number]) and (only is None or stream.address in only):
                         yield RecordedMessage(stream, _unpack(record.data), record.log_time)
             except READ_ERRORS:
                 self.chunks.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
@@ -175,9 +181,6 @@ class _RecordedFile:
         streams = self._streams.items()
         return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
-    def _count(self) -> dict[RecordedStream, int]:
-        return dict(Counter(recorded.stream for recorded in self.messages()))
-
     def _learn(self, record: McapRecord) -> None:
         """Register a schema or channel; the first with its id wins."""
         if isinstance(record, Schema):
@@ -185,36 +188,31 @@ class _RecordedFile:
         elif isinstance(record, Channel) and record.id not in self._streams:
             self._streams[record.id] = self._describe(self._schemas.get(record.schema_id), record)
 
-    def _stream(self, message: Message) -> RecordedStream | None:
-        if message.channel_id not in self._streams:
-            self._streams[message.channel_id] = None
-            self.chunks.warn(
-                f"skipped the messages of channel {message.channel_id}: its channel record is lost", lost=True
-            )
-        return self._streams[message.channel_id]
-
     def _describe(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
         if schema is None or not schema.name.startswith(("px4_msgs/", "px4_msgs_old/")):
             return None
         try:
             if schema.encoding and (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
-                forms = f"{channel.message_encoding} with {schema.encoding}"
-                raise ValueError(
-                    f"its encoding is {forms}, not cdr with ros2msg: record it where px4_msgs is installed"
-                )
+                forms = f"{channel.message_encoding} with {schema.encoding}, not cdr with ros2msg"
+                raise ValueError(f"its encoding is {forms}: record it where px4_msgs is installed")
             if not schema.data:
                 raise ValueError(f"the file has no definition of {schema.name}: record it where px4_msgs is installed")
             definition, layout = self._layout(schema, channel.topic)
-            address = self._address(channel)
+            metadata, number = channel.metadata, channel.metadata.get("instance")
+            if {"vehicle", "topic"} <= metadata.keys():
+                address = Address(metadata["vehicle"], metadata["topic"], None if number is None else int(number))
+            else:
+                namespace, topic, instance = split_ros2_topic(channel.topic)
+                address = Address(namespace.replace("/", "-") or self._vehicle, topic, instance)
             expected = BY_TOPIC.get(address.topic, definition)
             if expected is not definition:
                 raise ValueError(f"its messages are {definition.name}, but {address.topic} has {expected.name}")
         except (AddressError, ValueError) as exc:
             self.chunks.warn(f"skipped {channel.topic}: {exc}")
             return None
-        if (boot := channel.metadata.get("boot_time_utc_us", "")).isdecimal():
+        if (boot := metadata.get("boot_time_utc_us", "")).isdecimal():
             self.boots.add(boot)
-        missing = frozenset(channel.metadata.get("missing", "").split())
+        missing = frozenset(metadata.get("missing", "").split())
         return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
 
     def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:
@@ -239,14 +237,6 @@ class _RecordedFile:
         if unknown := sorted(types.keys() - known.known_types.keys()):
             self.chunks.warn(f"{topic}: {', '.join(unknown)} left out: not in any {known.name} that nedbus knows")
         return Layout("of the file", "", types=types)
-
-    def _address(self, channel: Channel) -> Address:
-        metadata = channel.metadata
-        if {"vehicle", "topic"} <= metadata.keys():
-            instance = metadata.get("instance")
-            return Address(metadata["vehicle"], metadata["topic"], None if instance is None else int(instance))
-        namespace, topic, instance_number = split_ros2_topic(channel.topic)
-        return Address(namespace.replace("/", "-") or self._vehicle, topic, instance_number)
 
 
 def _unpack(payload: bytes) -> bytes:

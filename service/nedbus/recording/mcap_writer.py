@@ -22,8 +22,6 @@ from nedbus_msgs import Address, Definition, Layout, Message, Provenance, defini
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.messages import LogMessage
 
-from .ros2_log import DEFINITION, TYPE, encode_log
-
 _CHUNK: Final = 2**23  # bytes; a flush every second makes smaller chunks
 _MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
 _MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have any timestamp
@@ -32,6 +30,20 @@ _END: Final = (
 )
 
 _ROS2: Final = "offered_qos_profiles"  # metadata by which tools of ROS 2 recognize their bags
+_LOG_TYPE: Final = "rcl_interfaces/msg/Log"
+_LOG_DEFINITION: Final = f"""builtin_interfaces/Time stamp
+uint8 level
+string name
+string msg
+string file
+string function
+uint32 line
+{"=" * 80}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # fatal, error, warning, information, debug; by severity
 
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
 
@@ -62,9 +74,9 @@ class RecordingWriter:
             self._file.close()
             self.path.unlink(missing_ok=True)
             raise
-        self._schemas: dict[tuple[Definition[Any], str], int] = {}  # by definition and layout
+        self._schemas: dict[tuple[str, str], int] = {}  # by type and text
         self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
-        self._log_schema, self._log_channels = 0, dict[str, int]()  # by vehicle
+        self._log_channels = dict[str, int]()  # by vehicle; readers of nedbus leave them out
 
     def write(
         self,
@@ -113,17 +125,10 @@ class RecordingWriter:
             yield logged, channel, data[index * size : (index + 1) * size], published, max(0, number) % 2**32
             self.messages += 1
             if definition is LogMessage.DEFINITION:
-                text = arrays_of(definition).to_message(messages[index])
-                copy = encode_log(stream[0].vehicle, text, time_ns=logged)
-                yield logged, self._log_channel(stream[0].vehicle), copy, published, 0
-
-    def _log_channel(self, vehicle: str) -> int:
-        """Return the channel of the copies of a vehicle's texts, which readers of nedbus leave out."""
-        if vehicle not in self._log_channels:
-            self._log_schema = self._log_schema or self._writer.register_schema(TYPE, "ros2msg", DEFINITION.encode())
-            found = self._writer.register_channel(f"/{vehicle}/log", "cdr", self._log_schema, {_ROS2: ""})
-            self._log_channels[vehicle] = found
-        return self._log_channels[vehicle]
+                text, vehicle = arrays_of(definition).to_message(messages[index]), stream[0].vehicle
+                if vehicle not in self._log_channels:
+                    self._log_channels[vehicle] = self._register(f"/{vehicle}/log", _LOG_TYPE, _LOG_DEFINITION, {})
+                yield logged, self._log_channels[vehicle], _encode_log(vehicle, text, logged), published, 0
 
     def _add(self, encoded: Iterable[_Encoded]) -> None:
         with _writing(self.path):
@@ -157,12 +162,7 @@ class RecordingWriter:
         self, definition: Definition[Any], address: Address, provenance: Provenance
     ) -> tuple[int, Layout]:
         layout = definition.recorded_layout(definition.all_fields - provenance.missing)
-        schema = self._schemas.get((definition, layout.name))
-        if schema is None:
-            text = definition_text(definition, layout).encode()
-            schema = self._writer.register_schema(ros2_type(definition), "ros2msg", text)
-            self._schemas[definition, layout.name] = schema
-        metadata = {_ROS2: "", "vehicle": address.vehicle, "topic": address.topic}
+        metadata = {"vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:
             metadata["instance"] = str(address.instance)
         if provenance.source is not None:
@@ -171,9 +171,25 @@ class RecordingWriter:
             metadata["boot_time_utc_us"] = str(self._boot_utc)
         if provenance.missing:
             metadata["missing"] = " ".join(sorted(provenance.missing))
-        channel = self._writer.register_channel(f"/{address}", "cdr", schema, metadata)
+        text = definition_text(definition, layout)
+        channel = self._register(f"/{address}", ros2_type(definition), text, metadata)
         self._channels[definition][address, provenance] = channel, layout
         return channel, layout
+
+    def _register(self, topic: str, name: str, text: str, metadata: dict[str, str]) -> int:
+        if (name, text) not in self._schemas:
+            self._schemas[name, text] = self._writer.register_schema(name, "ros2msg", text.encode())
+        return self._writer.register_channel(topic, "cdr", self._schemas[name, text], {_ROS2: "", **metadata})
+
+
+def _encode_log(vehicle: str, message: LogMessage, time_ns: int) -> bytes:
+    """Return the CDR payload of a text of a vehicle as _LOG_TYPE, which Foxglove's Log panel and ROS 2 show."""
+    seconds = min(time_ns // 10**9, 2**31 - 1)
+    body = struct.pack("<iIB", seconds, time_ns % 10**9, _LOG_LEVELS[message.severity])
+    for part in (vehicle, message.text, "", ""):
+        data = part.encode() + b"\0"
+        body += bytes(-len(body) % 4) + struct.pack("<I", len(data)) + data
+    return b"\0\1\0\0" + body + bytes(-len(body) % 4 + 4)
 
 
 @contextmanager

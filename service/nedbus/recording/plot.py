@@ -1,10 +1,9 @@
-"""Plot of a log or recording: track, altitude, speed, flags over time, resets, and events."""
+"""Plot of a log or recording: track, altitude, speed, flags over time, and resets."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -14,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
-from nedbus.events import KINDS, SEVERITIES, Event, Severity, Times, spans_of, to_clock, unit_of
+from nedbus.events import Times, to_clock, unit_of
 from nedbus.whole_file import whole_file
-from nedbus_msgs import DEFAULT_TOPIC, Address
+from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import missing_of
@@ -28,26 +27,19 @@ _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _DPI: Final = 120
 _WIDTH: Final = 12.0  # inches
 _HEIGHT: Final = 6.0  # inches for track, altitude and speed
-_ROW: Final = 0.2  # inches per row of flags or events below these
+_ROW: Final = 0.2  # inches per row of flags below these
 _FRAME: Final = 0.6  # inches for the title and axis of the rows
 _COLORS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 _WARNING_COLOR: Final = "#d62728"
-_MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
-    "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
-}  # fmt: skip
-_LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
 _STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21_600)  # s between ticks
 _TICKS: Final = 6  # on a time axis
 _BOOT: Final = Times()
-_NEAR: Final = 1.0  # s between an event and the message with its position
-_GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
 """Maximum number of streams in one plot."""
 
 _FLAGS: Final = (  # estimator flags
     "xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning",
 )  # fmt: skip
-_HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
 _COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy", "vz", "heading")}
 
 
@@ -64,25 +56,8 @@ class _Stream(NamedTuple):
         return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
 
 
-@dataclass(frozen=True, slots=True)
-class _Mark:
-    """An event of a vehicle, from begin to end [s]; both are equal for an instantaneous event."""
-
-    vehicle: str
-    row: str
-    severity: Severity
-    text: str
-    begin: float
-    end: float
-
-
 def draw(
-    streams: Sequence[tuple[Address, MessageArray]],
-    path: str | Path,
-    *,
-    title: str,
-    events: Iterable[Event] = (),
-    times: Times = _BOOT,
+    streams: Sequence[tuple[Address, MessageArray]], path: str | Path, *, title: str, times: Times = _BOOT
 ) -> None:
     """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
@@ -90,7 +65,6 @@ def draw(
     The time axis has UTC if `times` has that of all vehicles, else seconds since boot.
     Positions are local NED in metres; altitude is -z.
     Fields named by `missing_of` are not plotted; a note lists them.
-    `events`: for the streams' vehicles, events of severity bad or watch, mode changes, arming and landing are marked.
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
@@ -98,15 +72,12 @@ def draw(
         raise ConfigError(str(path), f"not a picture format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
         with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
-            figure = draw_figure(streams, title=title, events=events, times=times)
-            figure.savefig(part)  # a glyph missing in the font is only a warning
+            draw_figure(streams, title=title, times=times).savefig(part)  # a glyph missing in the font: only a warning
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
 
-def draw_figure(
-    streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
-) -> Figure:
+def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, times: Times = _BOOT) -> Figure:
     """Return the figure that `draw` saves."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
     drawn = [
@@ -114,81 +85,67 @@ def draw_figure(
         for (address, messages), color in zip(streams, _COLORS, strict=False)
     ]
     rows = _rows(drawn)
-    marks = _marks(drawn, start / 1e6, events)
-    by_row = _by_row(marks)
-    heights = [_FRAME + _ROW * len(each) for each in (rows, by_row) if each]
-    figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
+    height = _FRAME + _ROW * len(rows)
+    figure = Figure(figsize=(_WIDTH, _HEIGHT + height), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    mosaic: list[HashableList[str]] = [
-        ["track", "altitude"], ["track", "speed"], ["flags", "flags"], ["events", "events"]
-    ]  # fmt: skip
-    ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights]
-    axes = figure.subplot_mosaic(mosaic[: len(ratios)], height_ratios=ratios, width_ratios=[1, 1.2])
-    _draw_track(axes["track"], drawn)
-    _draw_altitude(axes["altitude"], drawn)
-    _draw_speed(axes["speed"], drawn)
-    _draw_rows(axes["flags"], rows)
-    _mark_events(axes, drawn, marks)
-    for name in ("track", "altitude", "speed"):
-        axes[name].grid(alpha=0.3)
+    mosaic: list[HashableList[str]] = [["track", "altitude"], ["track", "speed"], ["flags", "flags"]]
+    ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, height]
+    axes = figure.subplot_mosaic(mosaic, height_ratios=ratios, width_ratios=[1, 1.2])
+    for name in ("speed", "flags"):
+        axes[name].sharex(axes["altitude"])
+    _draw_estimates(axes, drawn)
+    _draw_flags(axes["flags"], rows)
     axes["track"].legend(fontsize="small", loc="best")
-    seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in marks)])
+    seconds = np.concatenate([stream.seconds for stream in drawn])
     margin = 0.02 * (np.ptp(seconds) or 1.0)
-    for name in axes.keys() - {"track"}:
-        axes[name].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
-    label = _label_times([axes[name] for name in axes.keys() - {"track"}], drawn, start / 1e6, times)
-    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
-    figure.supxlabel(_explain_missing(drawn), fontsize="small")
-    for name in ("speed", "events" if by_row else "flags"):
+    axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + margin)
+    label = _label_times(axes["altitude"], drawn, start / 1e6, times)
+    for name in ("speed", "flags"):
         axes[name].set_xlabel(label)
-    if by_row:
-        _draw_events(figure, axes["events"], by_row)
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
+    missing = {each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))] for each in drawn}
+    notes = (f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)
+    figure.supxlabel("\n".join(notes), fontsize="small")
     return figure
 
 
-def _label_times(axes: Iterable[Any], streams: Iterable[_Stream], start: float, times: Times) -> str:
+def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Times) -> str:
     """Put ticks on time axes that begin at `start` [s since boot], in UTC if it is one for all; return their label."""
     found = [times.utc_of_boot(stream.address.vehicle, start) for stream in streams]
     utc = [each for each in found if each is not None]
     has_utc = len(utc) == len(found) and max(utc) - min(utc) < 1.0
     shift = utc[0] if has_utc else start
-    for each in axes:
-        low, high = (limit + shift for limit in each.get_xlim())
-        step = next((step for step in _STEPS if high - low < _TICKS * step), _STEPS[-1])
-        ticks = np.arange(np.ceil(low / step), high / step) * step
-        each.set_xticks(
-            ticks - shift, [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
-        )
+    low, high = (limit + shift for limit in axes.get_xlim())
+    step = next((step for step in _STEPS if high - low < _TICKS * step), _STEPS[-1])
+    ticks = np.arange(np.ceil(low / step), high / step) * step
+    texts = [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
+    axes.set_xticks(ticks - shift, texts)
     return f"time [{unit_of('vehicle' if has_utc else 'boot')}]"
 
 
-def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
-    """Plot the tracks, with a circle at the start and a square at the end of each."""
+def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None:
+    """Plot the tracks, with a circle at the start and a square at the end of each, altitude and speed."""
     tracks = [(each.messages["y"], each.messages["x"]) for each in streams]
-    _draw_lines(axes, streams, "xy_valid", tracks, width=1.2)
+    _draw_lines(axes["track"], streams, "xy_valid", tracks, width=1.2)
+    altitudes = [(each.seconds, -each.messages["z"]) for each in streams]
+    _draw_lines(axes["altitude"], streams, "z_valid", altitudes, width=1.0)
+    speeds = [(each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams]
+    _draw_lines(axes["speed"], streams, "v_xy_valid", speeds, width=0.9)
     for stream in streams:
         track = stream.messages[stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])]
         if len(track):
-            axes.plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
-            axes.plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
-    axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
-    axes.locator_params(axis="x", nbins=6)  # more labels may overlap
-    axes.set_title("track; circle: start, square: end, thin: xy invalid")
-
-
-def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
-    _draw_lines(axes, streams, "z_valid", [(each.seconds, -each.messages["z"]) for each in streams], width=1.0)
-    for stream in streams:
-        for time in np.unique(np.concatenate([stream.resets(each) for each in _HEIGHT_COUNTERS])):
-            axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
+            axes["track"].plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
+            axes["track"].plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
+        for time in np.union1d(stream.resets("z_reset_counter"), stream.resets("vz_reset_counter")):
+            axes["altitude"].axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
+    axes["track"].set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
+    axes["track"].locator_params(axis="x", nbins=6)  # more labels may overlap
+    axes["track"].set_title("track; circle: start, square: end, thin: xy invalid")
     title = "altitude; thin: z invalid, dashed: z or vz reset"
-    axes.set(ylabel="altitude above origin, -z [m]", title=title)
-
-
-def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
-    speed = [(each.seconds, np.hypot(each.messages["vx"], each.messages["vy"])) for each in streams]
-    _draw_lines(axes, streams, "v_xy_valid", speed, width=0.9)
-    axes.set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
+    axes["altitude"].set(ylabel="altitude above origin, -z [m]", title=title)
+    axes["speed"].set(ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
+    for name in ("track", "altitude", "speed"):
+        axes[name].grid(alpha=0.3)
 
 
 def _draw_lines(
@@ -197,12 +154,11 @@ def _draw_lines(
     """Plot a line per stream, thin where its flag is not set; thin parts scale the axes only if no part is valid."""
     valid = [stream.messages[flag] for stream in streams]
     in_scale = not any(np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True))
-    for stream, (x, y) in zip(streams, lines, strict=True):
-        thin = Line2D(x, y, color=stream.color, linewidth=0.5, alpha=0.6)
-        (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
     for stream, each, line in zip(streams, valid, lines, strict=True):
-        x, y = (np.where(each, values, np.nan) for values in line)
-        axes.plot(x, y, color=stream.color, linewidth=width, label=str(stream.address))
+        thin = Line2D(*line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)  # below all others
+        (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
+        thick = (np.where(each, values, np.nan) for values in line)
+        axes.plot(*thick, color=stream.color, linewidth=width, label=str(stream.address))
 
 
 def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
@@ -217,7 +173,7 @@ def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
     return rows
 
 
-def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
+def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
     for number, (_, stream, field) in enumerate(rows):
         if field in _COUNTERS:
             times = stream.resets(field)
@@ -229,103 +185,3 @@ def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
     axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
-
-
-def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> list[_Mark]:
-    """Return the marks of the streams' vehicles by time; skip events far from all messages: their time is damaged."""
-    timed = [event for event in events if event.boot is not None]
-    marks: list[_Mark] = []
-    vehicles = sorted({stream.address.vehicle for stream in streams})
-    for vehicle in vehicles:
-        seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
-        first, last = float(seconds.min()), float(seconds.max())
-        found: dict[Event, _Mark] = {}  # conditions that began together share a mark until the last of them ends
-        for span in spans_of([event for event in timed if event.vehicle == vehicle]):
-            event = span.begin
-            if span.initial or event.boot is None or (event.severity == "info" and not KINDS[event.kind].phase):
-                continue
-            offset = event.boot - start - event.time
-            begin = span.since + offset
-            if max(first - begin, begin - last) > last - first + _NEAR:
-                continue
-            row = KINDS[event.kind].row or event.kind.replace("_", " ")
-            text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
-            row += f" {vehicle}" if len(vehicles) > 1 else ""
-            end = max(begin, last if span.until is None else min(span.until + offset, last))
-            end = max(end, found[event].end) if event in found else end
-            found[event] = _Mark(vehicle, row, event.severity, text, begin, end)
-        marks += found.values()
-    return sorted(marks, key=lambda mark: mark.begin)
-
-
-def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
-    """Return the marks by row label, rows with the most severe marks first."""
-    rows: dict[str, list[_Mark]] = {}
-    for mark in sorted(marks, key=lambda mark: SEVERITIES.index(mark.severity)):
-        rows.setdefault(mark.row, []).append(mark)
-    return {label: sorted(own, key=lambda mark: mark.begin) for label, own in rows.items()}
-
-
-def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
-    """Mark the begin of bad and watch events on the track and on the time axes of altitude and speed."""
-    by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
-    main = {stream.address.vehicle: stream for stream in by_preference}
-    for severity, label in _LEGEND.items():
-        marker, color, size = _MARKERS[severity]
-        own = [mark for mark in marks if mark.severity == severity]
-        if not own:
-            continue
-        style: dict[str, Any] = {"marker": marker, "color": color, "fillstyle": "none", "linestyle": "none"}
-        places = []
-        for mark in own:
-            stream = main[mark.vehicle]
-            nearest = np.abs(stream.seconds - mark.begin).argmin()
-            if abs(stream.seconds[nearest] - mark.begin) <= _NEAR:
-                places.append((stream.messages["y"][nearest], stream.messages["x"][nearest]))
-        if places:
-            found = Line2D(*zip(*places, strict=True), label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3)
-            found.set(**style)
-            axes["track"].add_artist(found)
-        for name in ("altitude", "speed"):
-            bottom = axes[name].get_xaxis_transform()
-            times = [mark.begin for mark in own]
-            axes[name].add_artist(Line2D(times, [0.03] * len(own), transform=bottom, markersize=size - 1, **style))
-
-
-def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
-    """Plot the marks row by row, with labels where there is room."""
-    for number, marks in enumerate(rows.values()):
-        for mark in marks:
-            marker, color, size = _MARKERS[mark.severity]
-            axes.broken_barh(
-                [(mark.begin, mark.end - mark.begin)], (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0
-            )
-            axes.plot(mark.begin, number, marker, color=color, markersize=size)
-    axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
-    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
-    axes.grid(axis="x", alpha=0.3)
-    figure.draw_without_rendering()  # lays out the axes, which determines the room for labels
-    for number, marks in enumerate(rows.values()):
-        _label(axes, number, marks)
-
-
-def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
-    """Label each mark if the text fits before the next mark."""
-    gap = _GAP * _DPI / 72
-    places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
-    for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
-        text = axes.annotate(
-            mark.text, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
-            fontsize="x-small", parse_math=False,
-        )  # fmt: skip
-        text.set_in_layout(False)
-        box = text.get_window_extent()
-        if box.x0 + 1.05 * box.width > after - gap:  # text width differs slightly between file formats
-            text.remove()
-
-
-def _explain_missing(streams: Sequence[_Stream]) -> str:
-    """Return a note on the rows that are not plotted because the flight lacks their fields."""
-    drawn = [*_FLAGS, *_COUNTERS]
-    missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
-    return "\n".join(f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)

@@ -36,10 +36,9 @@ class Recorder:
     @property
     def status(self) -> str:
         """The counts so far, as one line of text."""
-        counts = self._subscription.counts
         names = ("lost", "dropped", "invalid", "discarded", "forgotten")
-        trouble = ", ".join(f"{count} {name}" for name in names if (count := getattr(counts, name)))
-        return f"{self._writer.messages} messages" + (f", {trouble}" if trouble else "")
+        counts = ((getattr(self._subscription.counts, name), name) for name in names)
+        return ", ".join([f"{self.messages} messages", *(f"{count} {name}" for count, name in counts if count)])
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
         """Record until `stop` is set, for `duration` seconds, or until the subscription is closed.

@@ -16,7 +16,7 @@ from websockets.typing import Subprotocol
 import nedbus
 from nedbus import Sample
 from nedbus.bridges import FoxgloveServer
-from nedbus.bridges.foxglove_messages import orientation_of
+from nedbus.bridges.foxglove import orientation_of
 from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection, to_global
 from nedbus_msgs.messages.vehicle_attitude import VehicleAttitude
