@@ -16,11 +16,6 @@ CLOSED: Final = b"closed"
 _MAX_DIGITS: Final = 10  # of a sequence number
 
 
-def write_parameters(publisher: str, number: int, *, read: bool) -> str:
-    """Return the parameters of an acknowledgement request."""
-    return f"publisher={publisher};number={number};read={read:d}"
-
-
 def read_parameters(get: Callable[[str], str | None]) -> tuple[str, int, bool] | None:
     """Return publisher, number and `read` of an acknowledgement request, None if it is invalid.
 
