@@ -28,9 +28,7 @@ from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
 
-RING_CAPACITY: Final = 16_384
-"""Samples that fit between two polls; more than 0.2 s of traffic of the largest fleet."""
-
+RING_CAPACITY: Final = 16_384  # samples between two polls; more than 0.2 s of traffic of the largest fleet
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
@@ -70,7 +68,14 @@ class Receiver:
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
         if not pending_queue.newest_only:
-            self._declare_every()
+            requests: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
+            events: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
+            with while_open():
+                queryable = session.declare_queryable(ack_key(key_expr), requests)
+                links = session.info.declare_transport_events_listener(events, history=False)
+            self._undeclares += [queryable.undeclare, links.undeclare]
+            self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
+            self._retransmission = Retransmission(session, key_expr, pending_queue)
         self._job = Job(self._poll)
         self._queue.on_gap = self._job.wake
 
@@ -126,16 +131,6 @@ class Receiver:
         if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
             self._receiving.release()
 
-    def _declare_every(self) -> None:
-        requests: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
-        events: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
-        with while_open():
-            queryable = self._session.declare_queryable(ack_key(self._name), requests)
-            links = self._session.info.declare_transport_events_listener(events, history=False)
-        self._undeclares += [queryable.undeclare, links.undeclare]
-        self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
-        self._retransmission = Retransmission(self._session, self._name, self._queue)
-
     def _run(self) -> None:
         try:
             while not self._queue.ended:
@@ -150,7 +145,7 @@ class Receiver:
     def _receive(self, *, if_empty: bool = False) -> None:
         """Wait for a sample and drain the ring into the queue; end the queue if the subscriber is gone.
 
-        With `if_empty`, return at once if the queue already has a sample; if one is added later, `_wake` ends the wait.
+        With `if_empty`, return at once if the queue already has a sample; if one is added later, `_poll` ends the wait.
         """
         handler = self._handler
         self._idle = True
@@ -191,19 +186,12 @@ class Receiver:
             self._queue.acknowledge(drained=True)
         recovered_key, pause = self._retransmission.poll(now, drained=drained)
         if recovered_key:
-            self._wake(recovered_key)
-        return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
-
-    def _wake(self, key: str) -> None:
-        """Wake the reader; if it is blocked on the ring, put a session-local sample on one of its keys.
-
-        Nothing else ends a blocking receive from Zenoh's ring. The decoder discards the sample.
-        """
-        self._queue.wake()
-        if self._idle:
-            with suppress(zenoh.ZError):  # the session is closed
+            self._queue.wake()
+            if self._idle:  # only a session-local sample, which the decoder discards, ends a blocking receive
                 here = zenoh.Locality.SESSION_LOCAL
-                self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
+                with suppress(zenoh.ZError):  # the session is closed
+                    self._session.put(recovered_key, b"", encoding=WAKE_UP, allowed_destination=here)
+        return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
     def _take_events(self) -> None:
         """Handle link changes, which must precede the samples received since, and acknowledgement requests."""
