@@ -359,10 +359,10 @@ class Rejections:
     def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
         self._prefix = prefix
         self._owner = owner  # keeps the bus open
-        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_REPORTS)
         with while_open():
-            subscriber = session.declare_subscriber(rejected_key_expr(prefix=prefix), channel)
-        self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
+            key_expr = rejected_key_expr(prefix=prefix)
+            subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_MAX_REPORTS))
+        self._handler = subscriber.handler
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
     def take(self) -> list[RejectionReport]:

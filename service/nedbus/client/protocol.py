@@ -7,12 +7,8 @@ A lossless publisher requests acknowledgements from readers of mode `every` with
 from collections.abc import Callable
 from typing import Final
 
-LIVE: Final = b"live"
-"""Attachment of a publisher's reply with its last message; replies of a storage do not have it."""
-
-CLOSED: Final = b"closed"
-"""Payload of the acknowledgement of a closed reader; other acknowledgements are empty."""
-
+LIVE: Final = b"live"  # attachment of a publisher's reply with its last message; a storage's reply has none
+CLOSED: Final = b"closed"  # acknowledgement of a closed reader; others are empty
 _MAX_DIGITS: Final = 10  # of a sequence number
 
 

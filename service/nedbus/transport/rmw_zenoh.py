@@ -17,24 +17,16 @@ import xxhash
 
 from nedbus_msgs import DecodeError
 
-NO_HASH: Final = "TypeHashNotSupported"
-"""The type hash in the keys of ROS 2 Humble, and of a PX4 built for it."""
-
-BRIDGED_ENCODING: Final = "application/cdr;nedbus"
-"""The encoding of messages that nedbus publishes to ROS 2, which must not be bridged back; ROS 2 ignores it."""
-
+NO_HASH: Final = "TypeHashNotSupported"  # in the keys of ROS 2 Humble, and of a PX4 built for it
+BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # of messages from nedbus, not to be bridged back; ROS 2 ignores it
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10: as PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
 _MAX_KEY: Final = 512  # characters; keys of PX4 and ROS 2 have up to half of it
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
-
-LONGEST_TOKEN: Final = 2 * _MAX_KEY
-"""Characters of the longest liveliness token accepted; those of ROS 2 are shorter."""
-
-PX4_TYPES: Final = "px4_msgs$*"
-"""The DDS types of PX4's messages and of its translation node, as a chunk of a key expression."""
+LONGEST_TOKEN: Final = 2 * _MAX_KEY  # characters; those of ROS 2 are shorter
+PX4_TYPES: Final = "px4_msgs$*"  # chunk of a key expression: the DDS types of PX4 and of its translation node
 
 
 @dataclass(frozen=True, slots=True)

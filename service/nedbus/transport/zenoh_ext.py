@@ -17,8 +17,7 @@ import zenoh
 from .queries import MAX_ANSWERS, Answers, ask
 from .session import RawSample, Session, entity_name, while_open
 
-Heartbeats = dict[tuple[str, str], int]
-"""The newest sequence number, by the key of a stream and the name of its publisher."""
+Heartbeats = dict[tuple[str, str], int]  # newest sequence number, by key of a stream and name of its publisher
 
 _MAX_HEARTBEATS: Final = 16_384  # in the channel
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
@@ -39,9 +38,9 @@ def heartbeat_payload(published: int) -> bytes:
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
     """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
-    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_HEARTBEATS)
     with while_open():
-        subscriber = session.declare_subscriber(f"{key_expr}/@adv/pub/**", channel)
+        key = f"{key_expr}/@adv/pub/**"
+        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_MAX_HEARTBEATS))
 
     def drain() -> Heartbeats:
         newest: Heartbeats = {}

@@ -26,10 +26,10 @@ class MatchingListener:
     """Matching status of a key expression, from a publisher that never publishes. Thread-safe."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
         with while_open():
             self._probe = session.declare_publisher(key_expr)
-            self._listener = self._probe.declare_matching_listener(channel)  # reports the current status first
+            # It reports the current status first.
+            self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
         self._matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
         self._take = self._listener.handler.try_recv

@@ -23,8 +23,8 @@ JSON: Final = "application/json"
 
 _replies = CallThread("nedbus-replies")  # a report of many vehicles takes longer than the I/O thread may be held up
 
+# Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close.
 Reply = Callable[[zenoh.Query], object]
-"""Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close."""
 
 
 class QueryServer:
@@ -64,9 +64,8 @@ class QueryServer:
 
 class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
-            self._queryable = session.declare_queryable(key_expr, channel)
+            self._queryable = session.declare_queryable(key_expr, zenoh.handlers.RingChannel(_MAX_PENDING))
         self._take, self._reply = self._queryable.handler.try_recv, reply
         self._query: zenoh.Query | None = None  # to be replied to
         self._busy_until = 0.0

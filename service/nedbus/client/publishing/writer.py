@@ -17,8 +17,7 @@ from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
 _TURN: Final = 256  # heartbeats per call, so that other jobs are not delayed
-HEARTBEAT: Final = _PAUSES[0] + 2 * TICK
-"""Maximum delay of the first heartbeat after the last message [s]; readers then detect that they missed it."""
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s from a last message until readers detect that they missed it, at most
 
 
 class Writer:

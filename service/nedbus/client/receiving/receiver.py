@@ -55,11 +55,12 @@ class Receiver:
         self._idle = False  # the holder is blocked on an empty ring
         self._busy = False
         self._pump: threading.Thread | None = None
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         with while_open():
-            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                session, key_expr, zenoh.handlers.RingChannel(RING_CAPACITY), history=last
+            )
         # Receive on the handler: a blocking receive on the subscriber prevents undeclaring it.
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
         self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
@@ -68,11 +69,9 @@ class Receiver:
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
         if not pending_queue.newest_only:
-            requests: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
-            events: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
             with while_open():
-                queryable = session.declare_queryable(ack_key(key_expr), requests)
-                links = session.info.declare_transport_events_listener(events, history=False)
+                queryable = session.declare_queryable(ack_key(key_expr), zenoh.handlers.RingChannel(MAX_ACK_REQUESTS))
+                links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
             self._undeclares += [queryable.undeclare, links.undeclare]
             self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
             self._retransmission = Retransmission(session, key_expr, pending_queue)
