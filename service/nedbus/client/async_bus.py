@@ -9,14 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, overload
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, cast, overload
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
+from nedbus_msgs import Definition, Message, Selection
 
-from .bus import Bus, connect_with
+from .bus import Bus
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
@@ -86,19 +86,9 @@ class AsyncBus:
     ) -> AsyncSubscription[M_co]: ...
     @overload
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
-    def subscribe(
-        self,
-        message: type[Message] | str = VehicleLocalPosition,
-        *,
-        topic: str | None = None,
-        vehicle: str | int = ANY,
-        instance: int | None = None,
-        mode: Mode = "latest",
-        max_rate: float | None = None,
-    ) -> AsyncSubscription[Any]:
+    def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens with the first wait."""
-        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        return self.subscribe_to(selection, mode=mode, max_rate=max_rate)
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # it calls `subscribe_to`
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -191,7 +181,7 @@ def connect_async(
 ) -> AsyncBus:
     """Return a bus for asyncio, opened with `async with`; arguments and errors as in `connect`."""
     load = partial(load_client_settings, config, connect=endpoint, prefix=prefix, tls=tls)
-    return AsyncBus(lambda stop: connect_with(load(), timeout=timeout, tls=tls, stop=stop))
+    return AsyncBus(lambda stop: Bus(load(), timeout=timeout, tls=tls, stop=stop))
 
 
 class AsyncPublisher:

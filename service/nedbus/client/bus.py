@@ -45,11 +45,17 @@ class Bus:
     Thread-safe. Methods raise AddressError for an invalid name, and ClosedError once the bus is closed.
     """
 
-    def __init__(self, session: Session, *, routers: Sequence[str], prefix: str, tls: Tls | None) -> None:
-        self.prefix = prefix
-        self.routers = tuple(routers)
-        self._tls = tls
-        self._zenoh = session
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        timeout: float | None,
+        tls: Tls | None = None,
+        stop: threading.Event | None = None,
+    ) -> None:
+        self.prefix, self.routers = settings.prefix, settings.routers
+        self._tls, prefix = tls or settings.tls, settings.prefix
+        self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(Selection(), prefix=prefix)
@@ -250,12 +256,10 @@ class Bus:
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
-        session, prefix = self._session, self.prefix
-        receiver: Receiver
         if isinstance(pending_queue, MaxRateQueue):
-            receiver = MaxRateReceiver(session, selection, pending_queue, prefix=prefix)
+            receiver: Receiver = MaxRateReceiver(self._session, selection, pending_queue)
         else:
-            receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue)
+            receiver = Receiver(self._session, pending_queue)
         self._receivers.add(receiver)
         if self.closed:  # by another thread
             receiver.close()
@@ -281,20 +285,7 @@ def connect(
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
-    settings = load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls)
-    return connect_with(settings, timeout=timeout, tls=tls)
-
-
-def connect_with(
-    settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
-) -> Bus:
-    """Connect with these settings; `tls` overrides theirs. Errors as in `connect`.
-
-    Setting `stop` ends the wait for a router with ConnectError.
-    """
-    tls = tls or settings.tls
-    session = open_client(settings.routers, timeout=timeout, tls=tls, stop=stop)
-    return Bus(session, routers=settings.routers, prefix=settings.prefix, tls=tls)
+    return Bus(load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls), timeout=timeout, tls=tls)
 
 
 def _close_all(receivers: Iterable[Receiver]) -> None:

@@ -16,8 +16,8 @@ from .publishing import publish, take
 class LossyQueue(PendingQueue):
     """A queue that does not receive the messages `missing`, by sequence number."""
 
-    def __init__(self) -> None:
-        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
+    def __init__(self, key_expr: str) -> None:
+        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name=key_expr)
         self.missing: Collection[int] = ()
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:

@@ -35,9 +35,9 @@ KEY = f"nedbus/7/{VLP}"
 @pytest.fixture
 def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lossy]:
     """Subscribe to all vehicles, and wait until the publisher is matched."""
-    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue()
+    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
-        lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue), publisher)
+        lossy = Lossy(session, queue, Receiver(session, queue), publisher)
         monkeypatch.setattr(retransmission, "request_samples", lossy.ask)
         with lossy.subscription:
             wait_for_subscriber(publisher)
@@ -120,8 +120,8 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, wa
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
     foreign = raw.declare_subscriber(KEY, seen)
     wait_for_router(raw)
-    lossless = LossyQueue()
-    other = Receiver(lossy.session, KEY, lossless)
+    lossless = LossyQueue(KEY)
+    other = Receiver(lossy.session, lossless)
 
     def read() -> None:
         if waits == "without":
@@ -178,8 +178,8 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str)
             lossy.subscription.close()
         else:
             assert lossy.receive(3) == [0, 1, 2]
-        queue = LossyQueue()
-        other = Receiver(lossy.session, KEY, queue)
+        queue = LossyQueue(KEY)
+        other = Receiver(lossy.session, queue)
 
         def goes_on() -> bool:
             lossy.publish(7)

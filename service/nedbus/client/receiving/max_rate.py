@@ -81,13 +81,12 @@ class MaxRateQueue(PendingQueue):
 class MaxRateReceiver(Receiver):
     """Put downsampled and last messages into a MaxRateQueue until closed."""
 
-    def __init__(self, session: Session, selection: Selection, queue: MaxRateQueue, *, prefix: str) -> None:
-        self._prefix, self._rate_queue = prefix, queue
+    def __init__(self, session: Session, selection: Selection, queue: MaxRateQueue) -> None:
+        self._prefix, self._rate_queue = queue.decoder.prefix, queue
         self._awaiting: dict[Address, float] = {}  # appearance of tokens without a downsampled message yet [s]
-        self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
-        self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
-        rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
-        super().__init__(session, rate_key_expr, queue, history=False)
+        self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=self._prefix))
+        self._last = ask(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
+        super().__init__(session, queue, history=False)
         self._undeclares.append(self._tokens.undeclare)
         self.pump()  # last messages bypass the ring, so no reader may block on it
 

@@ -69,7 +69,7 @@ class PendingQueue:
 
     It owns the state of all streams: key states, writer proxies, counters and unread messages, guarded by one lock.
     In mode `every`, messages behind a gap are held back until it is filled; in mode `latest` a gap is lost at once.
-    `name` appears in the log. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
+    `name`: its key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
     def __init__(

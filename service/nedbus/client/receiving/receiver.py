@@ -39,16 +39,15 @@ _T = TypeVar("_T")
 
 
 class Receiver:
-    """Declare an advanced subscriber and put its samples into a PendingQueue until closed.
+    """Declare an advanced subscriber on the name of a PendingQueue, and put its samples there until closed.
 
     In mode `every` it also requests retransmissions and answers acknowledgement requests.
     With `history` the first samples are the last message of each publisher.
     """
 
-    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue, *, history: bool = True) -> None:
+    def __init__(self, session: Session, pending_queue: PendingQueue, *, history: bool = True) -> None:
         self._session = session
-        self._queue = pending_queue
-        self._name = key_expr
+        self._queue, key_expr = pending_queue, pending_queue.name
         self._changing = threading.Lock()
         self._closed = False
         self._receiving = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
@@ -74,7 +73,7 @@ class Receiver:
                 links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
             self._undeclares += [queryable.undeclare, links.undeclare]
             self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
-            self._retransmission = Retransmission(session, key_expr, pending_queue)
+            self._retransmission = Retransmission(session, pending_queue)
         self._job = Job(self._poll)
         self._queue.on_gap = self._job.wake
 
@@ -138,7 +137,7 @@ class Receiver:
                 with self._receiving:
                     self._receive()
         except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
-            _log.exception("%s: unexpected error, subscription ended", self._name, extra=about("error"))
+            _log.exception("%s: unexpected error, subscription ended", self._queue.name, extra=about("error"))
             self._queue.end(f"unexpected {type(exc).__name__}: {exc}")
 
     def _receive(self, *, if_empty: bool = False) -> None:
@@ -172,7 +171,7 @@ class Receiver:
             self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
         except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
             extra = about("bug")
-            _log.exception("%s: unexpected error, %d samples discarded", self._name, len(batch), extra=extra)
+            _log.exception("%s: unexpected error, %d samples discarded", self._queue.name, len(batch), extra=extra)
             self._queue.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:

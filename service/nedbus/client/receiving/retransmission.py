@@ -34,11 +34,11 @@ _ANSWER_POLL: Final = 0.005  # s between polls for answers
 class Retransmission:
     """Send a queue's retransmission requests and collect the answers; a job of the I/O thread."""
 
-    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue) -> None:
+    def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
         self._session = session
         self._queue = pending_queue
         self._open: dict[WriterProxy, RetransmitRequest] = {}
-        self._take_heartbeats, self._undeclare = follow_heartbeats(session, key_expr)
+        self._take_heartbeats, self._undeclare = follow_heartbeats(session, pending_queue.name)
         self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
