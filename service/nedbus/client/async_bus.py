@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractAsyncContextManager
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
@@ -96,7 +97,7 @@ class AsyncBus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
-        open_receiver = partial(self._in_thread, bus._open_receiver, selection, pending_queue)
+        open_receiver = partial(self._in_thread, bus._open_receiver, pending_queue)
         return AsyncSubscription(open_receiver, pending_queue)
 
     @overload
@@ -184,7 +185,7 @@ def connect_async(
     return AsyncBus(lambda stop: Bus(load(), timeout=timeout, tls=tls, stop=stop))
 
 
-class AsyncPublisher:
+class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
     """A Publisher for asyncio; get one from `await bus.publisher(...)`.
 
     Attributes and errors are those of Publisher; all methods are awaited.
@@ -215,9 +216,6 @@ class AsyncPublisher:
     flush = _awaited(Publisher.flush)
     close = _awaited(Publisher.close)
     __aexit__ = _awaited(Publisher.__exit__)
-
-    async def __aenter__(self) -> Self:
-        return self
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         cancelled, flow_control = threading.Event(), self._blocking._flow_control

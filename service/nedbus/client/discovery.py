@@ -92,10 +92,18 @@ class VehicleDirectory:
         with self._lock:
             if self._tokens is None:
                 self._tokens = AliveTokens(session, self._selection.alive_key_expr(prefix=self._prefix))
-            self._poll(self._tokens)
-            while self._tokens.is_listing and time.monotonic() < end:
+            while True:
+                for key, alive in self._tokens.take():
+                    if not alive:
+                        self._addresses.pop(key, None)
+                        continue
+                    try:
+                        self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
+                    except AddressError:
+                        _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
+                if not self._tokens.is_listing or time.monotonic() >= end:
+                    break
                 time.sleep(_POLL)
-                self._poll(self._tokens)
             publishers = Publishers(self._addresses.values())
             publishers.complete = self._tokens.complete
             if self._tokens.is_listing and timeout and not self._logged:
@@ -103,16 +111,6 @@ class VehicleDirectory:
                 _log.warning(text, timeout, len(publishers), extra=about("incomplete"))
             self._logged = self._tokens.is_listing and (self._logged or timeout > 0)
             return publishers
-
-    def _poll(self, tokens: AliveTokens) -> None:
-        for key, alive in tokens.take():
-            if not alive:
-                self._addresses.pop(key, None)
-                continue
-            try:
-                self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
-            except AddressError:
-                _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,11 +35,4 @@ from .session import (
 )
 from .tls import Tls, check_pem
 from .write_probe import Verdict, probe_writes
-from .zenoh_ext import (
-    Heartbeats,
-    RetransmitRequest,
-    follow_heartbeats,
-    heartbeat_key,
-    heartbeat_payload,
-    request_samples,
-)
+from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload

@@ -84,12 +84,11 @@ def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]
     kept: list[RawSample] = []
     size = left_out = 0
     for sample in filter(None, (reply.ok for reply in wait_for_answers([ask(session, selector, timeout=timeout)]))):
-        new_size = size + len(sample.payload) + len(str(sample.key_expr))
-        if new_size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
+        size += len(sample.payload) + len(str(sample.key_expr))
+        if size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
             left_out += 1
         else:
             kept.append(sample)
-            size = new_size
     if left_out:
         text = "%s: %d answers left out, beyond the limits of a query"
         _log.warning(text, selector, left_out, extra=about("incomplete"))

@@ -11,6 +11,7 @@ Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatib
 import re
 import struct
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Self
 
 import xxhash
@@ -119,19 +120,13 @@ def node_token(domain: int, session: str, node: str) -> str:
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{node}"
 
 
-def publisher_token(key: TopicKey, session: str, node: str, entity: int) -> str:
-    """Return the liveliness token of a node's publisher, for ROS 2 to list its topic."""
-    return _endpoint_token("MP", key, session, node, entity)
-
-
-def subscription_token(key: TopicKey, session: str, node: str, entity: int) -> str:
-    """Return the liveliness token of a node's subscription, for publishers in ROS 2 to match."""
-    return _endpoint_token("MS", key, session, node, entity)
-
-
 def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:
     topic = "%" + key.topic.replace("/", "%")
     return f"@ros2_lv/{key.domain}/{session}/0/{entity}/{kind}/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
+
+
+publisher_token: Final = partial(_endpoint_token, "MP")  # of a node, for ROS 2 to list its topic
+subscription_token: Final = partial(_endpoint_token, "MS")  # of a node, for publishers in ROS 2 to match
 
 
 def px4_publishers_key_expr(domain: int | None) -> str:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from itertools import chain, repeat
 from typing import Final
 
@@ -42,28 +42,23 @@ MAX_REPLY_BYTES: Final = 2**18  # payload of a reply to a query: services split 
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
-_forked = False
+_forks: Final[list[None]] = []  # not empty in a process that was forked from one with sessions
 
 
 def is_forked() -> bool:
     """Return whether this process was forked from one with Zenoh sessions; Zenoh does not work in it."""
-    return _forked
+    return bool(_forks)
 
 
 def require_unforked() -> None:
     """Raise ForkError in a process that was forked from one with Zenoh sessions."""
-    if _forked:
+    if _forks:
         raise ForkError
 
 
 @cache
 def _watch_forks() -> None:
-    os.register_at_fork(after_in_child=_mark_forked)
-
-
-def _mark_forked() -> None:
-    global _forked  # noqa: PLW0603 - a process has one state
-    _forked = True
+    os.register_at_fork(after_in_child=partial(_forks.append, None))
 
 
 def open_session(config: zenoh.Config) -> Session:

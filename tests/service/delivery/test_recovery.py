@@ -19,7 +19,7 @@ from nedbus.client.io_thread import Job
 from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
-from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
+from nedbus.transport import RetransmitRequest, Session, open_client, open_router
 from tests.flights.first_message import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
@@ -38,7 +38,7 @@ def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> It
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         lossy = Lossy(session, queue, Receiver(session, queue), publisher)
-        monkeypatch.setattr(retransmission, "request_samples", lossy.ask)
+        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.ask)
         with lossy.subscription:
             wait_for_subscriber(publisher)
             yield lossy
@@ -62,9 +62,9 @@ def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pyte
     """Messages no longer in the publisher's cache are lost, after a second request."""
 
     def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> RetransmitRequest:
-        return request_samples(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
+        return RetransmitRequest(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
 
-    monkeypatch.setattr(retransmission, "request_samples", forget)
+    monkeypatch.setattr(retransmission, "RetransmitRequest", forget)
     lossy.queue.missing = {1, 2, 3, 4}
     lossy.publish(*range(6))
     samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]

@@ -176,7 +176,6 @@ class FlowControl:
         request.queries.add(ask(session, selector, timeout=timeout, priority=priority, congestion_control=_DROP))
 
     def _poll(self, now: float) -> None:
-        """Receive replies, and update readers and credit once the request has ended."""
         request, is_stale, self._polled = self._request, now - self._polled > _STALE_POLL, now
         if request is None or not request.poll(now):
             return

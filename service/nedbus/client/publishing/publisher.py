@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence, Set
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import zenoh
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
-class Publisher:
+class Publisher(AbstractContextManager["Publisher"]):
     """Publishes the messages of one address; get one from `bus.publisher(...)`.
 
     A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
@@ -160,14 +160,10 @@ class Publisher:
             with suppress(zenoh.ZError):  # the session is already closed
                 self._token.undeclare()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, exc: object, *_: object) -> None:
         self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
-        """Put the payload of a message; `provided` are the names of its fields that were provided."""
         require_unforked()
         encoding, is_whole = self._encoding, len(provided) == len(self._all)
         if not is_whole:

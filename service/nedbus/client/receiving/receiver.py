@@ -17,7 +17,7 @@ import zenoh
 
 from nedbus.client.closing import join_thread
 from nedbus.client.io_thread import TICK, Job
-from nedbus.client.protocol import CLOSED, read_parameters
+from nedbus.client.protocol import CLOSED
 from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
@@ -34,6 +34,7 @@ _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledge
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
 _BUSY_PAUSE: Final = 0.001  # s
+_MAX_DIGITS: Final = 10  # of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, enough for a busy machine
 _T = TypeVar("_T")
 
@@ -205,10 +206,11 @@ class Receiver:
 
     def _take_request(self, query: zenoh.Query) -> None:
         self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
-        parameters = read_parameters(query.parameters.get)
-        if parameters is not None:  # otherwise malformed: dropping the query ends it
-            key = str(query.key_expr)
-            request = AckRequest(key.removesuffix(ack_key("")), *parameters, partial(_reply, query, key, self._queue))
+        key, get = str(query.key_expr), query.parameters.get
+        publisher, number = get("publisher"), get("number") or ""
+        if publisher and number.isdecimal() and len(number) <= _MAX_DIGITS:  # otherwise dropping the query ends it
+            reply, stream_key = partial(_reply, query, key, self._queue), key.removesuffix(ack_key(""))
+            request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
             self._queue.acknowledge(request, drained=self._idle)
 
 

@@ -14,7 +14,7 @@ import zenoh
 from nedbus.client.io_thread import TICK
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats, request_samples
+from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats
 from nedbus_msgs import PAYLOAD_LIMIT
 
 from .pending_queue import CAPACITY, PendingQueue
@@ -65,7 +65,7 @@ class Retransmission:
                 if (numbers := self._queue.next_request(writer, now)) is not None:
                     key, name = writer.stream.wire_key, writer.name
                     with suppress(NedbusError):  # the session is closed
-                        self._open[writer] = request_samples(self._session, key, name, numbers, timeout=_TIMEOUT)
+                        self._open[writer] = RetransmitRequest(self._session, key, name, numbers, timeout=_TIMEOUT)
         return recovered_key, _ANSWER_POLL if self._open else _POLL
 
     def close(self) -> None:

@@ -215,7 +215,6 @@ class WriterProxy:
             stream.gap = 0
 
     def _release(self) -> None:
-        """Deliver messages held back, up to the next gap."""
         request = self.request
         if request is None:
             return
