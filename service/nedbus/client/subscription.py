@@ -28,8 +28,6 @@ _T = TypeVar("_T")
 
 
 class _SubscriptionBase(Generic[M_co]):
-    """State shared by both subscriptions: name, counts and queue."""
-
     def __init__(self, pending_queue: PendingQueue) -> None:
         self.name = pending_queue.name
         self._queue = pending_queue

@@ -29,10 +29,8 @@ class Answers:
     """The answers to one query, polled by the thread that sent it."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
-        self.ended = False
-        """True once the last answer was taken: every queryable has answered, or the timeout has passed."""
-        self.failed = False
-        """True once an answer was an error, such as a timeout."""
+        self.ended = False  # the last answer was taken: every queryable has answered, or the timeout has passed
+        self.failed = False  # an answer was an error, such as a timeout
         self._handler = handler
         self._end = time.monotonic() + timeout + _GRACE
 

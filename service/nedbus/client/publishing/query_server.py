@@ -92,17 +92,13 @@ class _Queryable:
     def _take_turn(self) -> None:
         end = time.monotonic() + _TURN
         with self._replying, suppress(zenoh.ZError):
-            while self._query is not None and not self._closed:
-                _answer(self._query, self._reply)
+            while (query := self._query) is not None and not self._closed:
+                key_expr = str(query.key_expr)  # not available after the query has ended
+                try:
+                    with query:
+                        self._reply(query)
+                except zenoh.ZError as exc:
+                    _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
+                except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
+                    _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))
                 self._query = self._take() if time.monotonic() < end else None
-
-
-def _answer(query: zenoh.Query, reply: Reply) -> None:
-    key_expr = str(query.key_expr)  # not available after the query has ended
-    try:
-        with query:
-            reply(query)
-    except zenoh.ZError as exc:
-        _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
-    except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
-        _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))

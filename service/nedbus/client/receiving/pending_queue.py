@@ -50,18 +50,14 @@ _SLOW: Final = "the reader is slower than the data: messages are dropped"
 
 @dataclass(slots=True, eq=False)
 class AckRequest:
-    """Request to acknowledge that message `number` has arrived or, with `read`, that the application has read it.
-
-    `reply` answers it and is called once.
-    `read_target`: number of samples to be read before answering; None until the message has arrived.
-    """
+    """Request to acknowledge that message `number` has arrived or, with `read`, that the application has read it."""
 
     key: str
     publisher: str
     number: int
     read: bool
-    reply: Callable[[], object]
-    read_target: int | None = None
+    reply: Callable[[], object]  # answers it, and is called once
+    read_target: int | None = None  # samples to be read before answering; None until the message has arrived
 
 
 class PendingQueue:
@@ -81,8 +77,7 @@ class PendingQueue:
         self.ended = False
         self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
-        self.on_wake: Callable[[], object] | None = None
-        """Called on any thread when a sample may be ready, to wake a reader on an event loop."""
+        self.on_wake: Callable[[], object] | None = None  # wakes a reader on an event loop; called on any thread
         self.name = name
         self.account = Account()
         self._warned: set[str] = set()
