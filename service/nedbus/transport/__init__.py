@@ -17,9 +17,8 @@ from .rmw_zenoh import (
     px4_publishers_key_expr,
     subscription_token,
 )
-from .router import open_router, read_router_config, router_endpoints
+from .router import RouterState, ask_routers, open_router, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals
-from .router_state import RouterState, ask_routers
 from .session import (
     LEASE,
     MAX_REPLY_BYTES,
