@@ -171,20 +171,18 @@ class LogStreamStatus(_FromPeer):
     @property
     def text(self) -> str:
         """All of it but the vehicle in one line; the reason and the file are text from a peer."""
-        parts = [self.state, self.reason] if self.reason else [self.state]
-        if self.received:
-            parts.append(f"{self.rate / 1000:.1f} KB/s")
-        if self.delay is not None:
-            parts.append(f"delay {self.delay * 1000:.0f} ms")
-        if self.header_time is not None:
-            parts.append(f"header {self.header_time:.1f} s")
-        if self.gaps:
-            parts.append(f"{self.gaps} gaps, {self.lost_at_least} to {self.lost_at_most} messages lost")
-        if self.undecodable:
-            parts.append(f"{self.undecodable} without a definition")
-        if self.saved:
-            parts.append(f"saved to {self.saved}")
-        return ", ".join(parts)
+        lost = f"{self.lost_at_least} to {self.lost_at_most} messages lost"
+        parts = (
+            self.state,
+            self.reason,
+            f"{self.rate / 1000:.1f} KB/s" if self.received else "",
+            "" if self.delay is None else f"delay {self.delay * 1000:.0f} ms",
+            "" if self.header_time is None else f"header {self.header_time:.1f} s",
+            f"{self.gaps} gaps, {lost}" if self.gaps else "",
+            f"{self.undecodable} without a definition" if self.undecodable else "",
+            f"saved to {self.saved}" if self.saved else "",
+        )
+        return ", ".join(filter(None, parts))
 
 
 @dataclass(frozen=True, slots=True)

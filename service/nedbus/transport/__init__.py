@@ -24,7 +24,6 @@ from .session import (
     MAX_REPLY_BYTES,
     RawSample,
     Session,
-    SourceInfo,
     entity_name,
     is_forked,
     open_client,

@@ -22,7 +22,6 @@ from .tls import Tls
 
 Session = zenoh.Session
 RawSample = zenoh.Sample
-SourceInfo = zenoh.SourceInfo
 
 LEASE: Final = 5.0  # s of silence after which a link is closed, as with a frozen host or a cut cable
 # Shared memory limits a router to 351 fewer sessions, and gains nothing at 244 bytes.

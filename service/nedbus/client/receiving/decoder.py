@@ -14,21 +14,10 @@ import zenoh
 
 from nedbus import clock
 from nedbus.client.sample import Sample
+from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
 from nedbus.transport import RawSample
-from nedbus_msgs import (
-    BY_TOPIC,
-    PAYLOAD_LIMIT,
-    Address,
-    AddressError,
-    Codec,
-    DecodeError,
-    Provenance,
-    UnknownLayoutError,
-    codec_of,
-    identity_of,
-    provenance_of,
-)
+from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, Address, Codec, Provenance, codec_of, identity_of, provenance_of
 
 from .layout_lookup import LayoutLookup
 
