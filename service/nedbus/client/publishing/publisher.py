@@ -16,7 +16,7 @@ from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, enco
 
 from .downsampler import Downsampler, MatchingListener
 from .flow_control import CACHE, FlowControl
-from .writer import Writer, priority_of
+from .writer import Writer
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
@@ -65,7 +65,7 @@ class Publisher(AbstractContextManager["Publisher"]):
             token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
             self._token = heartbeats.session.liveliness().declare_token(token)
         cache = CACHE if lossless else topic.kept
-        self._writer = Writer(heartbeats, self.key, priority=priority_of(topic), cache=cache, encoding=self._encoding)
+        self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
         self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=matched)
 

@@ -21,12 +21,13 @@ HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s from a last message until readers 
 
 
 class Writer:
-    """Puts payloads on one key, with a history cache of `cache` messages."""
+    """Puts payloads of one topic on one key, with a history cache of `cache` messages."""
 
     def __init__(
-        self, heartbeats: Heartbeats, key: str, *, priority: Priority, cache: int, encoding: str | None = None
+        self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: str | None = None
     ) -> None:
-        self.session, self.key, self.priority, self.published = heartbeats.session, key, priority, 0
+        self.session, self.key, self.published = heartbeats.session, key, 0
+        self.priority = Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
         self.last_put = 0.0  # monotonic time of the last message [s]
         self.is_silent = True  # since then a heartbeat has been sent, or there is no message yet
         self.silent_since, self.sent_heartbeats = 0.0, 0  # time of the last message [s], and heartbeats since then
@@ -40,7 +41,7 @@ class Writer:
                 key,
                 encoding=encoding,
                 congestion_control=zenoh.CongestionControl.DROP,
-                priority=priority,
+                priority=self.priority,
                 cache=zenoh.ext.CacheConfig(cache),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
             )
@@ -120,8 +121,3 @@ class Heartbeats:
             writer.sent_heartbeats += 1
             writer.heartbeat_due = now + _PAUSES[min(writer.sent_heartbeats, len(_PAUSES) - 1)]
         return min((writer.heartbeat_due for writer in tuple(self.writers)), default=math.inf) - now
-
-
-def priority_of(topic: Topic) -> Priority:
-    """Return the Zenoh priority for messages of a topic."""
-    return Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
