@@ -3,6 +3,7 @@
 import re
 import socket
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final
 
 from nedbus.errors import ConfigError
@@ -38,12 +39,10 @@ def explain_endpoints(endpoints: Sequence[str]) -> str | None:
     for parts in map(split_endpoint, endpoints):
         if parts is None:
             return None
-        try:
+        with suppress(OSError):
             socket.getaddrinfo(parts[1], None)
-        except OSError:
-            hosts.append(parts[1])
-        else:
             return None
+        hosts.append(parts[1])
     names = " and ".join(hosts)
     return f"cannot resolve {names}: correct the name, or give the IP address" if hosts else None
 

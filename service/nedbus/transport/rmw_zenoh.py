@@ -42,10 +42,8 @@ class TopicKey:
     @classmethod
     def parse(cls, key: str) -> Self:
         """Parse a key of rmw_zenoh; raise DecodeError for any other key."""
-        if len(key) > _MAX_KEY:
-            raise DecodeError(f"a key of {len(key)} characters")
-        found = _KEY.fullmatch(key)
-        if found is None or "//" in key:
+        found = _KEY.fullmatch(key) if len(key) <= _MAX_KEY and "//" not in key else None
+        if found is None:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
         return cls(int(found[1]), found[2], found[3], found[4])
 
