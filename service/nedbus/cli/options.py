@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.client import Bus, connect_with
+from nedbus.client import Bus
 from nedbus.errors import ArgumentError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, load_settings
@@ -144,12 +144,12 @@ def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> Bus:
     """Connect to the router; with `wait`, retry until it answers."""
     settings = _read_settings(**settings_options)
     try:
-        return connect_with(settings, timeout=1.0)
+        return Bus(settings, timeout=1.0)
     except ConnectError as exc:
         if not wait:
             raise
         write_stderr(f"{exc}; waiting")
-    return connect_with(settings, timeout=None)
+    return Bus(settings, timeout=None)
 
 
 def _select(

@@ -6,7 +6,7 @@ from nedbus.events import to_age
 from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
-from .bus import Bus, connect, connect_with
+from .bus import Bus, connect
 from .discovery import (
     LogStreamStatus,
     Publishers,

@@ -6,17 +6,18 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractAsyncContextManager
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, overload
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, cast, overload
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_client_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
+from nedbus_msgs import Definition, Message, Selection
 
-from .bus import Bus, connect_with
+from .bus import Bus
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
@@ -86,19 +87,9 @@ class AsyncBus:
     ) -> AsyncSubscription[M_co]: ...
     @overload
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
-    def subscribe(
-        self,
-        message: type[Message] | str = VehicleLocalPosition,
-        *,
-        topic: str | None = None,
-        vehicle: str | int = ANY,
-        instance: int | None = None,
-        mode: Mode = "latest",
-        max_rate: float | None = None,
-    ) -> AsyncSubscription[Any]:
+    def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens with the first wait."""
-        selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
-        return self.subscribe_to(selection, mode=mode, max_rate=max_rate)
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # it calls `subscribe_to`
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -106,7 +97,7 @@ class AsyncBus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
-        open_receiver = partial(self._in_thread, bus._open_receiver, selection, pending_queue)
+        open_receiver = partial(self._in_thread, bus._open_receiver, pending_queue)
         return AsyncSubscription(open_receiver, pending_queue)
 
     @overload
@@ -191,10 +182,10 @@ def connect_async(
 ) -> AsyncBus:
     """Return a bus for asyncio, opened with `async with`; arguments and errors as in `connect`."""
     load = partial(load_client_settings, config, connect=endpoint, prefix=prefix, tls=tls)
-    return AsyncBus(lambda stop: connect_with(load(), timeout=timeout, tls=tls, stop=stop))
+    return AsyncBus(lambda stop: Bus(load(), timeout=timeout, tls=tls, stop=stop))
 
 
-class AsyncPublisher:
+class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
     """A Publisher for asyncio; get one from `await bus.publisher(...)`.
 
     Attributes and errors are those of Publisher; all methods are awaited.
@@ -225,9 +216,6 @@ class AsyncPublisher:
     flush = _awaited(Publisher.flush)
     close = _awaited(Publisher.close)
     __aexit__ = _awaited(Publisher.__exit__)
-
-    async def __aenter__(self) -> Self:
-        return self
 
     async def _in_thread(self, call: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
         cancelled, flow_control = threading.Event(), self._blocking._flow_control

@@ -3,12 +3,12 @@
 import threading
 import weakref
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Self, Unpack, overload
+from typing import Any, Unpack, overload
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import AccountReport
@@ -31,13 +31,12 @@ from .protocol import LIVE
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .rate_gate import check_max_rate, rate_step
 from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
 
-class Bus:
+class Bus(AbstractContextManager["Bus"]):
     """A connection to a router, from `connect`.
 
     Topics are selected by message class or by name, vehicles by name, instances by number; "*" and None match any.
@@ -45,11 +44,17 @@ class Bus:
     Thread-safe. Methods raise AddressError for an invalid name, and ClosedError once the bus is closed.
     """
 
-    def __init__(self, session: Session, *, routers: Sequence[str], prefix: str, tls: Tls | None) -> None:
-        self.prefix = prefix
-        self.routers = tuple(routers)
-        self._tls = tls
-        self._zenoh = session
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        timeout: float | None,
+        tls: Tls | None = None,
+        stop: threading.Event | None = None,
+    ) -> None:
+        self.prefix, self.routers = settings.prefix, settings.routers
+        self._tls, prefix = tls or settings.tls, settings.prefix
+        self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(Selection(), prefix=prefix)
@@ -110,7 +115,7 @@ class Bus:
     ) -> Subscription[Any]:
         """Subscribe to a selection of addresses; see `subscribe`."""
         pending_queue = self._make_queue(selection, mode, max_rate)
-        receiver = self._open_receiver(selection, pending_queue)
+        receiver = self._open_receiver(pending_queue)
         return Subscription(receiver, pending_queue, owner=self)
 
     @overload
@@ -222,9 +227,6 @@ class Bus:
         finally:
             self._finalizer.close_now()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, exc: object, *_: object) -> None:
         self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
@@ -244,18 +246,14 @@ class Bus:
         decoder = Decoder(self._layouts, prefix=self.prefix)
         if max_rate is None:
             return PendingQueue(mode, decoder, name=selection.key_expr(prefix=self.prefix))
-        check_max_rate(max_rate)
-        name = selection.rate_key_expr(rate_step(max_rate), prefix=self.prefix)
-        return MaxRateQueue(mode, decoder, max_rate=max_rate, name=name)
+        return MaxRateQueue(mode, decoder, selection, max_rate=max_rate)
 
-    def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
+    def _open_receiver(self, pending_queue: PendingQueue) -> Receiver:
         """Open the receiver of a subscription; AsyncBus calls this in a thread."""
-        session, prefix = self._session, self.prefix
-        receiver: Receiver
         if isinstance(pending_queue, MaxRateQueue):
-            receiver = MaxRateReceiver(session, selection, pending_queue, prefix=prefix)
+            receiver: Receiver = MaxRateReceiver(self._session, pending_queue)
         else:
-            receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue)
+            receiver = Receiver(self._session, pending_queue)
         self._receivers.add(receiver)
         if self.closed:  # by another thread
             receiver.close()
@@ -281,20 +279,7 @@ def connect(
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
-    settings = load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls)
-    return connect_with(settings, timeout=timeout, tls=tls)
-
-
-def connect_with(
-    settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
-) -> Bus:
-    """Connect with these settings; `tls` overrides theirs. Errors as in `connect`.
-
-    Setting `stop` ends the wait for a router with ConnectError.
-    """
-    tls = tls or settings.tls
-    session = open_client(settings.routers, timeout=timeout, tls=tls, stop=stop)
-    return Bus(session, routers=settings.routers, prefix=settings.prefix, tls=tls)
+    return Bus(load_client_settings(config, connect=endpoint, prefix=prefix, tls=tls), timeout=timeout, tls=tls)
 
 
 def _close_all(receivers: Iterable[Receiver]) -> None:

@@ -91,10 +91,18 @@ class VehicleDirectory:
         with self._lock:
             if self._tokens is None:
                 self._tokens = AliveTokens(session, self._selection.alive_key_expr(prefix=self._prefix))
-            self._poll(self._tokens)
-            while self._tokens.is_listing and time.monotonic() < end:
+            while True:
+                for key, alive in self._tokens.take():
+                    if not alive:
+                        self._addresses.pop(key, None)
+                        continue
+                    try:
+                        self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
+                    except AddressError:
+                        _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
+                if not self._tokens.is_listing or time.monotonic() >= end:
+                    break
                 time.sleep(_POLL)
-                self._poll(self._tokens)
             publishers = Publishers(self._addresses.values())
             publishers.complete = self._tokens.complete
             if self._tokens.is_listing and timeout and not self._logged:
@@ -102,16 +110,6 @@ class VehicleDirectory:
                 _log.warning(text, timeout, len(publishers), extra=about("incomplete"))
             self._logged = self._tokens.is_listing and (self._logged or timeout > 0)
             return publishers
-
-    def _poll(self, tokens: AliveTokens) -> None:
-        for key, alive in tokens.take():
-            if not alive:
-                self._addresses.pop(key, None)
-                continue
-            try:
-                self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
-            except AddressError:
-                _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,20 +170,18 @@ class LogStreamStatus(_FromPeer):
     @property
     def text(self) -> str:
         """All of it but the vehicle in one line; the reason and the file are text from a peer."""
-        parts = [self.state, self.reason] if self.reason else [self.state]
-        if self.received:
-            parts.append(f"{self.rate / 1000:.1f} KB/s")
-        if self.delay is not None:
-            parts.append(f"delay {self.delay * 1000:.0f} ms")
-        if self.header_time is not None:
-            parts.append(f"header {self.header_time:.1f} s")
-        if self.gaps:
-            parts.append(f"{self.gaps} gaps, {self.lost_at_least} to {self.lost_at_most} messages lost")
-        if self.undecodable:
-            parts.append(f"{self.undecodable} without a definition")
-        if self.saved:
-            parts.append(f"saved to {self.saved}")
-        return ", ".join(parts)
+        lost = f"{self.lost_at_least} to {self.lost_at_most} messages lost"
+        parts = (
+            self.state,
+            self.reason,
+            f"{self.rate / 1000:.1f} KB/s" if self.received else "",
+            "" if self.delay is None else f"delay {self.delay * 1000:.0f} ms",
+            "" if self.header_time is None else f"header {self.header_time:.1f} s",
+            f"{self.gaps} gaps, {lost}" if self.gaps else "",
+            f"{self.undecodable} without a definition" if self.undecodable else "",
+            f"saved to {self.saved}" if self.saved else "",
+        )
+        return ", ".join(filter(None, parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,10 +354,10 @@ class Rejections:
     def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
         self._prefix = prefix
         self._owner = owner  # keeps the bus open
-        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_REPORTS)
         with while_open():
-            subscriber = session.declare_subscriber(f"{prefix}{REJECTED}/**", channel)
-        self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
+            reports = f"{prefix}{REJECTED}/**"
+            subscriber = session.declare_subscriber(reports, zenoh.handlers.RingChannel(_MAX_REPORTS))
+        self._handler = subscriber.handler
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
     def take(self) -> list[RejectionReport]:

@@ -5,8 +5,7 @@ from typing import Final
 
 from nedbus.errors import ArgumentError
 
-RATES: Final = (1, 2, 5, 10, 20, 50, 100)
-"""Rates [Hz] to which publishers downsample a stream, each on its own key."""
+RATES: Final = (1, 2, 5, 10, 20, 50, 100)  # Hz to which publishers downsample a stream, each on its own key
 
 
 class RateGate:

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, Generic, Self
 
@@ -28,8 +28,6 @@ _T = TypeVar("_T")
 
 
 class _SubscriptionBase(Generic[M_co]):
-    """State shared by both subscriptions: name, counts and queue."""
-
     def __init__(self, pending_queue: PendingQueue) -> None:
         self.name = pending_queue.name
         self._queue = pending_queue
@@ -51,7 +49,7 @@ class _SubscriptionBase(Generic[M_co]):
         return self._queue.waiting
 
 
-class Subscription(_SubscriptionBase[M_co]):
+class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription[M_co]"]):
     """Iterator over received samples; `bus.subscribe(...)` returns one.
 
     Iteration waits for the next sample and ends when the subscription or the bus is closed; it raises ReceiveError if
@@ -97,9 +95,6 @@ class Subscription(_SubscriptionBase[M_co]):
             return self._next(self._queue.pop)
         except ClosedError:
             raise StopIteration from None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -17,14 +17,12 @@ from .rmw_zenoh import (
     px4_publishers_key_expr,
     subscription_token,
 )
-from .router import open_router, read_router_config, router_endpoints
+from .router import RouterState, ask_routers, open_router, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals
-from .router_state import RouterState, ask_routers
 from .session import (
     MAX_REPLY_BYTES,
     RawSample,
     Session,
-    SourceInfo,
     entity_name,
     is_forked,
     open_client,
@@ -34,11 +32,4 @@ from .session import (
 )
 from .tls import UNKNOWN_AUTHORITY, Tls, check_pem
 from .write_probe import Verdict, probe_writes
-from .zenoh_ext import (
-    Heartbeats,
-    RetransmitRequest,
-    follow_heartbeats,
-    heartbeat_key,
-    heartbeat_payload,
-    request_samples,
-)
+from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload

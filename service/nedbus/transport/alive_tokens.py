@@ -70,7 +70,7 @@ class AliveTokens:
                 self._probe = self._ask_probe() if self._probe.failed else None
         changes: list[tuple[str, bool]] = []
         with suppress(zenoh.ZError):  # the session is closed
-            while len(changes) < _MAX_CHANGES and (sample := self._handler.try_recv()) is not None:
+            while len(changes) < _MAX_CHANGES and (sample := self._subscriber.handler.try_recv()) is not None:
                 changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
         has_room = len(self._keys) < MAX_ANSWERS and time.monotonic() >= self._retry
         if len(changes) == _MAX_CHANGES or has_room:  # further changes were dropped
@@ -83,10 +83,9 @@ class AliveTokens:
         return [change for change in changes if self._note(*change)]
 
     def _subscribe(self) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_CHANGES)
         with while_open():
-            self._subscriber = self._session.liveliness().declare_subscriber(self._key_expr, channel, history=True)
-        self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
+            declare = self._session.liveliness().declare_subscriber
+            self._subscriber = declare(self._key_expr, zenoh.handlers.RingChannel(_MAX_CHANGES), history=True)
         self._probe, self._unseen, self._retry = self._ask_probe(), self._keys.copy(), math.inf
 
     def _ask_probe(self) -> Answers:
@@ -109,7 +108,7 @@ class AliveTokens:
 
 def _ask(session: Session, key_expr: str, timeout: float) -> Answers:
     """Query matching tokens and return at once; each answer without an error holds one token."""
-    channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_MAX_WAITING)
     timeout = zenoh_timeout(timeout)
     with while_open():
-        return Answers(session.liveliness().get(key_expr, channel, timeout=timeout), timeout=timeout)
+        answers = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_WAITING), timeout=timeout)
+    return Answers(answers, timeout=timeout)

@@ -3,13 +3,12 @@
 import re
 import socket
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final
 
 from nedbus.errors import ConfigError
 
-DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-"""The default endpoint: `nedbus serve` listens on it, and clients connect to it."""
-
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"  # `nedbus serve` listens on it, and clients connect to it
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+"
 )
@@ -40,12 +39,10 @@ def explain_endpoints(endpoints: Sequence[str]) -> str | None:
     for parts in map(split_endpoint, endpoints):
         if parts is None:
             return None
-        try:
+        with suppress(OSError):
             socket.getaddrinfo(parts[1], None)
-        except OSError:
-            hosts.append(parts[1])
-        else:
             return None
+        hosts.append(parts[1])
     names = " and ".join(hosts)
     return f"cannot resolve {names}: correct the name, or give the IP address" if hosts else None
 

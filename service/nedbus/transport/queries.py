@@ -18,12 +18,8 @@ from .session import RawSample, Session, while_open
 
 _log = logging.getLogger(__name__)
 
-MAX_ANSWERS: Final = 10_000
-"""Answers accepted per query; honest peers send fewer."""
-
-MAX_ANSWER_BYTES: Final = 2**26
-"""Bytes of payloads and keys accepted per query."""
-
+MAX_ANSWERS: Final = 10_000  # accepted per query; honest peers send fewer
+MAX_ANSWER_BYTES: Final = 2**26  # payloads and keys accepted per query
 _MAX_WAITING: Final = 1024  # answers in the channel
 _GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
 _PAUSES: Final = (0.0005, 0.01)  # s between polls for answers: the first pause, and the longest
@@ -33,10 +29,8 @@ class Answers:
     """The answers to one query, polled by the thread that sent it."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
-        self.ended = False
-        """True once the last answer was taken: every queryable has answered, or the timeout has passed."""
-        self.failed = False
-        """True once an answer was an error, such as a timeout."""
+        self.ended = False  # the last answer was taken: every queryable has answered, or the timeout has passed
+        self.failed = False  # an answer was an error, such as a timeout
         self._handler = handler
         self._end = time.monotonic() + timeout + _GRACE
 
@@ -88,12 +82,11 @@ def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]
     kept: list[RawSample] = []
     size = left_out = 0
     for sample in filter(None, (reply.ok for reply in wait_for_answers([ask(session, selector, timeout=timeout)]))):
-        new_size = size + len(sample.payload) + len(str(sample.key_expr))
-        if new_size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
+        size += len(sample.payload) + len(str(sample.key_expr))
+        if size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
             left_out += 1
         else:
             kept.append(sample)
-            size = new_size
     if left_out:
         text = "%s: %d answers left out, beyond the limits of a query"
         _log.warning(text, selector, left_out, extra=about("incomplete"))

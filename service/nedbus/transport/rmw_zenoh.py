@@ -11,30 +11,23 @@ Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatib
 import re
 import struct
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Self
 
 import xxhash
 
 from nedbus_msgs import DecodeError
 
-NO_HASH: Final = "TypeHashNotSupported"
-"""The type hash in the keys of ROS 2 Humble, and of a PX4 built for it."""
-
-BRIDGED_ENCODING: Final = "application/cdr;nedbus"
-"""The encoding of messages that nedbus publishes to ROS 2, which must not be bridged back; ROS 2 ignores it."""
-
+NO_HASH: Final = "TypeHashNotSupported"  # in the keys of ROS 2 Humble, and of a PX4 built for it
+BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # of messages from nedbus, not to be bridged back; ROS 2 ignores it
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10: as PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
 _MAX_KEY: Final = 512  # characters; keys of PX4 and ROS 2 have up to half of it
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
-
-LONGEST_TOKEN: Final = 2 * _MAX_KEY
-"""Characters of the longest liveliness token accepted; those of ROS 2 are shorter."""
-
-PX4_TYPES: Final = "px4_msgs$*"
-"""The DDS types of PX4's messages and of its translation node, as a chunk of a key expression."""
+LONGEST_TOKEN: Final = 2 * _MAX_KEY  # characters; those of ROS 2 are shorter
+PX4_TYPES: Final = "px4_msgs$*"  # chunk of a key expression: the DDS types of PX4 and of its translation node
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +42,8 @@ class TopicKey:
     @classmethod
     def parse(cls, key: str) -> Self:
         """Parse a key of rmw_zenoh; raise DecodeError for any other key."""
-        if len(key) > _MAX_KEY:
-            raise DecodeError(f"a key of {len(key)} characters")
-        found = _KEY.fullmatch(key)
-        if found is None or "//" in key:
+        found = _KEY.fullmatch(key) if len(key) <= _MAX_KEY and "//" not in key else None
+        if found is None:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
         return cls(int(found[1]), found[2], found[3], found[4])
 
@@ -127,19 +118,13 @@ def node_token(domain: int, session: str, node: str) -> str:
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{node}"
 
 
-def publisher_token(key: TopicKey, session: str, node: str, entity: int) -> str:
-    """Return the liveliness token of a node's publisher, for ROS 2 to list its topic."""
-    return _endpoint_token("MP", key, session, node, entity)
-
-
-def subscription_token(key: TopicKey, session: str, node: str, entity: int) -> str:
-    """Return the liveliness token of a node's subscription, for publishers in ROS 2 to match."""
-    return _endpoint_token("MS", key, session, node, entity)
-
-
 def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:
     topic = "%" + key.topic.replace("/", "%")
     return f"@ros2_lv/{key.domain}/{session}/0/{entity}/{kind}/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
+
+
+publisher_token: Final = partial(_endpoint_token, "MP")  # of a node, for ROS 2 to list its topic
+subscription_token: Final = partial(_endpoint_token, "MS")  # of a node, for publishers in ROS 2 to match
 
 
 def px4_publishers_key_expr(domain: int | None) -> str:

@@ -1,4 +1,4 @@
-"""An embedded Zenoh router, with nedbus's settings or a configuration file of `zenohd`."""
+"""An embedded Zenoh router, with nedbus's settings or a configuration file of `zenohd`, and the states of routers."""
 
 import json
 import logging
@@ -7,6 +7,8 @@ import re
 import resource
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,6 +19,7 @@ from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
+from .queries import query
 from .session import COMMON_SETTINGS, Session, draw_retry, error_reason, insert_settings, open_session
 from .tls import Tls
 
@@ -25,6 +28,10 @@ _log = logging.getLogger(__name__)
 # Longer than the lease of clients: a router drops a silent client before that client joins another router. If two
 # routers have the same client for a moment, Zenoh 1.10.2 loses its queryables on a third router that joins later.
 _OTHER_FILES: Final = 100  # open files besides sessions: 21 of a router, and the sources and HTTP clients of a service
+_ADMIN_KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
+_MAX_ANSWER_BYTES: Final = 2**20  # about 5,700 sessions
+_MAX_SESSIONS: Final = 2**32  # greatest limit accepted from a router
+_MAX_ROUTERS: Final = 1000  # returned routers; any peer may claim to be one
 
 
 def open_router(
@@ -184,3 +191,49 @@ def _parse_config(path: Path) -> zenoh.Config:
         reason = message[1].replace("`", "'") if message else "not a Zenoh configuration"
         raise ConfigError.in_file(path, reason, line=line, column=column) from exc
     return config
+
+
+@dataclass(frozen=True, slots=True)
+class RouterState:
+    """A router: its Zenoh id, its open sessions, including those with other routers, and their limit.
+
+    `max_sessions`: None unless it is in `metadata` of the router's configuration; Zenoh reports it nowhere else.
+    """
+
+    zid: str
+    sessions: int
+    max_sessions: int | None
+
+    @property
+    def load(self) -> float | None:
+        """Open sessions divided by their limit, 1.0 when full; None if the limit is unknown."""
+        return None if self.max_sessions is None else self.sessions / self.max_sessions
+
+
+def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
+    """Return the state of each router that answers within `timeout` seconds, sorted by id.
+
+    A router is missing if its admin space is off or denied, or if its answer exceeds the message size of this session:
+    2**18 bytes for a client, about 1,400 sessions.
+    """
+    answers = query(session, "@/*/router", timeout=timeout)
+    small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
+    states = filter(None, (read_state(str(answer.key_expr), answer.payload.to_bytes()) for answer in small))
+    by_zid = {state.zid: state for state in states}
+    return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
+
+
+def read_state(key: str, payload: bytes) -> RouterState | None:
+    """Parse the state in an answer; return None if it is not a router's, as any peer may answer anything."""
+    found = _ADMIN_KEY.fullmatch(key)
+    try:
+        answer = json.loads(payload)
+    except (ValueError, RecursionError):
+        return None
+    sessions = answer.get("sessions") if isinstance(answer, dict) else None
+    if found is None or not isinstance(sessions, list):
+        return None
+    metadata = answer.get("metadata")
+    limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
+    is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # not a bool
+    return RouterState(found[1], len(sessions), limit if is_limit else None)

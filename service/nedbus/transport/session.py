@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from itertools import chain, repeat
 from typing import Final
 
@@ -23,7 +23,6 @@ from .tls import Tls
 
 Session = zenoh.Session
 RawSample = zenoh.Sample
-SourceInfo = zenoh.SourceInfo
 
 # Shared memory limits a router to 351 fewer sessions, and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
@@ -37,34 +36,27 @@ COMMON_SETTINGS: Final = {
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
 }
-MAX_REPLY_BYTES: Final = 2**18
-"""Largest payload of a reply to a query: services split what is longer, readers refuse it."""
-
+MAX_REPLY_BYTES: Final = 2**18  # payload of a reply to a query: services split what is longer, readers refuse it
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
-_forked = False
+_forks: Final[list[None]] = []  # not empty in a process that was forked from one with sessions
 
 
 def is_forked() -> bool:
     """Return whether this process was forked from one with Zenoh sessions; Zenoh does not work in it."""
-    return _forked
+    return bool(_forks)
 
 
 def require_unforked() -> None:
     """Raise ForkError in a process that was forked from one with Zenoh sessions."""
-    if _forked:
+    if _forks:
         raise ForkError
 
 
 @cache
 def _watch_forks() -> None:
-    os.register_at_fork(after_in_child=_mark_forked)
-
-
-def _mark_forked() -> None:
-    global _forked  # noqa: PLW0603 - a process has one state
-    _forked = True
+    os.register_at_fork(after_in_child=partial(_forks.append, None))
 
 
 def open_session(config: zenoh.Config) -> Session:

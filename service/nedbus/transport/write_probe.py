@@ -31,7 +31,6 @@ def probe_writes(
     """
     probe = f"@doctor/{secrets.token_hex(8)}"  # chunks with @ are not matched by a reader's `**`
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
-    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(len(keys) + _SPARE)
     missing = dict(keys)
 
     def receive() -> bool:
@@ -40,7 +39,8 @@ def probe_writes(
         return not missing
 
     with while_open():
-        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", channel)
+        room = len(keys) + _SPARE
+        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(room))
         # Dropped rather than undeclared: `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))
         # Zenoh's stubs call the status a bool; it is an object, always true.

@@ -7,18 +7,16 @@ language recover samples from nedbus's publishers, and nedbus's from any advance
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from typing import Final
 
 import zenoh
 
-from .queries import MAX_ANSWERS, Answers, ask
+from .queries import MAX_ANSWERS, ask
 from .session import RawSample, Session, entity_name, while_open
 
-Heartbeats = dict[tuple[str, str], int]
-"""The newest sequence number, by the key of a stream and the name of its publisher."""
+Heartbeats = dict[tuple[str, str], int]  # newest sequence number, by key of a stream and name of its publisher
 
 _MAX_HEARTBEATS: Final = 16_384  # in the channel
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
@@ -39,9 +37,9 @@ def heartbeat_payload(published: int) -> bytes:
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
     """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
-    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_HEARTBEATS)
     with while_open():
-        subscriber = session.declare_subscriber(f"{key_expr}/@adv/pub/**", channel)
+        key = f"{key_expr}/@adv/pub/**"
+        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_MAX_HEARTBEATS))
 
     def drain() -> Heartbeats:
         newest: Heartbeats = {}
@@ -58,44 +56,35 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
 
 @lru_cache(1024)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
-    """Return the stream and publisher in the key of a heartbeat, None for any other key."""
     found = _KEY.fullmatch(heartbeat)
     return None if found is None else (found[1], f"{found[2]}:{found[3]}")
 
 
-@dataclass(frozen=True, slots=True)
 class RetransmitRequest:
-    """A request for samples of one publisher by sequence number, and its answers; used by one thread."""
-
-    answers: Answers
-    key: str
-    publisher: str
-    numbers: range
-
-    @property
-    def ended(self) -> bool:
-        """True once the last answer was taken, or the timeout has passed."""
-        return self.answers.ended
-
-    def take(self) -> dict[int, RawSample]:
-        """Return the samples received since the last call, by sequence number."""
-        samples: dict[int, RawSample] = {}
-        for sample in filter(None, (reply.ok for reply in self.answers.take())):
-            info = sample.source_info
-            if info is None or info.source_sn not in self.numbers or str(sample.key_expr) != self.key:
-                continue
-            if entity_name(info.source_id) == self.publisher:
-                samples[info.source_sn] = sample
-        return samples
-
-
-def request_samples(session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> RetransmitRequest:
-    """Request samples from the cache of an advanced publisher by sequence number, and return at once.
+    """A request for samples in the cache of one advanced publisher by sequence number; used by one thread.
 
     `publisher`: its name from `entity_name`. The key has no wildcards, which lets a router look it up instead of
     matching it against the queryables of all publishers.
     """
-    selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
-    room = min(len(numbers), MAX_ANSWERS) + _SPARE
-    answers = ask(session, selector, timeout=timeout, room=room, accept_replies=zenoh.ReplyKeyExpr.ANY)
-    return RetransmitRequest(answers, key, publisher, numbers)
+
+    def __init__(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> None:
+        self._key, self._publisher, self._numbers = key, publisher, numbers
+        selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
+        room = min(len(numbers), MAX_ANSWERS) + _SPARE
+        self._answers = ask(session, selector, timeout=timeout, room=room, accept_replies=zenoh.ReplyKeyExpr.ANY)
+
+    @property
+    def ended(self) -> bool:
+        """True once the last answer was taken, or the timeout has passed."""
+        return self._answers.ended
+
+    def take(self) -> dict[int, RawSample]:
+        """Return the samples received since the last call, by sequence number."""
+        samples: dict[int, RawSample] = {}
+        for sample in filter(None, (reply.ok for reply in self._answers.take())):
+            info = sample.source_info
+            if info is None or info.source_sn not in self._numbers or str(sample.key_expr) != self._key:
+                continue
+            if entity_name(info.source_id) == self._publisher:
+                samples[info.source_sn] = sample
+        return samples

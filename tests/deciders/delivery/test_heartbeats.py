@@ -26,6 +26,9 @@ class FakeWriter:
     priority: zenoh.Priority | None = None
     last_put: float = 0.0
     is_silent: bool = True
+    silent_since: float = 0.0
+    sent_heartbeats: int = 0
+    heartbeat_due: float = math.inf
 
 
 class Stream:
@@ -36,7 +39,7 @@ class Stream:
         self.sent: list[tuple[float, bytes]] = []
         self.writer = FakeWriter()
         self.heartbeats = Heartbeats(cast("Session", self))
-        self.heartbeats.add(cast("Writer", self.writer))
+        self.heartbeats.writers.add(cast("Writer", self.writer))
 
         self.on_sent: Callable[[], object] = lambda: None
 
@@ -129,7 +132,7 @@ def test_heartbeat_has_the_number_of_the_last_message(stream: Stream) -> None:
     stream.publish()
     stream.wait(1.0)
     assert stream.sent[-1][1] == b"\0\0\0\0"
-    stream.heartbeats.remove(cast("Writer", stream.writer))
+    stream.heartbeats.writers.remove(cast("Writer", stream.writer))
     assert stream.wait(10.0) == []
 
 
@@ -137,7 +140,7 @@ def test_many_heartbeats_are_sent_in_turns(stream: Stream) -> None:
     """Publishers that fall silent at the same time do not delay the other jobs of the process."""
     writers = [FakeWriter(published=1, last_put=0.1) for _ in range(1000)]
     for each in writers:
-        stream.heartbeats.add(cast("Writer", each))
+        stream.heartbeats.writers.add(cast("Writer", each))
         stream.heartbeats.resume(cast("Writer", each))
     assert stream.heartbeats.send_due(0.4) > 0.0
     assert stream.heartbeats.send_due(0.5) <= 0.0

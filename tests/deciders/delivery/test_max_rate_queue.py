@@ -15,7 +15,7 @@ from nedbus.client.rate_gate import RATES, RateGate, check_max_rate, rate_step
 from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateQueue
 from nedbus.errors import ArgumentError
 from nedbus.transport import RawSample
-from nedbus_msgs import Address
+from nedbus_msgs import Address, Selection
 
 from .raw_samples import KEY, drain, put, raw, timestamps
 
@@ -24,7 +24,7 @@ DOWNSAMPLED = f"{KEY}/@rate/5"
 
 def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateQueue:
     """Return an empty queue."""
-    return MaxRateQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), max_rate=max_rate, name="queue")
+    return MaxRateQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), Selection(), max_rate=max_rate)
 
 
 class Clock:

@@ -160,10 +160,10 @@ def test_max_rate_downsamples_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clo
 @BOTH
 def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: Address) -> None:
     """A reader of mode `every` gets missing messages from the publisher's history cache, in order."""
-    publisher, queue = publisher_of(bus, address), LossyQueue()
+    publisher, queue = publisher_of(bus, address), LossyQueue(address.key())
     queue.missing = {1, 2, 3, 6}
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
-        receiver = Receiver(session, address.key(), queue)
+        receiver = Receiver(session, queue)
         with nedbus.Subscription[Any](receiver, queue, owner=None) as subscription:
             wait_for_reader(bus._session, address.key())
             for number in range(10):

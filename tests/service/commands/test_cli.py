@@ -14,7 +14,7 @@ import nedbus
 from nedbus.cli import follow
 from nedbus.cli.app import app
 from nedbus.cli.commands.pki import pki
-from nedbus.client import Subscription, connect_with
+from nedbus.client import Subscription
 from nedbus.settings import Settings
 from nedbus.timings import Timings
 from nedbus.transport import alive_tokens, open_router
@@ -204,9 +204,9 @@ def test_no_router_is_one_clear_line(command: str, monkeypatch: pytest.MonkeyPat
     """Exit 1, one line: where, for how long, what to do; a traceback only with --debug."""
 
     def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
-        return connect_with(settings, timeout=timeout / 10)
+        return nedbus.Bus(settings, timeout=timeout / 10)
 
-    monkeypatch.setattr("nedbus.cli.options.connect_with", connect_soon)
+    monkeypatch.setattr("nedbus.cli.options.Bus", connect_soon)
     where = free_endpoint()
     ended = run_command(command, "-c", where)
     assert ended.exit_code == 1

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import nedbus
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
-from nedbus.transport import RawSample, RetransmitRequest, Session, request_samples
+from nedbus.transport import RawSample, RetransmitRequest, Session
 
 from .publishing import publish, take
 
@@ -16,8 +16,8 @@ from .publishing import publish, take
 class LossyQueue(PendingQueue):
     """A queue that does not receive the messages `missing`, by sequence number."""
 
-    def __init__(self) -> None:
-        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
+    def __init__(self, key_expr: str) -> None:
+        super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name=key_expr)
         self.missing: Collection[int] = ()
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
@@ -44,7 +44,7 @@ class Lossy:
             return SimpleNamespace(ended=True, take=dict)
         self.open += 1
         self.most = max(self.most, self.open)
-        return Counted(request_samples(session, key, publisher, numbers, timeout=timeout), self)
+        return Counted(RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self)
 
 
 class Counted:

@@ -20,7 +20,7 @@ from nedbus.client.receiving import Receiver, pending_queue, retransmission
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.timings import Timings
-from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
+from nedbus.transport import RetransmitRequest, Session, open_client, open_router
 from tests.flights.first_message import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
@@ -36,10 +36,10 @@ KEY = f"nedbus/7/{VLP}"
 @pytest.fixture
 def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lossy]:
     """Subscribe to all vehicles, and wait until the publisher is matched."""
-    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue()
+    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
-        lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue), publisher)
-        monkeypatch.setattr(retransmission, "request_samples", lossy.ask)
+        lossy = Lossy(session, queue, Receiver(session, queue), publisher)
+        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.ask)
         with lossy.subscription:
             wait_for_subscriber(publisher)
             yield lossy
@@ -63,9 +63,9 @@ def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pyte
     """Messages no longer in the publisher's cache are lost, after a second request."""
 
     def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> RetransmitRequest:
-        return request_samples(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
+        return RetransmitRequest(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
 
-    monkeypatch.setattr(retransmission, "request_samples", forget)
+    monkeypatch.setattr(retransmission, "RetransmitRequest", forget)
     lossy.queue.missing = {1, 2, 3, 4}
     lossy.publish(*range(6))
     samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]
@@ -119,8 +119,8 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, wa
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
     foreign = raw.declare_subscriber(KEY, seen)
     wait_for_router(raw)
-    lossless = LossyQueue()
-    other = Receiver(lossy.session, KEY, lossless)
+    lossless = LossyQueue(KEY)
+    other = Receiver(lossy.session, lossless)
 
     def read() -> None:
         if waits == "without":
@@ -177,8 +177,8 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str)
             lossy.subscription.close()
         else:
             assert lossy.receive(3) == [0, 1, 2]
-        queue = LossyQueue()
-        other = Receiver(lossy.session, KEY, queue)
+        queue = LossyQueue(KEY)
+        other = Receiver(lossy.session, queue)
 
         def goes_on() -> bool:
             lossy.publish(7)

@@ -26,8 +26,7 @@ from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, read_router_config, router
-from nedbus.transport.router import allow_sessions
-from nedbus.transport.router_state import read_state
+from nedbus.transport.router import allow_sessions, read_state
 from tests.peers.certificates import CONFIG
 from tests.peers.certificates import write_config as write_shipped
 from tests.peers.ports import free_endpoint
@@ -174,7 +173,7 @@ def test_large_and_many_answers(endpoint: str, raw: Session, monkeypatch: pytest
         impostor.declare_queryable("@/*/router", answer)
         wait_for(lambda: len(ask_routers(raw, timeout=5.0)) == 21, what="the answers of the impostor")
         assert real.zid in {state.zid for state in ask_routers(raw, timeout=5.0)}
-        monkeypatch.setattr("nedbus.transport.router_state._MAX_ROUTERS", 5)
+        monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
         assert len(ask_routers(raw, timeout=5.0)) == 5
 
 

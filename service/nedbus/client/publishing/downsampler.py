@@ -14,9 +14,9 @@ import zenoh
 
 from nedbus.client.rate_gate import RATES, RateGate
 from nedbus.transport import Session, while_open
-from nedbus_msgs import ANY, Address, get_topic
+from nedbus_msgs import ANY, Address, Topic, get_topic
 
-from .writer import Heartbeats, Writer, priority_of
+from .writer import Heartbeats, Writer
 
 _CACHE: Final = 20  # s of messages in the history cache
 _LINGER: Final = 60_000_000_000  # ns that an unmatched writer is kept for readers that reconnect and recover messages
@@ -26,10 +26,10 @@ class MatchingListener:
     """Matching status of a key expression, from a publisher that never publishes. Thread-safe."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
         with while_open():
             self._probe = session.declare_publisher(key_expr)
-            self._listener = self._probe.declare_matching_listener(channel)  # reports the current status first
+            # It reports the current status first.
+            self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
         self._matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
         self._take = self._listener.handler.try_recv
@@ -60,7 +60,7 @@ class Downsampler:
     def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
         self.vehicle, self._heartbeats = vehicle, heartbeats
         self._key = partial(address.rate_key, prefix=prefix)
-        self._priority = priority_of(get_topic(address.topic))
+        self._topic = get_topic(address.topic)
         self._any_rate: MatchingListener | None = None
         self._streams: list[_Stream] = []
 
@@ -73,7 +73,7 @@ class Downsampler:
         now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
         is_matched = self._any_rate.is_matched()
         if is_matched and not self._streams:
-            self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._priority) for rate in RATES]
+            self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES]
         for stream in self._streams:
             if is_matched or stream.writer is not None:
                 stream.put(now, payload, stamp, encoding)
@@ -89,10 +89,10 @@ class Downsampler:
 class _Stream:
     """The stream of one rate; its writer exists while it is matched, and for another minute."""
 
-    def __init__(self, heartbeats: Heartbeats, key: str, rate: int, priority: zenoh.Priority) -> None:
+    def __init__(self, heartbeats: Heartbeats, key: str, rate: int, topic: Topic) -> None:
         self.writer: Writer | None = None
         self._listener = MatchingListener(heartbeats.session, key)
-        self._open = partial(Writer, heartbeats, key, priority=priority, cache=_CACHE * rate)
+        self._open = partial(Writer, heartbeats, key, topic, cache=_CACHE * rate)
         self._rate, self._gate = rate, RateGate(rate)
         self._matched_at = 0
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from zenoh import CongestionControl
 
-from nedbus.client.protocol import CLOSED, write_parameters
+from nedbus.client.protocol import CLOSED
 from nedbus.errors import ClosedError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
@@ -171,15 +171,12 @@ class FlowControl:
             self._request = _Request(published, self._routers(), read=read, now=now)
         request, writer = self._request, self._writer
         self._next_request = now + min(_RETRY_PAUSE + now - request.sent, _QUERY_TIMEOUT)
-        parameters = write_parameters(writer.name, (request.number - 1) % 2**32, read=request.read)
-        selector = f"{ack_key(writer.key)}?{parameters}"
-        query = ask(
-            writer.session, selector, timeout=_QUERY_TIMEOUT, priority=writer.priority, congestion_control=_DROP
-        )
-        request.queries.add(query)
+        number = (request.number - 1) % 2**32
+        selector = f"{ack_key(writer.key)}?publisher={writer.name};number={number};read={request.read:d}"
+        session, priority, timeout = writer.session, writer.priority, _QUERY_TIMEOUT
+        request.queries.add(ask(session, selector, timeout=timeout, priority=priority, congestion_control=_DROP))
 
     def _poll(self, now: float) -> None:
-        """Receive replies, and update readers and credit once the request has ended."""
         request, is_stale, self._polled = self._request, now - self._polled > _STALE_POLL, now
         if request is None or not request.poll(now):
             return

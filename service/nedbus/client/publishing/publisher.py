@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence, Set
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import zenoh
 
@@ -16,7 +16,7 @@ from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, enco
 
 from .downsampler import Downsampler, MatchingListener
 from .flow_control import CACHE, FlowControl
-from .writer import Writer, priority_of
+from .writer import Writer
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
-class Publisher:
+class Publisher(AbstractContextManager["Publisher"]):
     """Publishes the messages of one address; get one from `bus.publisher(...)`.
 
     A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
@@ -65,7 +65,7 @@ class Publisher:
             token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
             self._token = heartbeats.session.liveliness().declare_token(token)
         cache = CACHE if lossless else topic.kept
-        self._writer = Writer(heartbeats, self.key, priority=priority_of(topic), cache=cache, encoding=self._encoding)
+        self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
         self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=matched)
 
@@ -160,14 +160,10 @@ class Publisher:
             with suppress(zenoh.ZError):  # the session is already closed
                 self._token.undeclare()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, exc: object, *_: object) -> None:
         self.close(FLUSH_TIMEOUT if exc is None else 0.0)
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
-        """Put the payload of a message; `provided` are the names of its fields that were provided."""
         require_unforked()
         encoding, is_whole = self._encoding, len(provided) == len(self._all)
         if not is_whole:

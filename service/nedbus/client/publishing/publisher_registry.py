@@ -23,7 +23,7 @@ from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Select
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
 from .publisher import FLUSH_TIMEOUT, Publisher
-from .query_server import JSON, QueryServer, Reply
+from .query_server import JSON, QueryServer
 from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
@@ -88,10 +88,13 @@ class PublisherRegistry:
             publisher = self._publishers[address] = Publisher(
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
-            self._queries.answer(self._messages_of(vehicle), _weakly(self._reply, vehicle))
+            self._queries.answer(f"{self.prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
             # A key of its own: routers take quadratic time for one that all sessions declare.
             self._queries.answer(self._schema_key(ANY), partial(_reply_schemas, self._schema_key, self._definitions))
-            self._add_definition(definition)
+            self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
+            if len(self._definitions) > len(self._publishers) + _MAX_UNUSED:
+                used = {each.definition for each in self._publishers.values()}
+                del self._definitions[next(key for key, each in self._definitions.items() if each not in used)]
         return publisher
 
     def is_published(self, address: Address) -> bool:
@@ -157,27 +160,18 @@ class PublisherRegistry:
         with self._lock:
             self._publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self._publishers):
-                self._queries.end(self._messages_of(address.vehicle))
+                self._queries.end(f"{self.prefix}/{address.vehicle}/**")
                 self._matched.pop(address.vehicle).close()
                 del self._directories[address.vehicle]
 
-    def _messages_of(self, vehicle: str) -> str:
-        return f"{self.prefix}/{vehicle}/**"
 
-    def _add_definition(self, definition: Definition[Any]) -> None:
-        """Reply to queries for a definition, and no more to those for the oldest one without a publisher."""
-        self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
-        if len(self._definitions) > len(self._publishers) + _MAX_UNUSED:
-            used = {each.definition for each in self._publishers.values()}
-            del self._definitions[next(key for key, each in self._definitions.items() if each not in used)]
-
-    def _reply(self, vehicle: str, query: zenoh.Query) -> None:
-        """Reply with the last messages of a vehicle."""
-        for publisher in self.publishers:
-            matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
-            if matches and publisher.last is not None:
-                payload, stamp, encoding = publisher.last
-                query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
+def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:
+    """Reply with the last messages of a vehicle; the registry would else stay alive, and its bus."""
+    for publisher in found.publishers if (found := registry()) is not None else ():
+        matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
+        if matches and publisher.last is not None:
+            payload, stamp, encoding = publisher.last
+            query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
 
 
 def _reply_schemas(
@@ -188,9 +182,3 @@ def _reply_schemas(
     for (name, short), definition in tuple(definitions.items()):
         if wanted in (None, short) and query.key_expr.intersects(key_of(name)):
             query.reply(key_of(name), json.dumps({**definition.schema(), "hash": short}), encoding=JSON)
-
-
-def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:
-    """Return a reply function with a weak reference, so that it does not keep the registry and its bus alive."""
-    method = weakref.WeakMethod(reply)
-    return lambda query: alive(vehicle, query) if (alive := method()) is not None else None

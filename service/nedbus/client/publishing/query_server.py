@@ -23,8 +23,8 @@ JSON: Final = "application/json"
 
 _replies = CallThread("nedbus-replies")  # a report of many vehicles takes longer than the I/O thread may be held up
 
+# Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close.
 Reply = Callable[[zenoh.Query], object]
-"""Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close."""
 
 
 class QueryServer:
@@ -64,9 +64,8 @@ class QueryServer:
 
 class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
-            self._queryable = session.declare_queryable(key_expr, channel)
+            self._queryable = session.declare_queryable(key_expr, zenoh.handlers.RingChannel(_MAX_PENDING))
         self._take, self._reply = self._queryable.handler.try_recv, reply
         self._query: zenoh.Query | None = None  # to be replied to
         self._busy_until = 0.0
@@ -93,17 +92,13 @@ class _Queryable:
     def _take_turn(self) -> None:
         end = time.monotonic() + _TURN
         with self._replying, suppress(zenoh.ZError):
-            while self._query is not None and not self._closed:
-                _answer(self._query, self._reply)
+            while (query := self._query) is not None and not self._closed:
+                key_expr = str(query.key_expr)  # not available after the query has ended
+                try:
+                    with query:
+                        self._reply(query)
+                except zenoh.ZError as exc:
+                    _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
+                except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
+                    _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))
                 self._query = self._take() if time.monotonic() < end else None
-
-
-def _answer(query: zenoh.Query, reply: Reply) -> None:
-    key_expr = str(query.key_expr)  # not available after the query has ended
-    try:
-        with query:
-            reply(query)
-    except zenoh.ZError as exc:
-        _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
-    except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
-        _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -18,19 +17,21 @@ from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
 _TURN: Final = 256  # heartbeats per call, so that other jobs are not delayed
-HEARTBEAT: Final = _PAUSES[0] + 2 * TICK
-"""Maximum delay of the first heartbeat after the last message [s]; readers then detect that they missed it."""
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s from a last message until readers detect that they missed it, at most
 
 
 class Writer:
-    """Puts payloads on one key, with a history cache of `cache` messages."""
+    """Puts payloads of one topic on one key, with a history cache of `cache` messages."""
 
     def __init__(
-        self, heartbeats: Heartbeats, key: str, *, priority: Priority, cache: int, encoding: str | None = None
+        self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: str | None = None
     ) -> None:
-        self.session, self.key, self.priority, self.published = heartbeats.session, key, priority, 0
+        self.session, self.key, self.published = heartbeats.session, key, 0
+        self.priority = Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
         self.last_put = 0.0  # monotonic time of the last message [s]
         self.is_silent = True  # since then a heartbeat has been sent, or there is no message yet
+        self.silent_since, self.sent_heartbeats = 0.0, 0  # time of the last message [s], and heartbeats since then
+        self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a look at `last_put` [s]
         self._heartbeats = heartbeats
         with while_open():
             # Interconnected routers cache the route of a message only if something is declared on its exact key.
@@ -40,12 +41,12 @@ class Writer:
                 key,
                 encoding=encoding,
                 congestion_control=zenoh.CongestionControl.DROP,
-                priority=priority,
+                priority=self.priority,
                 cache=zenoh.ext.CacheConfig(cache),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
             )
             self.name = entity_name(self._publisher.id)
-            heartbeats.add(self)
+            heartbeats.writers.add(self)
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
         """Put a payload without waiting for readers; `encoding` overrides that of the writer."""
@@ -64,51 +65,31 @@ class Writer:
 
     def close(self) -> None:
         """Withdraw the key and the history cache. Idempotent."""
-        self._heartbeats.remove(self)
+        self._heartbeats.writers.discard(self)
         # This drops the only reference: undeclare() would wait for Zenoh while holding the interpreter's lock.
         self._publisher = None
         with suppress(zenoh.ZError):  # the session is already closed
             self._token.undeclare()
 
 
-@dataclass(slots=True)
-class _Silence:
-    """The silence of a writer since its message at monotonic time `since` [s]; the first one follows."""
-
-    key: str
-    since: float = 0.0
-    sent: int = 0  # heartbeats during this silence
-    due: float = math.inf  # monotonic time of the next heartbeat, or of a look at the writer [s]
-
-
 class Heartbeats:
-    """Sends the heartbeats of all writers of a session."""
+    """Sends the heartbeats of `writers`, all of a session; without readers they cost no traffic."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self._silences: dict[Writer, _Silence] = {}
+        self.writers: set[Writer] = set()
         self._job: Job | None = None
-
-    def add(self, writer: Writer) -> None:
-        """Send heartbeats of a writer, from its first message on; without readers they cost no traffic."""
-        self._silences[writer] = _Silence(heartbeat_key(writer.key, writer.name))
 
     def resume(self, writer: Writer) -> None:
         """End the silence of a writer, which has put a message."""
-        silence = self._silences.get(writer)
-        if silence is not None:
-            writer.is_silent, silence.due = False, writer.last_put + _PAUSES[0]
-            if self._job is None:
-                self._job = Job(self._run)
-            self._job.wake(silence.due)
-
-    def remove(self, writer: Writer) -> None:
-        """Stop the heartbeats of a writer. Idempotent."""
-        self._silences.pop(writer, None)
+        writer.is_silent, writer.heartbeat_due = False, writer.last_put + _PAUSES[0]
+        if self._job is None:
+            self._job = Job(self._run)
+        self._job.wake(writer.heartbeat_due)
 
     def close(self) -> None:
         """Stop all heartbeats. Idempotent."""
-        self._silences.clear()
+        self.writers.clear()
         if self._job is not None:
             self._job.end()
 
@@ -121,26 +102,22 @@ class Heartbeats:
     def send_due(self, now: float) -> float:
         """Send all heartbeats due at monotonic time `now` [s]; return the seconds until the next call."""
         left = _TURN
-        for writer, silence in tuple(self._silences.items()):
-            if silence.due > now or not left:
+        for writer in tuple(self.writers):
+            if writer.heartbeat_due > now or not left:
                 continue
             writer.is_silent = True  # before the look at its last message, so that the next one calls `resume`
-            if silence.since != writer.last_put:
-                silence.since, silence.sent = writer.last_put, 0
-                silence.due = silence.since + _PAUSES[0]
-            if silence.due > now:
+            if writer.silent_since != writer.last_put:
+                writer.silent_since, writer.sent_heartbeats = writer.last_put, 0
+                writer.heartbeat_due = writer.silent_since + _PAUSES[0]
+            if writer.heartbeat_due > now:
                 writer.is_silent = False
                 continue
             left -= 1
             payload, drop = heartbeat_payload(writer.published), zenoh.CongestionControl.DROP
             with suppress(zenoh.ZError):  # the session is closed
                 # Not from a publisher: Zenoh keeps a few kB for each that was declared, until the session closes.
-                self.session.put(silence.key, payload, congestion_control=drop, priority=writer.priority)
-            silence.sent += 1
-            silence.due = now + _PAUSES[min(silence.sent, len(_PAUSES) - 1)]
-        return min((silence.due for silence in tuple(self._silences.values())), default=math.inf) - now
-
-
-def priority_of(topic: Topic) -> Priority:
-    """Return the Zenoh priority for messages of a topic."""
-    return Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
+                key = heartbeat_key(writer.key, writer.name)
+                self.session.put(key, payload, congestion_control=drop, priority=writer.priority)
+            writer.sent_heartbeats += 1
+            writer.heartbeat_due = now + _PAUSES[min(writer.sent_heartbeats, len(_PAUSES) - 1)]
+        return min((writer.heartbeat_due for writer in tuple(self.writers)), default=math.inf) - now

@@ -14,22 +14,10 @@ import zenoh
 
 from nedbus import clock
 from nedbus.client.sample import Sample
+from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
 from nedbus.transport import RawSample
-from nedbus_msgs import (
-    BY_TOPIC,
-    PAYLOAD_LIMIT,
-    RATE,
-    Address,
-    AddressError,
-    Codec,
-    DecodeError,
-    Provenance,
-    UnknownLayoutError,
-    codec_of,
-    identity_of,
-    provenance_of,
-)
+from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, Provenance, codec_of, identity_of, provenance_of
 
 from .layout_lookup import LayoutLookup
 
@@ -48,34 +36,22 @@ _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 @dataclass(slots=True, eq=False)
 class KeyState:
-    """State of a key: address, codec, writer proxies and losses not yet reported.
+    """State of a key: address, codec, writer proxies and losses not yet reported."""
 
-    `key`: key of the full-rate stream. `wire_key`: key on which messages arrive, perhaps downsampled.
-    `codec`: None for messages without a file, whose definition each encoding identifies. `size`: bytes of its payload
-    with all fields, or -1. `encoding`: the last one, as Zenoh's object and as text.
-    `provenance`: the last one, with its encoding.
-    `writers`: writer proxies by name. `writer`: the one of the last message.
-    `heard`: monotonic time of the last message or heartbeat [s].
-    `gap`: messages lost before the next delivery. `unreported`: messages lost before one that was dropped or invalid;
-    the next sample read reports them.
-    With a maximum rate, `gate`: of a stream with a downsampled message so far. `last_sent`: time of sending of its last
-    message [ns], which was queued before.
-    """
-
-    key: str
-    wire_key: str
+    key: str  # of the full-rate stream
+    wire_key: str  # on which messages arrive, perhaps downsampled
     address: Address
-    codec: Codec[Any] | None = None
-    size: int = -1
-    encoding: tuple[object, str] = None, ""  # one tuple each, as two threads access it
-    provenance: tuple[str, Provenance] = "", Provenance()
-    writers: dict[str, WriterProxy] = field(default_factory=dict)
-    writer: WriterProxy | None = None
-    heard: float = 0.0
-    gap: int = 0
-    unreported: int = 0
-    gate: RateGate | None = None
-    last_sent: float = -math.inf
+    codec: Codec[Any] | None = None  # None for messages without a file, whose definition each encoding identifies
+    size: int = -1  # bytes of its payload with all fields
+    encoding: tuple[object, str] = None, ""  # the last one, as Zenoh's object and as text; two threads access it
+    provenance: tuple[str, Provenance] = "", Provenance()  # the last one, with its encoding
+    writers: dict[str, WriterProxy] = field(default_factory=dict)  # by name
+    writer: WriterProxy | None = None  # of the last message
+    heard: float = 0.0  # monotonic time of the last message or heartbeat [s]
+    gap: int = 0  # messages lost before the next delivery
+    unreported: int = 0  # messages lost before one that was dropped or invalid; the next sample read reports them
+    gate: RateGate | None = None  # with a maximum rate, once a downsampled message has arrived
+    last_sent: float = -math.inf  # with a maximum rate, time of sending of the last message, queued before [ns]
 
 
 class DetachedSample(NamedTuple):

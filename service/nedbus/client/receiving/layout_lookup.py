@@ -123,7 +123,12 @@ class LayoutLookup:
                 self._thread.start()
 
     def _run(self) -> None:
-        while asked := self._next():
+        while True:
+            with self._changed:
+                if self._closed or not self._open:
+                    self._thread = None
+                    return
+                asked = dict(islice(self._open.items(), _MAX_UNKNOWN))
             added: list[Wanted] = []
             try:
                 with suppress(NedbusError):  # the session is closed
@@ -132,15 +137,7 @@ class LayoutLookup:
             finally:
                 self._end(asked, added)
 
-    def _next(self) -> dict[Wanted, object]:
-        with self._changed:
-            if self._closed or not self._open:
-                self._thread = None
-                return {}
-            return dict(islice(self._open.items(), _MAX_UNKNOWN))
-
     def _end(self, asked: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
-        """End the lookups of a query, and pause if it had no result."""
         with self._changed:
             for wanted, asked_for in asked.items():
                 publisher = self._open.pop(wanted)
@@ -161,7 +158,6 @@ class LayoutLookup:
         return self._add_layout(name, which, fields) if isinstance(which, int) else self._define(name, which, fields)
 
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
-        """Define a message without a file."""
         if not self._make_room(len(fields) + _BASE):
             if not self._full:
                 _log.warning("%s: too many messages without a file: not read", name, extra=about("invalid"))
@@ -189,7 +185,6 @@ class LayoutLookup:
         return room >= size
 
     def _add_layout(self, name: str, number: int, fields: Mapping[str, str]) -> bool:
-        """Add a newer layout of a message."""
         definition, newer = MESSAGES[name], self._newer.get(name, {})
         if len(newer) >= _MAX_LAYOUTS:
             return False

@@ -13,7 +13,7 @@ from typing import Final
 import zenoh
 
 from nedbus.client.protocol import LIVE
-from nedbus.client.rate_gate import RateGate, rate_step
+from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
 from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
@@ -33,15 +33,16 @@ _OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a d
 
 
 class MaxRateQueue(PendingQueue):
-    """Queue at most `max_rate` messages per second and stream, a finite number above 0.
+    """Queue at most `max_rate` messages per second and stream, a finite number above 0, else raise ArgumentError.
 
     Messages omitted to keep the rate count neither as lost nor as dropped.
     """
 
-    def __init__(self, mode: Mode, decoder: Decoder, *, max_rate: float, name: str = "") -> None:
-        super().__init__(mode, decoder, name=name)
+    def __init__(self, mode: Mode, decoder: Decoder, selection: Selection, *, max_rate: float) -> None:
+        check_max_rate(max_rate)
         self.rate = rate_step(max_rate)  # requested from publishers
-        self._max_rate = max_rate
+        super().__init__(mode, decoder, name=selection.rate_key_expr(self.rate, prefix=decoder.prefix))
+        self.selection, self._max_rate = selection, max_rate
 
     def put_last(self, batch: Sequence[RawSample]) -> None:
         """Queue the last messages of streams that have delivered none yet."""
@@ -81,13 +82,12 @@ class MaxRateQueue(PendingQueue):
 class MaxRateReceiver(Receiver):
     """Put downsampled and last messages into a MaxRateQueue until closed."""
 
-    def __init__(self, session: Session, selection: Selection, queue: MaxRateQueue, *, prefix: str) -> None:
-        self._prefix, self._rate_queue = prefix, queue
+    def __init__(self, session: Session, queue: MaxRateQueue) -> None:
+        self._prefix, self._rate_queue, selection = queue.decoder.prefix, queue, queue.selection
         self._awaiting: dict[Address, float] = {}  # appearance of tokens without a downsampled message yet [s]
-        self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
-        self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
-        rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
-        super().__init__(session, rate_key_expr, queue, history=False)
+        self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=self._prefix))
+        self._last = ask(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
+        super().__init__(session, queue, history=False)
         self._undeclares.append(self._tokens.undeclare)
         self.pump()  # last messages bypass the ring, so no reader may block on it
 
@@ -102,7 +102,6 @@ class MaxRateReceiver(Receiver):
         return pause if self._last.ended else min(pause, _LAST_POLL)
 
     def _check_publishers(self, now: float) -> None:
-        """Warn about live streams without a downsampled message."""
         for token, alive in self._tokens.take():
             with suppress(AddressError):  # not a nedbus key
                 address = address_of_alive_key(token, prefix=self._prefix)

@@ -22,7 +22,7 @@ from nedbus import clock
 from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.errors import ArgumentError, ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
-from nedbus.transport import RawSample, SourceInfo, entity_name
+from nedbus.transport import RawSample, entity_name
 from nedbus_msgs import AddressError, DecodeError, identity_of
 
 from .decoder import WAKE_UP, Arrival, Decoder, KeyState, detach, encoding_of, mark_retained
@@ -33,24 +33,12 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-CAPACITY: Final = 65_536
-"""Samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped."""
-
-MAX_KEYS: Final = 10_000
-"""Keys that a reader follows, a bound on memory; beyond, those silent longest are forgotten, and counted."""
-
-MAX_SILENCE: Final = 600.0
-"""Seconds without a message or heartbeat after which the state of a key is freed where there are many keys."""
-
-KEPT_KEYS: Final = 1_000
-"""Keys that are remembered however long they are silent, so that the losses of a long outage are counted."""
-
-MAX_HELD: Final = 131_072
-"""Messages held back behind gaps, about 90 MB; beyond, gaps are given up."""
-
-MAX_ACK_REQUESTS: Final = 1000
-"""Pending acknowledgement requests; a well-behaved publisher has one per key."""
-
+CAPACITY: Final = 65_536  # samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped
+MAX_KEYS: Final = 10_000  # that a reader follows; beyond, those silent longest are forgotten, and counted
+MAX_SILENCE: Final = 600.0  # s without a message or heartbeat until a key is forgotten where there are many
+KEPT_KEYS: Final = 1_000  # that are remembered however long they are silent: losses of a long outage are counted
+MAX_HELD: Final = 131_072  # messages held back behind gaps, about 90 MB; beyond, gaps are given up
+MAX_ACK_REQUESTS: Final = 1000  # that are pending; a well-behaved publisher has one per key
 _MAX_BATCH: Final = 4096  # messages per batch
 _MAX_FRESH: Final = 1024  # samples queued along with Zenoh's receive buffer; later ones are detached from it
 _MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
@@ -62,18 +50,14 @@ _SLOW: Final = "the reader is slower than the data: messages are dropped"
 
 @dataclass(slots=True, eq=False)
 class AckRequest:
-    """Request to acknowledge that message `number` has arrived or, with `read`, that the application has read it.
-
-    `reply` answers it and is called once.
-    `read_target`: number of samples to be read before answering; None until the message has arrived.
-    """
+    """Request to acknowledge that message `number` has arrived or, with `read`, that the application has read it."""
 
     key: str
     publisher: str
     number: int
     read: bool
-    reply: Callable[[], object]
-    read_target: int | None = None
+    reply: Callable[[], object]  # answers it, and is called once
+    read_target: int | None = None  # samples to be read before answering; None until the message has arrived
 
 
 class PendingQueue:
@@ -81,7 +65,7 @@ class PendingQueue:
 
     It owns the state of all streams: key states, writer proxies, counters and unread messages, guarded by one lock.
     In mode `every`, messages behind a gap are held back until it is filled; in mode `latest` a gap is lost at once.
-    `name` appears in the log. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
+    `name`: its key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
     def __init__(
@@ -93,8 +77,7 @@ class PendingQueue:
         self.ended = False
         self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
-        self.on_wake: Callable[[], object] | None = None
-        """Called on any thread when a sample may be ready, to wake a reader on an event loop."""
+        self.on_wake: Callable[[], object] | None = None  # wakes a reader on an event loop; called on any thread
         self.name = name
         self.account = Account()
         self._warned: set[str] = set()
@@ -174,10 +157,12 @@ class PendingQueue:
             writer.on_retransmission(arrivals, ended=ended, now=now)
             return self._queue() > 0
 
-    def give_up(self) -> None:
-        """Count all gaps as lost and queue the messages held back."""
+    def give_up(self, max_held: int = -1) -> None:
+        """Count gaps as lost, largest reorder buffers first, until `max_held` messages are held back; -1: all gaps."""
         with self._lock:
-            self._give_up(-1)
+            for writer in sorted(self.account.requesting, key=lambda writer: -len(writer.held)):
+                if self.account.held > max_held:
+                    writer.give_up()
             self._queue()
 
     def acknowledge(self, *requests: AckRequest, drained: bool) -> None:
@@ -371,7 +356,12 @@ class PendingQueue:
             if info is not None:
                 source = info.source_id
                 if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than names
-                    writer = self._writer_of(stream, info, recovers=recovers)
+                    name = entity_name(source)
+                    writer = stream.writers.get(name)
+                    if writer is None:
+                        first = 0 if recovers and self._settling else info.source_sn
+                        writer = self._add_writer(stream, name, first, history_end=info.source_sn)
+                    stream.writer = writer
                     if writer is not None:
                         arrival = arrival if writer.eid is not None else mark_retained(arrival)
                         writer.zid, writer.eid = source.zid, source.eid
@@ -386,7 +376,7 @@ class PendingQueue:
             else:
                 writer.on_sample(number, arrival, recovers=recovers, overflowed=overflowed)
         if self.account.held > MAX_HELD:
-            self._give_up(MAX_HELD)
+            self.give_up(MAX_HELD)
         self._queue()
 
     def _are_in_order(self, arrivals: list[Arrival]) -> bool:
@@ -407,16 +397,6 @@ class PendingQueue:
         stream.heard = self._clock()
         return True
 
-    def _writer_of(self, stream: KeyState, info: SourceInfo, *, recovers: bool) -> WriterProxy | None:
-        """Return the writer proxy of a sample, a new one if needed; None if there is no room for it."""
-        name = entity_name(info.source_id)
-        writer = stream.writers.get(name)
-        if writer is None:
-            first = 0 if recovers and self._settling else info.source_sn
-            writer = self._add_writer(stream, name, first, history_end=info.source_sn)
-        stream.writer = writer
-        return writer
-
     def _add_writer(self, stream: KeyState, name: str, expected: int, *, history_end: int) -> WriterProxy | None:
         """Add a writer proxy, evicting one without a gap if necessary; None if all of its key have gaps."""
         if len(stream.writers) >= _MAX_WRITERS_OF_KEY:
@@ -428,12 +408,6 @@ class PendingQueue:
         writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, history_end=history_end)
         return writer
 
-    def _give_up(self, max_held: int) -> None:
-        """Give up gaps until `max_held` messages are held back, largest reorder buffers first; -1 gives up all."""
-        for writer in sorted(self.account.requesting, key=lambda writer: -len(writer.held)):
-            if self.account.held > max_held:
-                writer.give_up()
-
     # Unread messages
 
     def _queue(self) -> int:
@@ -442,7 +416,14 @@ class PendingQueue:
         self._arrived += len(arrivals)
         if self.newest_only:
             for arrival in arrivals:
-                self._supersede(arrival)
+                stream, payload, raw, lost, received = arrival
+                if (waiting := self._newest.get(stream.key)) is not None:
+                    self.account.dropped += 1
+                    self._newest[stream.key] = stream, payload, raw, lost + waiting[3], received
+                    continue
+                if len(self._newest) >= MAX_KEYS:
+                    self._drop(self._newest.pop(next(iter(self._newest))))
+                self._newest[stream.key] = arrival
             return len(arrivals)
         every = self._every
         every.extend(map(detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
@@ -450,16 +431,6 @@ class PendingQueue:
             self._drop(every.popleft())
             self._warn_once(_SLOW)
         return len(arrivals)
-
-    def _supersede(self, arrival: Arrival) -> None:
-        stream, payload, raw, lost, received = arrival
-        waiting = self._newest.get(stream.key)
-        if waiting is not None:
-            self.account.dropped += 1
-            arrival = stream, payload, raw, lost + waiting[3], received
-        elif len(self._newest) >= MAX_KEYS:
-            self._drop(self._newest.pop(next(iter(self._newest))))
-        self._newest[stream.key] = arrival
 
     def _drop(self, arrival: Arrival) -> None:
         stream, _, _, lost, _ = arrival

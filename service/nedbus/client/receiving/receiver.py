@@ -17,7 +17,7 @@ import zenoh
 
 from nedbus.client.closing import join_thread
 from nedbus.client.io_thread import TICK, Job
-from nedbus.client.protocol import CLOSED, read_parameters
+from nedbus.client.protocol import CLOSED
 from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
@@ -28,40 +28,39 @@ from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
 
-RING_CAPACITY: Final = 16_384
-"""Samples that fit between two polls; more than 0.2 s of traffic of the largest fleet."""
-
+RING_CAPACITY: Final = 16_384  # samples between two polls; more than 0.2 s of traffic of the largest fleet
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
 _BUSY_PAUSE: Final = 0.001  # s
+_MAX_DIGITS: Final = 10  # of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, enough for a busy machine
 _T = TypeVar("_T")
 
 
 class Receiver:
-    """Declare an advanced subscriber and put its samples into a PendingQueue until closed.
+    """Declare an advanced subscriber on the name of a PendingQueue, and put its samples there until closed.
 
     In mode `every` it also requests retransmissions and answers acknowledgement requests.
     With `history` the first samples are the last message of each publisher.
     """
 
-    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue, *, history: bool = True) -> None:
+    def __init__(self, session: Session, pending_queue: PendingQueue, *, history: bool = True) -> None:
         self._session = session
-        self._queue = pending_queue
-        self._name = key_expr
+        self._queue, key_expr = pending_queue, pending_queue.name
         self._changing = threading.Lock()
         self._closed = False
         self._receiving = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
         self._idle = False  # the holder is blocked on an empty ring
         self._busy = False
         self._pump: threading.Thread | None = None
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         with while_open():
-            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                session, key_expr, zenoh.handlers.RingChannel(RING_CAPACITY), history=last
+            )
         # Receive on the handler: a blocking receive on the subscriber prevents undeclaring it.
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
         self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
@@ -70,7 +69,12 @@ class Receiver:
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
         if not pending_queue.newest_only:
-            self._declare_every()
+            with while_open():
+                queryable = session.declare_queryable(ack_key(key_expr), zenoh.handlers.RingChannel(MAX_ACK_REQUESTS))
+                links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
+            self._undeclares += [queryable.undeclare, links.undeclare]
+            self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
+            self._retransmission = Retransmission(session, pending_queue)
         self._job = Job(self._poll)
         self._queue.on_gap = self._job.wake
 
@@ -126,16 +130,6 @@ class Receiver:
         if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
             self._receiving.release()
 
-    def _declare_every(self) -> None:
-        requests: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
-        events: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
-        with while_open():
-            queryable = self._session.declare_queryable(ack_key(self._name), requests)
-            links = self._session.info.declare_transport_events_listener(events, history=False)
-        self._undeclares += [queryable.undeclare, links.undeclare]
-        self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
-        self._retransmission = Retransmission(self._session, self._name, self._queue)
-
     def _run(self) -> None:
         try:
             while not self._queue.ended:
@@ -144,13 +138,13 @@ class Receiver:
                 with self._receiving:
                     self._receive()
         except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
-            _log.exception("%s: unexpected error, subscription ended", self._name, extra=about("error"))
+            _log.exception("%s: unexpected error, subscription ended", self._queue.name, extra=about("error"))
             self._queue.end(f"unexpected {type(exc).__name__}: {exc}")
 
     def _receive(self, *, if_empty: bool = False) -> None:
         """Wait for a sample and drain the ring into the queue; end the queue if the subscriber is gone.
 
-        With `if_empty`, return at once if the queue already has a sample; if one is added later, `_wake` ends the wait.
+        With `if_empty`, return at once if the queue already has a sample; if one is added later, `_poll` ends the wait.
         """
         handler = self._handler
         self._idle = True
@@ -178,7 +172,7 @@ class Receiver:
             self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
         except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
             extra = about("bug")
-            _log.exception("%s: unexpected error, %d samples discarded", self._name, len(batch), extra=extra)
+            _log.exception("%s: unexpected error, %d samples discarded", self._queue.name, len(batch), extra=extra)
             self._queue.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:
@@ -191,19 +185,12 @@ class Receiver:
             self._queue.acknowledge(drained=True)
         recovered_key, pause = self._retransmission.poll(now, drained=drained)
         if recovered_key:
-            self._wake(recovered_key)
-        return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
-
-    def _wake(self, key: str) -> None:
-        """Wake the reader; if it is blocked on the ring, put a session-local sample on one of its keys.
-
-        Nothing else ends a blocking receive from Zenoh's ring. The decoder discards the sample.
-        """
-        self._queue.wake()
-        if self._idle:
-            with suppress(zenoh.ZError):  # the session is closed
+            self._queue.wake()
+            if self._idle:  # only a session-local sample, which the decoder discards, ends a blocking receive
                 here = zenoh.Locality.SESSION_LOCAL
-                self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
+                with suppress(zenoh.ZError):  # the session is closed
+                    self._session.put(recovered_key, b"", encoding=WAKE_UP, allowed_destination=here)
+        return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
     def _take_events(self) -> None:
         """Handle link changes, which must precede the samples received since, and acknowledgement requests."""
@@ -219,10 +206,11 @@ class Receiver:
 
     def _take_request(self, query: zenoh.Query) -> None:
         self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
-        parameters = read_parameters(query.parameters.get)
-        if parameters is not None:  # otherwise malformed: dropping the query ends it
-            key = str(query.key_expr)
-            request = AckRequest(key.removesuffix(ack_key("")), *parameters, partial(_reply, query, key, self._queue))
+        key, get = str(query.key_expr), query.parameters.get
+        publisher, number = get("publisher"), get("number") or ""
+        if publisher and number.isdecimal() and len(number) <= _MAX_DIGITS:  # otherwise dropping the query ends it
+            reply, stream_key = partial(_reply, query, key, self._queue), key.removesuffix(ack_key(""))
+            request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
             self._queue.acknowledge(request, drained=self._idle)
 
 

@@ -14,7 +14,7 @@ import zenoh
 from nedbus.client.io_thread import TICK
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats, request_samples
+from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats
 from nedbus_msgs import PAYLOAD_LIMIT
 
 from .pending_queue import CAPACITY, PendingQueue
@@ -26,7 +26,7 @@ _MAX_OPEN: Final = 64  # requests in flight
 _MAX_OPEN_HISTORY: Final = 16  # of these, requests to publishers that have delivered no message yet
 _MAX_OPEN_OF_KEY: Final = 4  # of these, requests on one key, whose publishers may never answer
 _MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, answers would push out others, and requests pause
-_REQUEST_TIMEOUT: Final = 3.0  # s
+_TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
 
@@ -34,11 +34,11 @@ _ANSWER_POLL: Final = 0.005  # s between polls for answers
 class Retransmission:
     """Send a queue's retransmission requests and collect the answers; a job of the I/O thread."""
 
-    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue) -> None:
+    def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
         self._session = session
         self._queue = pending_queue
         self._open: dict[WriterProxy, RetransmitRequest] = {}
-        self._take_heartbeats, self._undeclare = follow_heartbeats(session, key_expr)
+        self._take_heartbeats, self._undeclare = follow_heartbeats(session, pending_queue.name)
         self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
@@ -60,8 +60,12 @@ class Retransmission:
             for writer in list(self._queue.account.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
-                if writer not in self._open and self._has_room(writer):
-                    self._send_request(writer, now)
+                if writer in self._open or not self._has_room(writer):
+                    continue
+                if (numbers := self._queue.next_request(writer, now)) is not None:
+                    key, name = writer.stream.wire_key, writer.name
+                    with suppress(NedbusError):  # the session is closed
+                        self._open[writer] = RetransmitRequest(self._session, key, name, numbers, timeout=_TIMEOUT)
         return recovered_key, _ANSWER_POLL if self._open else _POLL
 
     def close(self) -> None:
@@ -90,11 +94,3 @@ class Retransmission:
         if writer.history_end:
             return len(share) < _MAX_OPEN_HISTORY
         return sum(each.stream is writer.stream for each in share) < _MAX_OPEN_OF_KEY
-
-    def _send_request(self, writer: WriterProxy, now: float) -> None:
-        numbers = self._queue.next_request(writer, now)
-        if numbers is None:
-            return
-        with suppress(NedbusError):  # the session is closed
-            key = writer.stream.wire_key
-            self._open[writer] = request_samples(self._session, key, writer.name, numbers, timeout=_REQUEST_TIMEOUT)

@@ -14,12 +14,8 @@ from nedbus.transport import MAX_ANSWERS
 
 from .decoder import Arrival, KeyState, detach
 
-NUMBERS: Final = 2**32
-"""Zenoh's sequence numbers wrap here."""
-
-MAX_GAP: Final = 2**30
-"""Largest gap; a larger step means that the publisher restarted or the message is late."""
-
+NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
+MAX_GAP: Final = 2**30  # a larger step means that the publisher restarted or the message is late
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
 _MAX_REORDERED: Final = 2**16  # a number lower by up to this is late or a duplicate; beyond, the publisher restarted
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
@@ -27,61 +23,45 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the las
 
 @dataclass(slots=True, eq=False)
 class Account:
-    """Counters and open gaps of a subscription, which its queue owns and its writer proxies update.
-
-    `dropped`: by a full ring or queue. `discarded`: duplicates and late messages. `forgotten`: keys beyond the limit.
-    `held`: messages held back behind gaps. `delivered`: messages to be queued, in order.
-    `requesting`: writers with a gap, least recently requested first. `opened`: gaps so far.
-    """
+    """Counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
 
     lost: int = 0
-    dropped: int = 0
-    discarded: int = 0
-    forgotten: int = 0
-    held: int = 0
-    opened: int = 0
-    delivered: list[Arrival] = field(default_factory=list)
-    requesting: dict[WriterProxy, None] = field(default_factory=dict)
+    dropped: int = 0  # by a full ring or queue
+    discarded: int = 0  # duplicates and late messages
+    forgotten: int = 0  # keys beyond the limit
+    held: int = 0  # messages held back behind gaps
+    opened: int = 0  # gaps so far
+    delivered: list[Arrival] = field(default_factory=list)  # to be queued, in order
+    requesting: dict[WriterProxy, None] = field(default_factory=dict)  # with a gap, least recently requested first
 
 
 @dataclass(slots=True, eq=False)
 class Request:
-    """Retransmission request to one publisher; times in monotonic seconds.
+    """Retransmission request to one publisher; times in monotonic seconds."""
 
-    `stop`: one past the highest number known to be sent. `requested`: numbers of the open query. `deadline`: the gap is
-    lost then; each delivery resets it. `first_available`: lowest number answered; the publisher caches everything from
-    there on. `last_answered`: the highest requested number was answered. `probe`: number to request again; an answer
-    proves that `candidate` is the lowest number in the publisher's cache.
-    """
-
-    stop: int
+    stop: int  # one past the highest number known to be sent
     due: float = 0.0
-    deadline: float | None = None
+    deadline: float | None = None  # the gap is lost then; each delivery resets it
     attempts: int = 0
-    requested: range | None = None
-    first_available: int | None = None
-    last_answered: bool = False
-    probe: int | None = None
+    requested: range | None = None  # numbers of the open query
+    first_available: int | None = None  # lowest number answered; the publisher caches everything from there on
+    last_answered: bool = False  # the highest requested number was answered
+    probe: int | None = None  # number to request again; an answer proves that `candidate` is the lowest in the cache
     candidate: int | None = None
 
 
 @dataclass(slots=True, eq=False)
 class WriterProxy:
-    """One publisher on one key; not thread-safe.
-
-    `name`: `zid` and `eid` combined; these two are set by the first message. `expected`: the next number.
-    `history_end`: lower numbers may predate the subscription and do not count as lost; 0 after the first delivery.
-    `unresponsive`: it left a request unanswered; later gaps get a single attempt.
-    """
+    """One publisher on one key; not thread-safe."""
 
     stream: KeyState
-    name: str
-    expected: int
+    name: str  # `zid` and `eid` combined
+    expected: int  # the next number
     account: Account
-    zid: object = None
+    zid: object = None  # this and the next are set by the first message
     eid: int | None = None
-    history_end: int = 0
-    unresponsive: bool = False
+    history_end: int = 0  # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
+    unresponsive: bool = False  # it left a request unanswered; later gaps get a single attempt
     request: Request | None = None
     held: dict[int, Arrival] = field(default_factory=dict)
 
@@ -195,7 +175,6 @@ class WriterProxy:
         self.request.stop = max(self.request.stop, stop)
 
     def _count_gap(self, number: int, *, overflowed: bool = False) -> None:
-        """Count the gap before `number`, the next one to deliver."""
         certain = max(self.expected, min(self.history_end, number))
         lost = (number - certain) % NUMBERS
         if overflowed:
@@ -219,7 +198,6 @@ class WriterProxy:
             stream.gap = 0
 
     def _release(self) -> None:
-        """Deliver messages held back, up to the next gap."""
         request = self.request
         if request is None:
             return
