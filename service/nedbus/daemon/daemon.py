@@ -16,7 +16,7 @@ from nedbus.errors import ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
-from nedbus.sources import LiveSource
+from nedbus.sources import ReplaySource
 from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
@@ -236,7 +236,9 @@ class Daemon:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
                     # Heartbeats tell readers of the last message, in case they missed it.
-                    speeds = [worker.source.speed for worker in finite if not isinstance(worker.source, LiveSource)]
+                    speeds = [
+                        worker.source.options.speed for worker in finite if isinstance(worker.source, ReplaySource)
+                    ]
                     self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return

@@ -6,7 +6,7 @@ from typing import Final
 
 from nedbus.errors import ConfigError
 from nedbus.settings import Settings, locate_setting, locate_source
-from nedbus.sources import LiveSource, Source, parse_source
+from nedbus.sources import ReplaySource, Source, parse_source
 from nedbus.transport import dial_endpoint
 
 _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
@@ -54,4 +54,4 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
 
 def is_finite(source: Source) -> bool:
     """Return True if a source ends by itself."""
-    return not isinstance(source, LiveSource) and source.finite
+    return isinstance(source, ReplaySource) and source.finite

@@ -180,7 +180,7 @@ class Worker:
                 _log.exception("%s: unexpected error", self._name, extra=about("retrying", source=self._name))
                 self._fail(_describe(exc))
             else:
-                if isinstance(self.source, LiveSource) or not self.source.loop:
+                if isinstance(self.source, LiveSource) or self.source.finite:
                     self._end("failed" if self._error else "done", self._error)
                     return
                 failures = 0
@@ -197,7 +197,7 @@ class Worker:
             failures += 1
 
     def _run_replay(self, source: ReplaySource) -> None:
-        run, last = source.open(), self._run
+        run, last, speed = source.open(), self._run, source.options.speed
         if last is None or last.summary != run.summary:
             _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
             self._warned.clear()
@@ -205,18 +205,18 @@ class Worker:
             run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that come later
         self._warn(run)
         self._run, self._done = run, 0
-        if source.wait and last is None:
+        if source.options.wait and last is None:
             self._state = "waiting"
             _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
             while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
                 pass
         self._output.release(keep=run.addresses)
-        self._output.claim_all(run, lossless=source.speed is None)
+        self._output.claim_all(run, lossless=speed is None)
         self._set_state("running")
         start = self._clock.now()
         for message in run.messages:
-            if source.speed is not None:
-                early = start + message.due / source.speed - self._clock.now()
+            if speed is not None:
+                early = start + message.due / speed - self._clock.now()
                 if early < -_MAX_DELAY:
                     extra = about("late", source=self._name)
                     _log.warning("%s: %.1f s late, shifting the schedule", self._name, -early, extra=extra)
@@ -226,8 +226,8 @@ class Worker:
             if self._clock.stopped:
                 return
             # A lossless publisher may wait for its readers.
-            self._turn = None if source.speed is None else self._clock.now()
-            self._output.publish_replay(message, lossless=source.speed is None)
+            self._turn = None if speed is None else self._clock.now()
+            self._output.publish_replay(message, lossless=speed is None)
             self._turn = None
             self._done += 1
         self._warn(run)

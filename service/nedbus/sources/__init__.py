@@ -5,4 +5,4 @@ from .conversion import convert
 from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 from .mavlink.link import Link, open_link, parse_link
 from .mavlink.senders import Senders, why_ignored
-from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
+from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage

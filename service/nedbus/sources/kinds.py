@@ -1,8 +1,9 @@
 """Table of source kinds, and parser for sources: `KIND:TARGET?OPTION=VALUE&...`, or a TOML table."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Final, cast
 from urllib.parse import parse_qsl, unquote, urlencode
@@ -15,12 +16,12 @@ from nedbus.recording import find_format, format_of
 from nedbus.transport import Tls
 
 from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, SimulatorOptions
-from .source import Source, SourceContext
+from .source import LiveSource, ReplaySource, Source
 
 
 @dataclass(frozen=True, slots=True)
 class SourceKind:
-    """One kind of source: its options, its target, and its class, which is imported on first use.
+    """One kind of source: its options, its target, and its function or class, which is imported on first use.
 
     `target`: name of the part after the colon; None without one, in brackets if it is optional.
     `extra`: the extra of nedbus that it requires.
@@ -29,7 +30,7 @@ class SourceKind:
     options: type[Options]
     target: str | None
     module: str
-    class_name: str
+    name: str
     extra: str = ""
 
     def accepts(self, target: str) -> bool:
@@ -38,10 +39,10 @@ class SourceKind:
 
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
-    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator.source", "SimulatorSource"),
-    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
-    "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "McapSource", "mcap"),
-    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "TlogSource", "mavlink"),
+    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator.source", "open_simulator"),
+    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "open_ulog"),
+    "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "open_mcap", "mcap"),
+    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "open_tlog", "mavlink"),
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
@@ -66,8 +67,10 @@ class SourceSpec:
         # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
             raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one first")
-        make = cast("Callable[..., Source]", getattr(needs(kind.extra, kind.module), kind.class_name))
-        return make(self.target, self.options, SourceContext(vehicle, routers, tls))
+        make = getattr(needs(kind.extra, kind.module), kind.name)
+        if isinstance(self.options, RecordedOptions | SimulatorOptions):
+            return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
+        return cast("LiveSource", make(self.target, self.options, vehicle, routers, tls))
 
 
 def parse_source(source: str | Mapping[str, object]) -> SourceSpec:

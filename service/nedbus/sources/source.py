@@ -1,12 +1,14 @@
 """The two kinds of sources, replay and live, and the messages they yield."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from nedbus.client import LogStreamStatus
-from nedbus.transport import Session, Tls
+from nedbus.transport import Session
 from nedbus_msgs import Address, Definition
+
+from .options import RecordedOptions, SimulatorOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,33 +90,20 @@ class ReplayRun:
 
 
 @dataclass(frozen=True, slots=True)
-class SourceContext:
-    """Settings of the service that runs a source.
-
-    `vehicle`: the name for sources that set none.
-    `routers`: endpoints of the service's router; `tls`: the files to connect to them.
-    """
-
-    vehicle: str
-    routers: tuple[str, ...] = ()
-    tls: Tls | None = None
-
-
-class ReplaySource(Protocol):
+class ReplaySource:
     """A source that can be replayed, once or repeatedly.
 
-    `finite`: it ends by itself; `loop`: it restarts at its end; `wait`: it waits for a subscriber before it starts.
-    `speed`: factor of real time; None for as fast as readers receive, without loss.
+    `open`: opens it for one run; raises SourceError if it cannot be opened or has no messages.
     """
 
-    finite: bool
-    loop: bool
-    wait: bool
-    speed: float | None
+    options: RecordedOptions | SimulatorOptions
+    open: Callable[[], ReplayRun]
 
-    def open(self) -> ReplayRun:
-        """Open it for one run; raise SourceError if it cannot be opened or has no messages."""
-        ...
+    @property
+    def finite(self) -> bool:
+        """True if it ends by itself."""
+        options = self.options
+        return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
 
 @runtime_checkable

@@ -13,7 +13,7 @@ from nedbus.client import LogStreamStatus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
-from nedbus.sources.source import Rejection, SourceContext, SourceMessage
+from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.transport import Session
 from nedbus.ulog import SPOKEN
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -44,7 +44,7 @@ class MavlinkSource:
     Validity is approximated from ESTIMATOR_STATUS, as LOCAL_POSITION_NED is sent even while it is invalid.
     """
 
-    def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
+    def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
         parse_link(link)
         known = {SPOKEN.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):

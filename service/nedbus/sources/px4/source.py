@@ -9,8 +9,8 @@ from typing import Any, Final
 from nedbus.errors import ConfigError, ConnectError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.source import Absence, Rejection, SourceContext, SourceMessage
-from nedbus.transport import Session, check_endpoints, open_client
+from nedbus.sources.source import Absence, Rejection, SourceMessage
+from nedbus.transport import Session, Tls, check_endpoints, open_client
 from nedbus_msgs import Definition, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
 
 from .node import Px4ZenohNode
@@ -22,17 +22,19 @@ _CONNECT_TIMEOUT: Final = 0.5  # s; the service must be able to stop within 1 s,
 
 
 class Px4ZenohSource:
-    """All publishers of px4_msgs at a router: the service's own, or another one."""
+    """All publishers of px4_msgs at a router: the service's own, which has the endpoints `routers`, or another one."""
 
-    def __init__(self, endpoint: str, options: Px4ZenohOptions, context: SourceContext) -> None:
+    def __init__(
+        self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
+    ) -> None:
         if endpoint:
             check_endpoints([endpoint], where="px4-zenoh")
-        self._endpoints = (endpoint,) if endpoint else context.routers
-        self._is_own = not endpoint or endpoint in context.routers
-        self._tls = context.tls
+        self._endpoints = (endpoint,) if endpoint else routers
+        self._is_own = not endpoint or endpoint in routers
+        self._tls = tls
         self._options = options
         self._given = _read_definitions(options.msg)
-        self._vehicle = options.vehicle or context.vehicle
+        self._vehicle = options.vehicle or vehicle
         self._name = f"px4-zenoh:{' or '.join(self._endpoints)}"
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
