@@ -7,7 +7,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Final, Literal
 
 from nedbus import clock
@@ -21,12 +20,13 @@ from nedbus.transport import Session, Uplinks, open_client, open_router, read_ro
 from nedbus_msgs import status_key
 
 from .plan import Planned, is_finite, plan_sources
-from .worker import SourceMeasures, Worker, apply_plan, stop_workers
+from .worker import SourceMeasures, Worker, stop_workers
 from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s for sources to stop at shutdown
+_RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _POLL: Final = 1.0  # s between two polls of silent streams and of the link
 _RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
 
@@ -151,11 +151,9 @@ class Daemon:
             self._settings, self._plan = settings, plan
             if self._registry is None:
                 return "no source is running yet"
-            before, make_worker = self._workers, partial(self._make_worker, self._registry)
-            self._workers = apply_plan(plan, before, make_worker)
+            before, kept = len(self._workers), self._apply_plan(self._registry)
         self._changed.set()
-        kept = len(set(before).intersection(self._workers))
-        return f"{len(plan) - kept} started, {len(before) - kept} stopped, {kept} unchanged"
+        return f"{len(plan) - kept} started, {before - kept} stopped, {kept} unchanged"
 
     def run(self) -> bool:
         """Publish until done or stopped; return False if a source has failed.
@@ -171,7 +169,7 @@ class Daemon:
             queries.answer_json(status_key(self.id, prefix=settings.prefix), self._answer)
             with self._planning:
                 self._registry = registry
-                self._workers = apply_plan(self._plan, self._workers, partial(self._make_worker, registry))
+                self._apply_plan(registry)
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
             self._wait(registry, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
@@ -185,15 +183,28 @@ class Daemon:
                 self._permission.close()
         return not any(source.state == "failed" for source in self.sources)
 
-    def _make_worker(self, registry: PublisherRegistry, planned: Planned) -> Worker:
-        return Worker(
-            planned,
-            registry,
-            router=self._session if self.role == "router" else None,
-            account=self.account,
-            retry=not self.until_done,
-            on_end=self._changed.set,
-        )
+    def _apply_plan(self, registry: PublisherRegistry) -> int:
+        """Start new sources and stop removed ones, in the order of the plan; return the number of unchanged ones."""
+        left, ordered, new = list(self._workers), list[Worker](), list[Worker]()
+        router = self._session if self.role == "router" else None
+        for planned in self._plan:
+            worker = next((each for each in left if each.planned == planned), None)
+            if worker is not None:
+                left.remove(worker)
+            else:
+                retry, on_end = not self.until_done, self._changed.set
+                worker = Worker(planned, registry, router=router, account=self.account, retry=retry, on_end=on_end)
+                new.append(worker)
+            ordered.append(worker)
+        stop_workers(left, _RETIRE_TIMEOUT, release=True)
+        for worker in left:
+            if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
+                text = "%s: still stopping after %.0f s, maybe because of a slow reader"
+                _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
+        for worker in new:  # after the others have stopped: they may use the same addresses
+            worker.thread.start()
+        self._workers = ordered
+        return len(ordered) - len(new)
 
     def _make_plan(self, settings: Settings) -> list[Planned]:
         """Open the sources of these settings; raise ConfigError for the first mistake, with its location."""
@@ -236,10 +247,10 @@ class Daemon:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
                     # Heartbeats tell readers of the last message, in case they missed it.
-                    speeds = [
-                        worker.source.options.speed for worker in finite if isinstance(worker.source, ReplaySource)
-                    ]
-                    self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
+                    is_paced = any(
+                        isinstance(each.source, ReplaySource) and each.source.options.speed for each in finite
+                    )
+                    self._stop.wait(2 * HEARTBEAT if is_paced else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
             self._changed.wait(_POLL)

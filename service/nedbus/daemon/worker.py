@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
@@ -25,7 +25,6 @@ _MIN_RUN: Final = 0.1  # s, minimum of a looped run: a log of one message must n
 _MAX_DELAY: Final = 1.0  # s: a replay that is later than this shifts its schedule instead of catching up
 _STALE_POLL: Final = 0.5  # s between two checks for stale streams
 _READER_POLL: Final = 0.05  # s between two checks for a reader
-_RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _MAX_STREAMS: Final = 100  # in a status, which must fit into one message
 
 _Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
@@ -285,27 +284,6 @@ class Worker:
 
 def _describe(error: BaseException) -> str:
     return f"unexpected {type(error).__name__}: {error}"
-
-
-def apply_plan(
-    plan: Iterable[Planned], workers: Sequence[Worker], make_worker: Callable[[Planned], Worker]
-) -> list[Worker]:
-    """Start new sources, stop removed ones, and return the workers in the order of the plan."""
-    left, ordered = list(workers), []
-    for planned in plan:
-        same = next((worker for worker in left if worker.planned == planned), None)
-        if same is not None:
-            left.remove(same)
-        ordered.append(same or make_worker(planned))
-    stop_workers(left, _RETIRE_TIMEOUT, release=True)
-    for worker in left:
-        if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
-            text = "%s: still stopping after %.0f s, maybe because of a slow reader"
-            _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
-    for worker in ordered:  # after the others have stopped: they may use the same addresses
-        if worker not in workers:
-            worker.thread.start()
-    return ordered
 
 
 def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:
