@@ -14,10 +14,10 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection
 
 from .fields import is_reboot
+from .link import AUTOPILOT, Peer
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Reassembly
 from .reader import LinkReader, Received
-from .senders import AUTOPILOT, Peer
 
 _KINDS: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
 _MAX_WAITING: Final = 16_384  # messages read ahead; more are lost, as the sequence numbers of both protocols show

@@ -8,9 +8,8 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources.source import Rejection
 
-from .link import Link
+from .link import Link, Peer, why_ignored
 from .log_reassembly import Piece
-from .senders import Peer, why_ignored
 
 _MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
 

@@ -19,11 +19,10 @@ from nedbus.ulog import SPOKEN
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
-from .link import Link, open_link, parse_link
+from .link import AUTOPILOT, Link, Peer, Senders, open_link, parse_link
 from .log_receiver import LogReceiver
 from .log_stream import LogStream
 from .reader import LinkReader, Received
-from .senders import AUTOPILOT, Peer, Senders
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -102,7 +101,11 @@ class _LinkSession:
                     log.log_changes(now)
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
-                self._send_heartbeat()
+                # Routers and vehicles send only to components that they know.
+                kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
+                heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
+                for peer in {self._link.peer} - {None} or set(self._peers.values()):
+                    self._send(heartbeat, peer)
             if now >= next_status:
                 next_status = now + _STATUS_INTERVAL
                 for system, log in self._logs.items():
@@ -155,14 +158,6 @@ class _LinkSession:
                 parameters = [number, 1e6 / rate if rate else 0, 0, 0, 0, 0, 0]
                 message = dialect.MAVLink_command_long_message(system, AUTOPILOT, command, 0, *parameters)
                 self._send(message, self._peers[system])
-
-    def _send_heartbeat(self) -> None:
-        """Announce this component: routers and vehicles send only to components that they know."""
-        heartbeat = dialect.MAVLink_heartbeat_message(
-            dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
-        )
-        for peer in {self._link.peer} - {None} or set(self._peers.values()):
-            self._send(heartbeat, peer)
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread that reads the link acknowledges its data
