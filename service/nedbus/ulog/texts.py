@@ -11,7 +11,7 @@ from nedbus_msgs import field_type
 
 from .event_metadata import MAX_PACKED, Event, EventMetadata
 from .layout import PayloadField, PayloadLayout
-from .records import Data, LoggedText, MultiInformation, Record, Subscription
+from .records import Data, Information, LoggedText, Record, Subscription
 
 _FORM: Final = struct.Struct("<QB127s")
 _FIELDS: Final = (("timestamp", "uint64", 0), ("severity", "uint8", 8), ("text", "char[127]", 9))
@@ -91,7 +91,7 @@ class Texts:
         """Return the statement that a record completes, None if there is none or it is a repetition."""
         if isinstance(record, LoggedText):
             return None if self._is_said(record) else record
-        if isinstance(record, MultiInformation) and record.key == "metadata_events" and isinstance(record.value, bytes):
+        if isinstance(record, Information) and record.key == "metadata_events" and isinstance(record.value, bytes):
             if self._metadata is None and not self.problem:  # the first metadata hold
                 self._packed = ((self._packed if record.continued else b"") + record.value)[:MAX_PACKED]
         elif isinstance(record, Data) and record.subscription.name == "event":
