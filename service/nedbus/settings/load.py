@@ -1,8 +1,10 @@
-"""Load settings from a file, the environment and flags, each overriding the previous one."""
+"""Load settings from a TOML file, the environment and flags, each overriding the previous one; locate mistakes."""
 
 import difflib
 import logging
 import os
+import re
+import tomllib
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -16,12 +18,13 @@ from nedbus.log_event import about
 from nedbus.transport import Tls
 
 from .model import Settings, split_sources, split_values
-from .toml_file import find_key, find_source, read_text, read_toml
 
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
 _MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters from which a variable counts as the beginning of a setting's name
+
+_Place = tuple[int | None, int | None]  # line and column, counted from 1; None if unknown
 
 
 def load_settings(
@@ -60,7 +63,7 @@ def find_mistakes(
     path, content = None, dict[str, object]()
     try:
         path = _settings_file(file)
-        content = read_toml(path) if path and needed != set() else {}
+        content = _read_toml(path) if path and needed != set() else {}
         content = {name: value for name, value in content.items() if needed is None or name in needed}
     except ConfigError as exc:
         mistakes.append(exc)
@@ -84,7 +87,7 @@ def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
     path, setter = settings._file, settings.set_by(name) or name
     if path is None or setter != str(path):
         return ConfigError(setter, reason)
-    line, column = find_key(read_text(path), name)
+    line, column = _find_key(_read_text(path), name)
     return ConfigError.in_file(path, reason, line=line, column=column)
 
 
@@ -93,7 +96,7 @@ def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigE
     setter = settings.set_by("source")
     if settings._file is None or setter != str(settings._file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
-    line, column = find_source(read_text(settings._file), settings.source, index, error.key)
+    line, column = _find_source(_read_text(settings._file), settings.source, index, error.key)
     return ConfigError.in_file(settings._file, str(error), line=line, column=column)
 
 
@@ -155,3 +158,57 @@ def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
     return locate_setting(settings, name, reason)
+
+
+def _read_text(path: Path) -> str:
+    """Return the text of a file without a byte order mark; raise ConfigError if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as exc:
+        raise ConfigError.in_file(path, "not UTF-8 text") from exc
+    except OSError as exc:
+        raise ConfigError.in_file(path, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    """Parse a file; raise ConfigError with line and column."""
+    text = _read_text(path)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
+        reason = re.sub(r" \(at .*\)", "", str(exc))
+        if position is None:  # "at end of document"
+            lines = text.splitlines() or [""]
+            raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
+        raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
+
+
+def _find_key(text: str, name: str) -> _Place:
+    """Return line and column of a key or a table, which TOML parsers do not keep."""
+    found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
+    return place_at(text, found.start(1)) if found else (None, None)
+
+
+def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Place:
+    """Return line and column of the source with this index, a table or a text in a list, or of one of its options."""
+    source = sources[index]
+    headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
+    if not isinstance(source, str) and index < len(headers):
+        start = headers[index].start(1)
+        end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
+        option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
+        return place_at(text, start + option.start(1) if option else start)
+    if isinstance(source, str):
+        found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
+        before = sources[:index].count(source)
+        if before < len(found):
+            return place_at(text, found[before])
+    return _find_key(text, "source")
+
+
+def place_at(text: str, start: int) -> _Place:
+    """Return line and column of an index into a text; unknown for a negative index, as from `str.find`."""
+    if start < 0:
+        return None, None
+    return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)
