@@ -140,7 +140,8 @@ class SourceOutput:
             fields.setdefault("timestamp", None)  # else invalid: it is never this host's
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
-            self._reject_invalid(message, _rule_of(exc), exc.reason)
+            field, violation = exc.violations[0]
+            self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)  # without values
             return
         self.durations.add(time.perf_counter() - start)
         self.published += 1
@@ -289,9 +290,3 @@ def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
 
 def _time_of(message: SourceMessage) -> int:
     return cast("int", message.fields.get("timestamp", 0))
-
-
-def _rule_of(error: InvalidMessageError) -> str:
-    """Return the first violated rule: the field, and the rule without values."""
-    field, rule = error.violations[0]
-    return f"{field}: {rule.partition(' (')[0]}"

@@ -1,7 +1,8 @@
 """The options of each kind of source, as Pydantic models."""
 
+import re
 from collections.abc import Collection, Mapping, Set
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
@@ -29,12 +30,6 @@ def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
     return vehicles
 
 
-def _check_layout(name: str) -> str:
-    if name not in (*RELEASES, *DEFAULT.layouts):
-        raise ValueError(name)
-    return name
-
-
 def _parse_topics(text: object) -> object:
     """Parse `TOPIC,TOPIC`; the name of a message stands for all of its topics."""
     if not isinstance(text, str):
@@ -55,6 +50,7 @@ _Origin = tuple[
     Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
     Annotated[float, Field(ge=-500, le=1e4)],
 ]  # fmt: skip
+_LAYOUTS: Final = f"^({'|'.join(map(re.escape, (*RELEASES, *DEFAULT.layouts)))})$"
 Vehicle = Annotated[str, AfterValidator(check_vehicle)]
 Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
@@ -117,7 +113,7 @@ class Px4ZenohOptions(Options):
     )
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for topics without a namespace")
     vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
-    layout: Annotated[str, AfterValidator(_check_layout)] | None = Field(
+    layout: Annotated[str, Field(pattern=_LAYOUTS)] | None = Field(
         None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(RELEASES)}"
     )
     msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")

@@ -1,7 +1,5 @@
 """The ROS 2 node of a source: receives messages, and declares a subscription to each published topic."""
 
-from __future__ import annotations
-
 import logging
 import os
 import queue
@@ -50,7 +48,7 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohNode:
-    """Receive from all publishers, convert samples to messages or rejections, and appear in ROS 2; a context manager.
+    """Receive from all publishers, convert samples to messages or rejections, and appear in ROS 2, until closed.
 
     Samples wait in a channel in Rust, which a thread of this node drains: a callback would make Zenoh wait for the
     GIL. Its liveliness tokens make ROS 2 list this source, and publishers in ROS 2 see a subscriber.
@@ -79,7 +77,10 @@ class Px4ZenohNode:
         last: Absence | None = None
         next_report = 0.0
         while True:
-            yield from self._dropped_messages()
+            new = self._dropped - self._reported
+            for (where, reason), count in new.items():
+                yield Rejection(where, reason, count=count)
+            self._reported += new
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=_TICK)
@@ -91,10 +92,8 @@ class Px4ZenohNode:
                 if (absence := self._streams.report(now)) != last:
                     yield (last := absence)
 
-    def __enter__(self) -> Px4ZenohNode:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
+    def close(self) -> None:
+        """Leave ROS 2, and end the thread."""
         with suppress(zenoh.ZError):  # the session may be closed already
             for token in (*self._subscriptions.values(), *self._nodes.values()):
                 token.undeclare()
@@ -156,13 +155,6 @@ class Px4ZenohNode:
         elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
             with suppress(zenoh.ZError):  # the session may be closed already
                 self._subscriptions.pop(token.key).undeclare()
-
-    def _dropped_messages(self) -> Iterator[Rejection]:
-        """Yield one rejection per reason for the messages dropped since the last call."""
-        new = self._dropped - self._reported
-        for (where, reason), count in new.items():
-            yield Rejection(where, reason, count=count)
-        self._reported += new
 
     def _subscribe(self, key: TopicKey) -> None:
         """Declare a subscription to a topic, for ROS 2 to list."""

@@ -35,7 +35,6 @@ class Px4ZenohSource:
         self._options = options
         self._given = _read_definitions(options.msg)
         self._vehicle = options.vehicle or vehicle
-        self._name = f"px4-zenoh:{' or '.join(self._endpoints)}"
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
         """Receive; raise SourceError if no router answers."""
@@ -44,18 +43,16 @@ class Px4ZenohSource:
                 # A separate client would lose the messages that do not fit the queue of its link.
                 session = router
             else:
-                session = self._open_session()
+                try:
+                    session = open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
+                except ConnectError as exc:
+                    reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
+                    raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
-            node = closing.enter_context(Px4ZenohNode(session, streams, domain=self._options.domain))
+            node = Px4ZenohNode(session, streams, domain=self._options.domain)
+            closing.callback(node.close)
             yield from node.run()  # a session that loses its router reconnects by itself
-
-    def _open_session(self) -> Session:
-        try:
-            return open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
-        except ConnectError as exc:
-            reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
-            raise SourceError(self._name, reason) from exc
 
 
 def _read_definitions(paths: str) -> Definitions:
