@@ -11,16 +11,15 @@ from typing import Final, Literal
 
 from nedbus import clock
 from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus, reply_parts
-from nedbus.errors import ConnectError
+from nedbus.errors import ConfigError, ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
-from nedbus.settings import Settings, locate_setting
-from nedbus.sources import ReplaySource
-from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
+from nedbus.settings import Settings, locate_setting, locate_source
+from nedbus.sources import ReplaySource, Source, parse_source
+from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
-from .plan import Planned, is_finite, plan_sources
-from .worker import SourceMeasures, Worker, stop_workers
+from .worker import Planned, SourceMeasures, Worker, stop_workers
 from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
@@ -29,6 +28,42 @@ _GRACE: Final = 1.0  # s for sources to stop at shutdown
 _RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _POLL: Final = 1.0  # s between two polls of silent streams and of the link
 _RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
+_TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
+
+
+def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:
+    """Open the sources for a service with these endpoints; also return the mistakes, at most one per source."""
+    plan: list[Planned] = []
+    mistakes: list[ConfigError] = []
+    if not settings.source and "source" not in settings.left_out:
+        reason = "no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"
+        mistakes.append(ConfigError("source", reason))
+    tls = None
+    try:
+        tls = settings.tls
+    except ConfigError as exc:
+        if not settings.left_out.intersection(_TLS):
+            mistakes.append(
+                locate_setting(settings, next(name for name in _TLS if getattr(settings, name)), exc.reason)
+            )
+    routers = tuple(map(dial_endpoint, endpoints))
+    for index, given in enumerate(settings.source):
+        try:
+            spec = parse_source(given)
+            source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls)
+        except ConfigError as exc:
+            mistakes.append(locate_source(settings, index, exc))
+        else:
+            plan.append(Planned(index, spec.text, settings.vehicle, source))
+    if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
+        reason = "no source ever ends: give sim: a duration, or remove loop=1 from ulog:"
+        mistakes.append(ConfigError("until_done", reason))
+    return plan, mistakes
+
+
+def is_finite(source: Source) -> bool:
+    """Return True if a source ends by itself."""
+    return isinstance(source, ReplaySource) and source.finite
 
 
 class Daemon:

@@ -5,18 +5,17 @@ import threading
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, SourceMessage
+from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.transport import Session
 
 from .output import SourceOutput
-from .plan import Planned
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +29,16 @@ _MAX_STREAMS: Final = 100  # in a status, which must fit into one message
 _Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A configured source, number `index` in the settings; a reload leaves it running if text and vehicle are equal."""
+
+    index: int = field(compare=False)
+    text: str
+    vehicle: str
+    source: Source = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A simulated flight and its estimates, as functions of the time since the start.
+"""A simulated flight, its estimates and the other messages of its vehicle, as functions of the time since the start.
 
 The vehicle takes off and flies figures of eight at 20 m.
 
@@ -14,20 +14,20 @@ from collections.abc import Mapping, Sequence
 from random import Random
 from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import VehicleLocalPosition
+from nedbus_msgs import MESSAGES, VehicleLocalPosition
 from nedbus_msgs.frames import MapProjection, euler_to_quaternion, wrap
 
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
-LAP: Final = 120.0  # s
-OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
+_LAP: Final = 120.0  # s
+_OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
 ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
 REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
-BOOT: Final = 10_000_000  # us since boot at the start
+_BOOT: Final = 10_000_000  # us since boot at the start
 
 _HEADING_RESET: Final = 15.0  # s into a lap
 _MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
 _Z_RESET: Final = 90.0  # s into a lap
-_HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap, when the error appears that the next heading reset corrects
+_HEADING_DISTURBED: Final = _LAP - 5.0  # s into a lap, when the error appears that the next heading reset corrects
 _Z_STEP: Final = 1.0  # m, up and down in turn
 _DRIFT: Final = 0.02  # m/s^2, half the acceleration of the error in dead reckoning
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
@@ -35,9 +35,17 @@ _SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
 _GRAVITY: Final = 9.80665  # m/s^2
 
 _ALTITUDE: Final = 20.0  # m
-CLIMB: Final = 10.0  # s to this altitude
+_CLIMB: Final = 10.0  # s to this altitude
 _SIZE: Final = 40.0  # m
 _STEP: Final = 1e-3  # s, for the derivatives
+
+_Status: Final = MESSAGES["VehicleStatus"].model
+_Gps: Final = MESSAGES["SensorGps"].model
+_ARMED: Final = _BOOT - 1_000_000  # us since boot
+_CAPACITY: Final = 5000.0  # mAh
+_CURRENT: Final = 12.0  # A
+_ENDURANCE: Final = 1200.0  # s until the battery is replaced by a full one, with a fifth of its charge left
+_BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: start of 2026
 
 Vector = tuple[float, ...]  # north, east, down
 
@@ -67,7 +75,7 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float] =
 
 
 def _position(time: float, direction: float) -> Vector:
-    climb = _smoothstep(time / CLIMB)
+    climb = _smoothstep(time / _CLIMB)
     # The phase starts slowly after the climb and then advances evenly, one figure a minute.
     late = max(0.0, time - 8.0)
     phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
@@ -159,11 +167,11 @@ class Estimator:
         }  # fmt: skip
 
     def _at(self, time: float) -> _State:
-        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + TICK / 2, LAP)
-        outages, steps, alignments = (int(lap) + (lap_time >= end) for end in (OUTAGE[1], _Z_RESET, _HEADING_RESET))
-        dead_reckoning = lap_time - OUTAGE[0] if OUTAGE[0] <= lap_time < OUTAGE[1] else 0.0
+        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + TICK / 2, _LAP)
+        outages, steps, alignments = (int(lap) + (lap_time >= end) for end in (_OUTAGE[1], _Z_RESET, _HEADING_RESET))
+        dead_reckoning = lap_time - _OUTAGE[0] if _OUTAGE[0] <= lap_time < _OUTAGE[1] else 0.0
         moved, speed = self._drift(dead_reckoning)
-        corrected, slowed = self._drift(OUTAGE[0] - OUTAGE[1] if outages else 0.0)
+        corrected, slowed = self._drift(_OUTAGE[0] - _OUTAGE[1] if outages else 0.0)
         x, y, z = (self._noise * (math.sin(time / 7.0 + each) + math.sin(time / 2.3 - each)) for each in self._phases)
         return _State(
             position=(x + moved[0], y + moved[1], z + _Z_STEP * (steps % 2)),
@@ -202,7 +210,7 @@ def truth_fields(time: float, truth: Truth) -> dict[str, object]:
 
 
 def _timestamps(time: float) -> dict[str, object]:
-    timestamp = BOOT + round(time * 1e6)
+    timestamp = _BOOT + round(time * 1e6)
     return {"timestamp": timestamp, "timestamp_sample": timestamp - _DELAY}
 
 
@@ -217,9 +225,80 @@ def _motion(
         **_timestamps(time),
         **dict(zip(names, (*position, *velocity, *truth.acceleration), strict=True)), "z_deriv": velocity[2],
         "xy_global": has_origin, "z_global": has_origin,
-        "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if has_origin else 0,
+        "ref_timestamp": _BOOT + round(ORIGIN_SET * 1e6) if has_origin else 0,
         "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
         "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
         "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
         "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,
+    }  # fmt: skip
+
+
+def status(estimator: Estimator, time: float, _: Truth) -> dict[str, object]:
+    """Return the status: take-off, then a mission; without a valid position, a failsafe that holds altitude."""
+    failsafe = not estimator.xy_valid(time)
+    flown = _Status.NAVIGATION_STATE_AUTO_MISSION if time >= _CLIMB else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
+    mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
+    return {
+        "timestamp": _BOOT + round(time * 1e6), "armed_time": _ARMED, "takeoff_time": _BOOT,
+        "arming_state": _Status.ARMING_STATE_ARMED,
+        "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
+        "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
+        "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
+    }  # fmt: skip
+
+
+def land_detected(time: float, truth: Truth) -> dict[str, object]:
+    """Return the land detector's output: landed until take-off."""
+    (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
+    return {
+        "timestamp": _BOOT + round(time * 1e6),
+        **dict.fromkeys(("landed", "maybe_landed", "ground_contact", "at_rest"), landed),
+        "vertical_movement": abs(vz) > 0.5, "horizontal_movement": math.hypot(vx, vy) > 1.5,
+        "close_to_ground_or_skipped_check": truth.position[2] > -1.0,
+    }  # fmt: skip
+
+
+def home(time: float, truth: Truth) -> dict[str, object]:
+    """Return the place of take-off, with global coordinates once the origin is known."""
+    known = time >= ORIGIN_SET
+    latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
+    return {
+        "timestamp": _BOOT + round(time * 1e6), "lat": latitude, "lon": longitude, "alt": altitude,
+        "x": 0.0, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": truth.heading,
+        "valid_hpos": known, "valid_alt": known, "valid_lpos": True, "valid_attitude": True,
+        "update_count": 1 + known,
+    }  # fmt: skip
+
+
+def battery(time: float, _: Truth) -> dict[str, object]:
+    """Return the state of a battery that is discharged by a constant current."""
+    discharged = _CURRENT * (time % _ENDURANCE) / 3.6
+    remaining = 1.0 - discharged / _CAPACITY
+    return {
+        "timestamp": _BOOT + round(time * 1e6), "connected": True, "id": 1, "scale": 1.0,
+        "voltage_v": 14.0 + 2.8 * remaining, "current_a": _CURRENT, "current_average_a": _CURRENT,
+        "discharged_mah": discharged, "remaining": remaining, "capacity": round(_CAPACITY),
+        "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0, "cell_count": 4,
+    }  # fmt: skip
+
+
+def gps(time: float, truth: Truth) -> dict[str, object]:
+    """Return a GNSS fix with noise; there is none before the origin is set, and in the outage."""
+    now, is_started = _BOOT + round(time * 1e6), time >= ORIGIN_SET
+    fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
+    north, east, down = (
+        value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
+    )
+    latitude, longitude = MapProjection(*truth.origin[:2]).reproject(north, east) if fix else (math.nan, math.nan)
+    altitude = truth.origin[2] - down if fix else math.nan
+    vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
+    return {
+        "timestamp": now, "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
+        "latitude_deg": latitude, "longitude_deg": longitude,
+        "altitude_msl_m": altitude, "altitude_ellipsoid_m": altitude,
+        "eph": 0.9 if fix else 100.0, "epv": 1.8 if fix else 100.0, "s_variance_m_s": 0.4 if fix else 100.0,
+        "hdop": 0.7 if fix else 100.0, "vdop": 1.1 if fix else 100.0, "satellites_used": 14 if fix else 0,
+        "vel_ned_valid": fix, "vel_n_m_s": vx, "vel_e_m_s": vy, "vel_d_m_s": vz,
+        "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
+        "time_utc_usec": _BOOTED_AT + now if is_started else 0,
     }  # fmt: skip
