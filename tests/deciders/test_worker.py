@@ -34,8 +34,7 @@ class StandingClock:
     seconds: float = 0.0
     waits: list[float] = field(default_factory=list)
 
-    @property
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         return self.seconds >= self.stop_at
 
     def now(self) -> float:
@@ -44,7 +43,7 @@ class StandingClock:
     def wait(self, seconds: float) -> bool:
         self.waits.append(round(seconds, 6))
         self.seconds += seconds
-        return self.stopped
+        return self.is_set()
 
 
 @dataclass

@@ -57,19 +57,10 @@ class SourceMeasures:
         return {each.address: stream_state(each.health, publishers=each.address in alive).name for each in streams}
 
 
-class Clock:
-    """Monotonic time, and waits that end early when the worker is stopped; replaced in tests."""
+class Clock(threading.Event):
+    """Monotonic time, and waits that end early when the worker is stopped, as this is set; replaced in tests."""
 
-    def __init__(self) -> None:
-        self._event = threading.Event()
-        self.now = time.monotonic
-        self.stop = self._event.set
-        self.wait = self._event.wait
-
-    @property
-    def stopped(self) -> bool:
-        """True once the worker has to stop."""
-        return self._event.is_set()
+    now = staticmethod(time.monotonic)
 
 
 class Worker:
@@ -161,7 +152,7 @@ class Worker:
     def stop(self, *, release: bool) -> None:
         """Stop the source; with `release`, its thread closes the publishers, which may wait for slow readers."""
         self._release = release
-        self._clock.stop()
+        self._clock.set()
 
     def _run_and_release(self) -> None:
         self.run()
@@ -172,7 +163,7 @@ class Worker:
 
     def _run_until_done(self) -> None:
         failures = 0
-        while not self._clock.stopped:
+        while not self._clock.is_set():
             start = self._clock.now()
             try:
                 if isinstance(self.source, LiveSource):
@@ -231,7 +222,7 @@ class Worker:
                     start -= early
                 elif early > 0:
                     self._clock.wait(early)
-            if self._clock.stopped:
+            if self._clock.is_set():
                 return
             # A lossless publisher may wait for its readers.
             self._turn = None if speed is None else self._clock.now()
@@ -254,7 +245,7 @@ class Worker:
             next_poll = 0.0
             for item in items:
                 now = self._turn = self._clock.now()
-                if self._clock.stopped:
+                if self._clock.is_set():
                     return
                 if isinstance(item, Rejection):
                     self._output.reject(item)
@@ -276,7 +267,7 @@ class Worker:
         self._state, self._error = state, None
 
     def _end(self, state: Literal["done", "failed"], reason: str | None) -> None:
-        if not self._clock.stopped:
+        if not self._clock.is_set():
             self._state, self._error = state, reason
             text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
             event = "failed" if state == "failed" else "done"

@@ -97,7 +97,14 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
         options = kind.options.model_validate(dict(pairs))
     except ValidationError as exc:
-        reason, name = _explain(exc, kind)
+        detail = exc.errors()[0]
+        name = str(detail["loc"][0])
+        if (field := kind.options.model_fields.get(name)) is None:
+            reason = f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}"
+        elif isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
+            reason = str(cause)
+        else:
+            reason = f"{name}={detail['input']} is invalid: expected {field.description}"
         raise ConfigError(f"source {text!r}", reason, key=name) from exc
     except ValueError:
         hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
@@ -147,15 +154,3 @@ def _join(name: str, kind: SourceKind, target: str, options: Mapping[str, str]) 
     path = target.replace("%", "%25").replace("?", "%3F") if kind.target == "FILE" else target
     query = urlencode(options, safe=":,/")
     return f"{name}:{path}?{query}" if query else f"{name}:{path}"
-
-
-def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:
-    """Return the error text for an invalid option, and its name."""
-    detail = error.errors()[0]
-    name = str(detail["loc"][0])
-    field = kind.options.model_fields.get(name)
-    if field is None:
-        return f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}", name
-    if isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
-        return str(cause), name
-    return f"{name}={detail['input']} is invalid: expected {field.description}", name

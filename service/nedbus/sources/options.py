@@ -119,11 +119,6 @@ class Px4ZenohOptions(Options):
     msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
 
 
-def _parse_log(text: object) -> object:
-    """Parse `log=`: 0 or 1, or `armed` and `take`, separated by a comma."""
-    return frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text
-
-
 def _check_save(folder: str, info: ValidationInfo) -> str:
     if folder and not info.data.get("log"):
         raise ValueError(folder)
@@ -142,7 +137,10 @@ class MavlinkOptions(Options):
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"
     )
-    log: Annotated[frozenset[Literal["1", "armed", "take"]], BeforeValidator(_parse_log)] = Field(
+    log: Annotated[
+        frozenset[Literal["1", "armed", "take"]],
+        BeforeValidator(lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text),
+    ] = Field(
         frozenset(),
         description="1 to request the ULog stream of each PX4 on the link, armed to start it in the air as well, take"
         " to end the stream of another client, or armed,take",

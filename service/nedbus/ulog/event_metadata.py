@@ -83,16 +83,14 @@ class EventMetadata:
         shown: list[Any] = []
         offset = 0
         for name in types:
-            enum = None if name in _TYPES else self._enum(name if "::" in name else f"{namespace}::{name}")
+            space, _, base = name.rpartition("::")
+            parts = (part for part in self._components.values() if part["namespace"] == (space or namespace))
+            enum = None if name in _TYPES else next(parts)["enums"][base]
             code = _TYPES[enum["type"] if enum else name]
             values += struct.unpack_from(code, data, offset)
             offset += struct.calcsize(code)
             shown.append(_describe(enum, values[-1]) if enum else values[-1])
         return values, shown
-
-    def _enum(self, name: str) -> Mapping[str, Any]:
-        space, _, base = name.rpartition("::")
-        return next(part["enums"][base] for part in self._components.values() if part["namespace"] == space)
 
 
 def _describe(enum: Mapping[str, Any], value: int) -> str:

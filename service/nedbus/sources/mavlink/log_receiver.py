@@ -38,7 +38,7 @@ class _Vehicle:
 class LogReceiver:
     """Reads a link in a thread of its own, so that PX4's log stream is acknowledged while publishing waits.
 
-    `send`: sends a MAVLink message to a peer; it must not wait.
+    `send`: sends a MAVLink message to a peer; it must not wait. `clients`: those of vehicles since their heartbeats.
     """
 
     def __init__(
@@ -53,15 +53,11 @@ class LogReceiver:
         self._reader, self._options, self._send = reader, options, send
         self._ids = system, component
         self._vehicles: dict[int, _Vehicle] = {}
+        self.clients: dict[int, LogStreamClient] = {}
         self._waiting: SimpleQueue[Received | Rejection | Exception] = SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-mavlink", daemon=True)
         self._thread.start()
-
-    def client(self, system: int) -> LogStreamClient | None:
-        """Return the client of a vehicle; None before its first heartbeat."""
-        vehicle = self._vehicles.get(system)
-        return vehicle.client if vehicle is not None else None
 
     def read(self, timeout: float) -> Iterator[Received | Rejection]:
         """Yield what was read; wait up to `timeout` seconds for the first. Raises the error that ended the thread."""
@@ -121,7 +117,9 @@ class LogReceiver:
         elif kind == "HEARTBEAT":
             if vehicle is None:
                 system, component = self._ids
-                client = LogStreamClient(self._options.log, system=system, component=component)
+                client = self.clients[received.system] = LogStreamClient(
+                    self._options.log, system=system, component=component
+                )
                 vehicle = self._vehicles[received.system] = _Vehicle(received.system, client, received.peer)
             vehicle.peer = received.peer
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -126,18 +126,16 @@ class Vehicle:
         if not self._pending and now >= self._next_round:
             self._next_round = now + _REQUEST_INTERVAL
             self._pending = [each for each in self._rates if now - self._arrivals.get(each, 0.0) > _SILENCE_TIMEOUT]
-            self._log_missing()
+            # The origin needs a global position first.
+            for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
+                self._reported.add(number)
+                name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
+                text, extra = "%s: the vehicle does not send %s on request", about("unsupported", address)
+                _log.info(text, address, name, extra=extra)
         if not self._pending:
             return None
         number = self._pending.pop(0)
         return number, self._rates[number]
-
-    def _log_missing(self) -> None:
-        """Log each requested message that never arrived, once; the origin needs a global position first."""
-        for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
-            self._reported.add(number)
-            name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
-            _log.info("%s: the vehicle does not send %s on request", address, name, extra=about("unsupported", address))
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
         """Convert a message; return None if it has nothing for the chosen topics, a Rejection if it is late."""

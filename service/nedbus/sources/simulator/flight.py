@@ -75,7 +75,8 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float] =
 
 
 def _position(time: float, direction: float) -> Vector:
-    climb = _smoothstep(time / _CLIMB)
+    part = min(1.0, max(0.0, time / _CLIMB))
+    climb = part**3 * (10 - 15 * part + 6 * part**2)  # from 0 to 1 with continuous acceleration
     # The phase starts slowly after the climb and then advances evenly, one figure a minute.
     late = max(0.0, time - 8.0)
     phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
@@ -83,12 +84,6 @@ def _position(time: float, direction: float) -> Vector:
     cos, sin = math.cos(direction), math.sin(direction)
     down = -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2)
     return along * cos - across * sin, along * sin + across * cos, down
-
-
-def _smoothstep(part: float) -> float:
-    """Rise from 0 to 1 with continuous acceleration."""
-    part = min(1.0, max(0.0, part))
-    return part**3 * (10 - 15 * part + 6 * part**2)
 
 
 class _State(NamedTuple):
