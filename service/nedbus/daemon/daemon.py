@@ -161,7 +161,6 @@ class Daemon:
         )
 
     def _answer(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
-        """Answer a query with the status, or with the events if it has the parameter for them."""
         within, seconds = parameter(ACCOUNT_PARAMETER), 0.0
         with suppress(ValueError):
             seconds = float(within or 0.0)

@@ -51,14 +51,10 @@ class SourceOutput:
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
-        self.rejections: Counter[str] = Counter()
-        """Number of rejected messages by violated rule."""
-        self.absence = Absence()
-        """Topics that vehicles publish and a live source does not deliver now."""
-        self.log_streams: dict[str, LogStreamStatus] = {}
-        """The ULog stream of each vehicle of a live source."""
-        self.durations = Histogram(_DURATIONS)
-        """Time to validate, encode and send a message [s]."""
+        self.rejections: Counter[str] = Counter()  # messages by violated rule
+        self.absence = Absence()  # topics that vehicles publish and a live source does not deliver now
+        self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
+        self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
         self._text = text
         self._kind = text.partition(":")[0]

@@ -233,7 +233,6 @@ class Worker:
         self._error = run.damage
 
     def _warn(self, run: ReplayRun) -> None:
-        """Log the warnings of a run that were not logged yet."""
         for warning in run.warnings:
             if warning not in self._warned:
                 self._warned.add(warning)

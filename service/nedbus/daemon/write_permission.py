@@ -149,7 +149,6 @@ class WritePermission:
 
 
 def _routers_of(session: Session) -> set[str]:
-    """Return the ids of the routers that a session is linked to."""
     try:
         with while_open():
             return {str(zid) for zid in session.info.routers_zid()}

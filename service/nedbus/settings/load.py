@@ -142,7 +142,6 @@ def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
 
 
 def _warn_of_misspelt_variables() -> None:
-    """Warn about environment variables that look like misspelt settings."""
     known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
     for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
         longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)
@@ -171,7 +170,6 @@ def _read_text(path: Path) -> str:
 
 
 def _read_toml(path: Path) -> dict[str, object]:
-    """Parse a file; raise ConfigError with line and column."""
     text = _read_text(path)
     try:
         return tomllib.loads(text)

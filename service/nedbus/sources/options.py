@@ -42,7 +42,6 @@ def _parse_topics(text: object) -> object:
 
 
 def _topics_of(name: str) -> Set[str]:
-    """Return all topics of a message, or the topic itself."""
     return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 

@@ -108,7 +108,6 @@ class _Clock:
 
 
 def _warnings_of(reader: UlogReader) -> list[str]:
-    """Return the damage and the skipped parts so far."""
     warnings = reader.warnings
     for stream in reader.streams.values():
         unknown = sorted(set(stream.names) - stream.definition.known_types.keys())

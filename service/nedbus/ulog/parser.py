@@ -37,13 +37,10 @@ _CONTEXT: Final = 16  # bytes that a candidate can have
 
 
 class _Judgement(Enum):
-    SOUND = auto()
-    """A record whose content fits its type and size."""
-    OPAQUE = auto()
-    """A record of unknown type, message id or content, or none: only what follows can tell."""
+    SOUND = auto()  # a record whose content fits its type and size
+    OPAQUE = auto()  # a record of unknown type, message id or content, or none: only what follows can tell
     NONE = auto()
-    PARTIAL = auto()
-    """Bytes are missing."""
+    PARTIAL = auto()  # bytes are missing
 
 
 class _Seen(NamedTuple):
@@ -105,7 +102,6 @@ class UlogParser:
         return records
 
     def _begin(self, *, is_end: bool) -> None:
-        """Read the header, and the flag bits behind it."""
         kind, content = self._buffer[_START + 2 : _START + _HEADER], _START + _HEADER
         stop = content + int.from_bytes(self._buffer[_START : _START + 2], "little") if kind == b"B" else _START
         if is_end or (kind and stop <= len(self._buffer)):
@@ -226,7 +222,6 @@ class UlogParser:
         return _Judgement.NONE
 
     def _look(self, at: int) -> _Seen:
-        """Judge a position of the buffer."""
         buffer = self._buffer
         known = self._known.get(buffer[at : at + _DATA_HEADER])
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
@@ -252,7 +247,6 @@ class UlogParser:
         return head[2] in READERS
 
     def _truncate(self, at: int) -> int:
-        """Report the record in which the log ends, if any."""
         end = len(self._buffer)
         if at < end:
             self._records.append(Damage("the file ends inside a message", self._offset + at, end - at, is_end=True))

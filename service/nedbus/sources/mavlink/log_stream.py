@@ -193,7 +193,6 @@ class LogStream:
         self._parser.gap()
 
     def _record_sizes(self) -> tuple[int, int]:
-        """Return the least and the greatest size of a data record."""
         sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
         return min(sizes, default=_DATA_HEADER), max(sizes, default=_PIECE)
 
@@ -258,7 +257,6 @@ class LogFile:
 
 
 def _create(folder: Path, vehicle: str) -> tuple[Path, BinaryIO]:
-    """Create a file that does not exist yet, and its folder."""
     name = f"{vehicle}_{clock.now():%Y-%m-%d_%H-%M-%S}"
     path = folder / f"{name}.ulg"
     try:

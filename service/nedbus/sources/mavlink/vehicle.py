@@ -170,7 +170,6 @@ class Vehicle:
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
-        """Keep fields that complete later messages."""
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
@@ -217,7 +216,6 @@ class Vehicle:
         return fields if now <= until else {}
 
     def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
-        """Add the fields kept from earlier messages."""
         match topic:
             case "vehicle_local_position":
                 for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):

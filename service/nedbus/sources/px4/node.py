@@ -142,7 +142,6 @@ class Px4ZenohNode:
         return form
 
     def _on_token(self, text: str, *, alive: bool) -> None:
-        """Add or remove the publisher of a liveliness token."""
         now = time.monotonic()
         try:
             token = PublisherToken.parse(text)
