@@ -39,7 +39,7 @@ class SourceKind:
 
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
-    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator.source", "open_simulator"),
+    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "open_simulator"),
     "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "open_ulog"),
     "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "open_mcap", "mcap"),
     "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "open_tlog", "mavlink"),

@@ -20,9 +20,8 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
 from .link import AUTOPILOT, Link, Peer, Senders, open_link, parse_link
-from .log_receiver import LogReceiver
 from .log_stream import LogStream
-from .reader import LinkReader, Received
+from .reader import LinkReader, LogReceiver, Received
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)

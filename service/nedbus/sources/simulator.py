@@ -10,18 +10,25 @@ Every lap of 120 s has the events of a real flight:
 """
 
 import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import count
 from random import Random
 from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import MESSAGES, VehicleLocalPosition
+from nedbus.errors import SourceError
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, MESSAGES, Address, VehicleLocalPosition
 from nedbus_msgs.frames import MapProjection, euler_to_quaternion, wrap
 
-TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
+from .options import SimulatorOptions
+from .source import ReplayRun, SourceMessage
+
+_TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
 _LAP: Final = 120.0  # s
 _OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
-ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
-REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
+_ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
+_REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
 _BOOT: Final = 10_000_000  # us since boot at the start
 
 _HEADING_RESET: Final = 15.0  # s into a lap
@@ -60,10 +67,10 @@ class Truth(NamedTuple):
     velocity: Vector
     acceleration: Vector
     heading: float
-    origin: tuple[float, float, float] = REFERENCE
+    origin: tuple[float, float, float] = _REFERENCE
 
 
-def truth_at(time: float, direction: float, origin: tuple[float, float, float] = REFERENCE) -> Truth:
+def truth_at(time: float, direction: float, origin: tuple[float, float, float] = _REFERENCE) -> Truth:
     """Return the truth at a time [s] since the start; `direction` [rad] rotates the figures."""
     positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
     axes = list(zip(*positions, strict=True))
@@ -125,7 +132,7 @@ class Estimator:
         position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
         velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
         return {
-            **_motion(time, position, velocity, truth, has_origin=time >= ORIGIN_SET),
+            **_motion(time, position, velocity, truth, has_origin=time >= _ORIGIN_SET),
             **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
             **{f"delta_{name}": delta for name, delta in state.deltas.items()},
             **{f"{name}_reset_counter": count for name, count in state.counters.items()},
@@ -162,7 +169,7 @@ class Estimator:
         }  # fmt: skip
 
     def _at(self, time: float) -> _State:
-        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + TICK / 2, _LAP)
+        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + _TICK / 2, _LAP)
         outages, steps, alignments = (int(lap) + (lap_time >= end) for end in (_OUTAGE[1], _Z_RESET, _HEADING_RESET))
         dead_reckoning = lap_time - _OUTAGE[0] if _OUTAGE[0] <= lap_time < _OUTAGE[1] else 0.0
         moved, speed = self._drift(dead_reckoning)
@@ -220,7 +227,7 @@ def _motion(
         **_timestamps(time),
         **dict(zip(names, (*position, *velocity, *truth.acceleration), strict=True)), "z_deriv": velocity[2],
         "xy_global": has_origin, "z_global": has_origin,
-        "ref_timestamp": _BOOT + round(ORIGIN_SET * 1e6) if has_origin else 0,
+        "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6) if has_origin else 0,
         "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
         "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
         "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
@@ -255,7 +262,7 @@ def land_detected(time: float, truth: Truth) -> dict[str, object]:
 
 def home(time: float, truth: Truth) -> dict[str, object]:
     """Return the place of take-off, with global coordinates once the origin is known."""
-    known = time >= ORIGIN_SET
+    known = time >= _ORIGIN_SET
     latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
     return {
         "timestamp": _BOOT + round(time * 1e6), "lat": latitude, "lon": longitude, "alt": altitude,
@@ -279,7 +286,7 @@ def battery(time: float, _: Truth) -> dict[str, object]:
 
 def gps(time: float, truth: Truth) -> dict[str, object]:
     """Return a GNSS fix with noise; there is none before the origin is set, and in the outage."""
-    now, is_started = _BOOT + round(time * 1e6), time >= ORIGIN_SET
+    now, is_started = _BOOT + round(time * 1e6), time >= _ORIGIN_SET
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
     north, east, down = (
         value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
@@ -297,3 +304,68 @@ def gps(time: float, truth: Truth) -> dict[str, object]:
         "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
         "time_utc_usec": _BOOTED_AT + now if is_started else 0,
     }  # fmt: skip
+
+
+Fields = Callable[[float, Truth], dict[str, object]]  # of a message, given time since start and truth
+
+
+def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
+    """Start a flight, endless unless its options set a duration; raise SourceError without any requested topic."""
+    vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
+    ticks = None if options.duration is None else round(options.duration / _TICK)
+    streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)
+    chosen = {
+        address: stream
+        for address, stream in streams.items()
+        if stream[0] and (topics is None or address.topic in topics)
+    }
+    if not chosen:
+        asked = ", ".join(sorted(topics or ()))
+        known = ", ".join(sorted({address.topic for address in streams}))
+        raise SourceError("sim", f"a simulated vehicle has no {asked}; choose from {known}")
+    total = None if ticks is None else sum(len(ticks) for ticks, _ in chosen.values())
+    length = "endless" if ticks is None else f"{total} messages, {ticks * _TICK:g} s"
+    return ReplayRun(
+        messages=_messages(chosen, options.seed, ticks, options.origin or _REFERENCE),
+        addresses=dict.fromkeys(sorted(chosen, key=lambda address: address.topic != DEFAULT_TOPIC)),
+        total=total,
+        summary=f"vehicle {vehicle}, seed {options.seed}, {length}",
+    )
+
+
+def _streams(vehicle: str, seed: int, end: int) -> dict[Address, tuple[range, Fields]]:
+    """Return the ticks and the fields of all streams, in the order of their messages in one tick."""
+    first, second = (Estimator(f"ekf {each}", seed, noise) for each, noise in enumerate((0.3, 0.5)))
+    ins = Estimator("ins", seed, 0.05, aided=True)
+    origin = round(_ORIGIN_SET / _TICK)
+    at = partial(Address, vehicle)
+    return {
+        at("vehicle_local_position_groundtruth"): (range(0, end, 2), truth_fields),
+        at("external_ins_local_position"): (range(1, end, 2), ins.fields),
+        at("estimator_local_position", 0): (range(0, end, 50), first.fields),
+        at("estimator_local_position", 1): (range(0, end, 50), second.fields),
+        at("vehicle_local_position"): (range(end), first.fields),
+        at("vehicle_attitude"): (range(0, end, 2), first.attitude),
+        at("vehicle_global_position"): (range(origin, end, 10), first.global_fields),
+        at("sensor_gps", 0): (range(0, end, 10), gps),
+        at("vehicle_status"): (range(0, end, 50), partial(status, first)),
+        at("vehicle_land_detected"): (range(0, end, 100), land_detected),
+        at("battery_status", 0): (range(0, end, 100), battery),
+        at("home_position"): (range(0, min(end, origin + 1), origin), home),
+    }
+
+
+def _messages(
+    chosen: Mapping[Address, tuple[range, Fields]], seed: int, ticks: int | None, origin: tuple[float, float, float]
+) -> Iterator[SourceMessage]:
+    direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
+    absent = {}  # the fields of PX4's newest layout, as "not provided"
+    for address in chosen:
+        layout = BY_TOPIC[address.topic].layout_of_release("main")
+        absent[address] = {name: kind.absent for name, kind in layout.types.items()} if layout else {}
+    for tick in count() if ticks is None else range(ticks):
+        time = tick * _TICK
+        now = truth_at(time, direction, origin)
+        for address, (when, fields) in chosen.items():
+            if tick in when:
+                yield SourceMessage(time, address, absent[address] | fields(time, now))
