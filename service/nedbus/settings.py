@@ -1,7 +1,4 @@
-"""Settings from `nedbus.toml`, the environment and flags, each overriding the previous one; read here alone.
-
-Their names, types, defaults and checks; their origins, and the locations of mistakes.
-"""
+"""Settings from `nedbus.toml`, the environment and flags, each overriding the previous one; read here alone."""
 
 import difflib
 import logging

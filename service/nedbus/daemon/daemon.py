@@ -190,10 +190,7 @@ class Daemon:
         return f"{len(plan) - kept} started, {before - kept} stopped, {kept} unchanged"
 
     def run(self) -> bool:
-        """Publish until done or stopped; return False if a source has failed.
-
-        Raises ListenError if the embedded router cannot listen, ConfigError for a mistake in its file.
-        """
+        """Publish until done or stopped; return False if a source has failed; raise ListenError or ConfigError."""
         session = self._session = self._open()
         if session is None:
             return True

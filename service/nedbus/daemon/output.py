@@ -42,10 +42,7 @@ class _Stream:
 
 
 class SourceOutput:
-    """Publish the messages of a source.
-
-    `name`: name of the source in the log; `text`: the source as configured; `now`: monotonic clock [s].
-    """
+    """Publish the messages of a source with this name in the log and configured text; `now`: monotonic clock [s]."""
 
     def __init__(
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
@@ -100,10 +97,7 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher for an address if it has none of this definition.
-
-        Raises AddressInUseError if another source has one.
-        """
+        """Open a publisher for an address without one of this definition; raise AddressInUseError if another has it."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
@@ -237,10 +231,7 @@ class SourceOutput:
             _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
-        """Republish the topics without a rate of a vehicle that is back: it would not repeat them.
-
-        After a reboot they are outdated, and are dropped.
-        """
+        """Republish the topics without a rate of a vehicle that is back, as it will not, unless it rebooted since."""
         vehicle = message.address.vehicle
         known = [
             (address, stream, stream.last)

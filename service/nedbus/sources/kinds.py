@@ -59,10 +59,7 @@ class SourceSpec:
     options: Options
 
     def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
-        """Create the source, for a service with this default vehicle, router endpoints and TLS files.
-
-        Raises ConfigError for an invalid target, a path that is not a regular file, or a missing extra.
-        """
+        """Create the source for a service; raise ConfigError for a bad target or file, or a missing extra."""
         kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
         # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
@@ -117,10 +114,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
 
 
 def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
-    """Return the source that replays a file with these options, as text: `ulog:flight.ulg?vehicle=7`.
-
-    Raises ConfigError for an unknown file suffix.
-    """
+    """Return the source that replays a file, as `ulog:flight.ulg?vehicle=7`; raise ConfigError for another suffix."""
     name = format_of(path)
     return _join(name, SOURCE_KINDS[name], str(path), {key: value for key, value in options.items() if value})
 

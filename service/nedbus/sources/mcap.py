@@ -74,10 +74,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
-    """Yield messages in order of log time; writers batch a few hundred messages of one stream at a time.
-
-    When time goes back by more than _MAX_GAP (a damaged time, another clock), flush the buffer first.
-    """
+    """Yield messages in order of log time, as writers batch them by stream; flush when it falls by over _MAX_GAP."""
     waiting: list[tuple[int, int, RecordedMessage]] = []
     newest = 0
     for number, recorded in messages:

@@ -58,10 +58,7 @@ Vector = tuple[float, ...]  # north, east, down
 
 
 class Truth(NamedTuple):
-    """The true state: position [m], velocity [m/s], acceleration [m/s^2] in local NED, heading [rad].
-
-    `origin`: latitude, longitude [deg] and altitude [m] of the local frame.
-    """
+    """The truth in local NED: position [m], velocity, acceleration, heading [rad]; latitude, longitude, altitude."""
 
     position: Vector
     velocity: Vector

@@ -38,11 +38,7 @@ class SourceMessage:
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Input that a live source could not turn into a message.
-
-    `where`: its key, link or address; each is logged once.
-    `count`: number of rejected messages.
-    """
+    """Input that a live source could not turn into a message; each `where` (key, link or address) is logged once."""
 
     where: str
     reason: str
@@ -91,10 +87,7 @@ class ReplayRun:
 
 @dataclass(frozen=True, slots=True)
 class ReplaySource:
-    """A source that can be replayed, once or repeatedly.
-
-    `open`: opens it for one run; raises SourceError if it cannot be opened or has no messages.
-    """
+    """A source that can be replayed, once or repeatedly; `open` raises SourceError if it has no message to read."""
 
     options: RecordedOptions | SimulatorOptions
     open: Callable[[], ReplayRun]

@@ -55,14 +55,11 @@ def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptio
 
 
 class _Clock:
-    """A clock that follows the timestamps of a log from the start of logging, and does not wait for outliers.
-
-    `gaps`: number of steps that were skipped as too long. `unordered`: number of timestamps out of order.
-    """
+    """A clock that follows the timestamps of a log from the start of logging, and does not wait for outliers."""
 
     def __init__(self) -> None:
-        self.gaps = 0
-        self.unordered: Counter[Address] = Counter()
+        self.gaps = 0  # steps that were skipped as too long
+        self.unordered: Counter[Address] = Counter()  # timestamps
         self._now = self._due = self._behind = 0  # us; messages
         self._is_running = False
 

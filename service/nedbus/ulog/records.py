@@ -54,10 +54,7 @@ class Parameter(NamedTuple):
 
 
 class Subscription(NamedTuple):
-    """One instance of a topic whose data follow under a message id.
-
-    Names of nested fields are flat: `esc[0].rpm` of the log is `esc_0_rpm`.
-    """
+    """One instance of a topic, with flat names of fields: `esc[0].rpm` of the log is `esc_0_rpm`."""
 
     message_id: int
     multi_id: int
@@ -132,10 +129,7 @@ def read_header(data: bytes) -> Header:
 
 
 def read_flags(content: bytes) -> tuple[int, ...]:
-    """Return the offsets of appended data in flag bits.
-
-    Raises UlogError for an unknown incompatible flag: the specification requires to refuse the log.
-    """
+    """Return the offsets of appended data; raise UlogError for an unknown incompatible flag, as the format requires."""
     incompatible, *offsets = struct.unpack_from("<8xQ3Q", content.ljust(40, b"\0"))
     if incompatible & ~1:
         raise UlogError(f"it has unknown incompatible flags ({incompatible:#x}): read it with a newer version")

@@ -1,7 +1,4 @@
-"""Client of one vehicle's ULog stream, as a state machine: events in, commands to send out; no I/O, no clock.
-
-Times are monotonic seconds of the caller's clock.
-"""
+"""Client of one vehicle's ULog stream, a state machine: events in, commands out; no I/O, times of the caller [s]."""
 
 import math
 from collections.abc import Mapping, Set

@@ -36,10 +36,7 @@ _MAX_SAME_NAME: Final = 100
 
 
 class LogStream:
-    """State of the stream of one vehicle, in the thread of the source.
-
-    `client`: its requests and acknowledgements, in the thread that reads the link.
-    """
+    """The stream of one vehicle, in the thread of the source; `client`: its requests, in that of the link."""
 
     def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
         self._name, self._client = name, client
@@ -212,12 +209,7 @@ class LogStream:
 
 
 class LogFile:
-    """One stream of one boot in a new file of a folder, `<vehicle>_<UTC>.ulg`, valid at any moment.
-
-    `path`: of the file.
-
-    Raises OutputError if the file cannot be created or written, for example on a full disk.
-    """
+    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, such as for a full disk."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)

@@ -27,14 +27,11 @@ _SIGNATURE: Final = 13  # bytes
 
 
 class TlogReader:
-    """Reads the messages of all autopilots in a .tlog; `due` is the host's time since its first frame [s].
-
-    `definitions`: those of each address so far.
-    """
+    """Reads the messages of all autopilots in a .tlog; `due` is the host's time since its first frame [s]."""
 
     def __init__(self, path: Path, topics: Collection[str] | None = None, *, vehicle: str | None = None) -> None:
         self._path, self._options, self._vehicle = path, MavlinkOptions(topics=tuple(topics or ())), vehicle
-        self.definitions: dict[Address, Definition[Any] | None] = {}
+        self.definitions: dict[Address, Definition[Any] | None] = {}  # of each address so far
         self._boots: set[int] = set()  # Unix times [us]
         self._damaged_bytes = self.position = 0
 

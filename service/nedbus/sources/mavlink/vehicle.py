@@ -1,7 +1,4 @@
-"""State of one MAVLink vehicle: takes MAVLink messages, returns PX4 messages and requests; no I/O, no clock.
-
-Times are monotonic seconds of the caller's clock unless stated otherwise.
-"""
+"""State of one MAVLink vehicle: MAVLink in, PX4 messages and requests out; no I/O, monotonic times of a caller [s]."""
 
 import logging
 import math

@@ -1,7 +1,4 @@
-"""Assign messages from rmw_zenoh publishers to addresses, and detect absent topics; no I/O, no clock.
-
-Times are monotonic seconds of the caller's clock.
-"""
+"""Assign messages of rmw_zenoh to addresses, and detect absent topics; no I/O, monotonic times of the caller [s]."""
 
 import math
 from collections.abc import Mapping
@@ -136,10 +133,7 @@ class StreamRegistry:
         return not stream.tokens
 
     def hear(self, key: str, now: float) -> Px4Stream:
-        """Return the stream of a key, and note that a message arrived on it.
-
-        Raises DecodeError or AddressError for a key that is not of a PX4 topic, NotAcceptedError beyond the limit.
-        """
+        """Return the stream of a key with a new message; raise DecodeError, AddressError or NotAcceptedError."""
         stream = self._streams.get(key) or self._find(TopicKey.parse(key))
         stream.heard = now
         return stream
