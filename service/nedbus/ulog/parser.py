@@ -108,7 +108,7 @@ class UlogParser:
             header = read_header(self._buffer[:_START])
             self._records.append(header)
             if header.version > 1:
-                self._records.append(Damage(f"unknown version {header.version} of the format", 7, 0))
+                self._records.append(Damage(f"unknown version {header.version} of the format"))
             offsets = read_flags(self._buffer[content:stop]) if kind == b"B" else ()
             self._boundaries = sorted(offset for offset in offsets if offset >= stop)
             self._drop(min(stop, len(self._buffer)))
@@ -129,7 +129,7 @@ class UlogParser:
                 after = self._search(at, is_end=is_end)
         self._drop(at if after is None else after)
         if is_end:
-            self._end_damage(self._offset)
+            self._end_damage()
 
     def _take_data(self, at: int) -> int:
         """Take messages up to the last one in a row, whose successor needs a closer look; return its position."""
@@ -184,15 +184,13 @@ class UlogParser:
         window = begun + 1 + number * _WINDOW
         start, found = self._find(at, window + (_WINDOW if number < 2 else _SAMPLE), is_end=is_end)
         if found is _Judgement.SOUND:
-            self._end_damage(self._offset + start)
+            self._end_damage()
             return start
         return None if found is _Judgement.PARTIAL else min(window + _WINDOW, len(self._buffer))
 
-    def _end_damage(self, offset: int) -> None:
+    def _end_damage(self) -> None:
         if self._damage is not None:
-            self._records.append(
-                Damage(f"no record begins at byte {self._damage}", self._damage, offset - self._damage)
-            )
+            self._records.append(Damage(f"no record begins at byte {self._damage}"))
             self._damage = None
 
     def _find(self, start: int, stop: int, *, is_end: bool) -> tuple[int, _Judgement]:
@@ -249,12 +247,12 @@ class UlogParser:
     def _truncate(self, at: int) -> int:
         end = len(self._buffer)
         if at < end:
-            self._records.append(Damage("the file ends inside a message", self._offset + at, end - at, is_end=True))
+            self._records.append(Damage("the file ends inside a message", is_end=True))
         return end
 
     def _emit(self, at: int, seen: _Seen) -> int:
         """Use a record; return the position after it."""
-        kind, offset, reason = self._buffer[at + 2], self._offset + at, ""
+        kind, reason = self._buffer[at + 2], ""
         if seen.record is not None:
             try:
                 self._records.extend(self._apply(seen.record))
@@ -266,9 +264,9 @@ class UlogParser:
         elif kind == ord("D"):
             self.undecodable += 1
         elif kind in READERS or seen.judgement is _Judgement.NONE:
-            reason = f"the record at byte {offset} is damaged"
+            reason = f"the record at byte {self._offset + at} is damaged"
         if reason:
-            self._records.append(Damage(reason, offset, seen.stop - at))
+            self._records.append(Damage(reason))
         return seen.stop
 
     def _apply(self, record: Record) -> list[Record]:

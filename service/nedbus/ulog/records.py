@@ -98,8 +98,6 @@ class Damage(NamedTuple):
     """Bytes that are not used; `is_end`: the log ends inside a record, as after a loss of power."""
 
     reason: str
-    offset: int
-    size: int
     is_end: bool = False
 
 
