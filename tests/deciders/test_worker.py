@@ -160,7 +160,7 @@ class Ran:
 
     @property
     def status(self) -> SourceStatus:
-        return self.worker.status
+        return self.worker.status()
 
     @property
     def times(self) -> list[float]:

@@ -117,7 +117,7 @@ class Daemon:
     @property
     def sources(self) -> tuple[SourceStatus, ...]:
         """Current status of each source."""
-        return tuple(worker.status for worker in self._workers)
+        return tuple(worker.status() for worker in self._workers)
 
     @property
     def refused(self) -> Mapping[str, bool]:
@@ -276,7 +276,7 @@ class Daemon:
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
-                if all(worker.status.ended for worker in finite):
+                if all(worker.status().ended for worker in finite):
                     # Heartbeats tell readers of the last message, in case they missed it.
                     is_paced = any(
                         isinstance(each.source, ReplaySource) and each.source.options.speed for each in finite

@@ -106,16 +106,12 @@ class Worker:
         return 0.0 if since is None else self._clock.now() - since
 
     @property
-    def status(self) -> SourceStatus:
-        """Current status of the source."""
-        return self._status(_MAX_STREAMS)
-
-    @property
     def measures(self) -> SourceMeasures:
         """Measurements of the source for metrics."""
-        return SourceMeasures(self._status(), self._output.durations)
+        return SourceMeasures(self.status(None), self._output.durations)
 
-    def _status(self, max_streams: int | None = None) -> SourceStatus:
+    def status(self, max_streams: int | None = _MAX_STREAMS) -> SourceStatus:
+        """Return the status of the source; `max_streams`: limit of its streams, None for all."""
         run, output = self._run, self._output
         return SourceStatus(
             source=self.text,

@@ -190,19 +190,16 @@ class Px4ZenohNode:
         except (AddressError, DecodeError, NotAcceptedError):
             return  # its messages are rejected
         if alive and not token.node.startswith("nedbus_"):
-            self._subscribe(token.key)
+            key = token.key
+            if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
+                return
+            if key.domain not in self._nodes:
+                self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
+            self._entities += 1
+            self._subscriptions[key] = self._declare(subscription_token(key, self._zid, self._node, self._entities))
         elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
             with suppress(zenoh.ZError):  # the session may be closed already
                 self._subscriptions.pop(token.key).undeclare()
-
-    def _subscribe(self, key: TopicKey) -> None:
-        """Declare a subscription to a topic, for ROS 2 to list."""
-        if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
-            return
-        if key.domain not in self._nodes:
-            self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
-        self._entities += 1
-        self._subscriptions[key] = self._declare(subscription_token(key, self._zid, self._node, self._entities))
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
         with while_open():
