@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from nedbus_msgs import field_type
 
-from .layout import PayloadField, PayloadLayout
+from .layout import BASIC_TYPES, PayloadField, PayloadLayout
 from .records import Data, Information, LoggedText, Record, Subscription
 
 _FORM: Final = struct.Struct("<QB127s")
@@ -40,10 +40,6 @@ _MAX_UNPACKED: Final = 2**21  # bytes; PX4's have 170,000
 _MAX_MEMORY: Final = 2**27  # bytes for the dictionary of xz
 _MAX_PARTS: Final = 64  # components, groups of events or modes, and modes of a group; PX4 has 30
 _MAX_TEXT: Final = 200  # characters of a template, and of one argument; PX4's longest template has 120
-_TYPES: Final = {
-    "int8_t": "<b", "uint8_t": "<B", "int16_t": "<h", "uint16_t": "<H", "int32_t": "<i", "uint32_t": "<I",
-    "int64_t": "<q", "uint64_t": "<Q", "float": "<f",
-}  # fmt: skip
 _CHECKS: Final = ("arming_check", "health")
 _MARK = re.compile(
     r"\\(?P<escaped>.)"
@@ -117,8 +113,8 @@ class _EventMetadata:
         for name in types:
             space, _, base = name.rpartition("::")
             parts = (part for part in self._components.values() if part["namespace"] == (space or namespace))
-            enum = None if name in _TYPES else next(parts)["enums"][base]
-            code = _TYPES[enum["type"] if enum else name]
+            enum = None if name in BASIC_TYPES else next(parts)["enums"][base]
+            code = f"<{BASIC_TYPES[enum['type'] if enum else name].form}"
             values += struct.unpack_from(code, data, offset)
             offset += struct.calcsize(code)
             shown.append(_describe(enum, values[-1]) if enum else values[-1])
@@ -215,7 +211,7 @@ class Texts:
         if (timestamp, *key) in self._seen or (event := self._decode(fields["id"], bytes(fields["arguments"]))) is None:
             return None
         self._seen.append((timestamp, *key))
-        is_check = event.group in ("arming_check", "health")
+        is_check = event.group in _CHECKS
         if level >= _PROTOCOL and event.group == "arming_check":  # the begin of a report
             self._failed, self._before = {}, self._failed
         if level >= _PROTOCOL or not (is_check or event.group == "default"):
