@@ -91,7 +91,7 @@ class _Vehicle:
 class LogReceiver:
     """Reads a link in a thread of its own, so that PX4's log stream is acknowledged while publishing waits.
 
-    `send`: sends a MAVLink message to a peer; it must not wait. `clients`: those of vehicles since their heartbeats.
+    `send`: sends a MAVLink message to a peer; it must not wait. `vehicles`: those with a heartbeat so far.
     """
 
     def __init__(
@@ -105,8 +105,7 @@ class LogReceiver:
     ) -> None:
         self._reader, self._options, self._send = reader, options, send
         self._ids = system, component
-        self._vehicles: dict[int, _Vehicle] = {}
-        self.clients: dict[int, LogStreamClient] = {}
+        self.vehicles: dict[int, _Vehicle] = {}
         self._waiting: SimpleQueue[Received | Rejection | Exception] = SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-mavlink", daemon=True)
@@ -131,10 +130,10 @@ class LogReceiver:
             while not self._stop.is_set():
                 self._turn()
             end = time.monotonic() + _STOP_TIMEOUT
-            for vehicle in self._vehicles.values():
+            for vehicle in self.vehicles.values():
                 self._act(vehicle, vehicle.client.stop(time.monotonic()))
             while time.monotonic() < end and any(
-                vehicle.client.status.state == "stopping" for vehicle in self._vehicles.values()
+                vehicle.client.status.state == "stopping" for vehicle in self.vehicles.values()
             ):
                 self._turn()
         except Exception as exc:  # noqa: BLE001 - raised again by `read`, in the thread of the source
@@ -146,13 +145,13 @@ class LogReceiver:
             seen = self._take(item, has_room=has_room) if isinstance(item, Received) else item
             if has_room:
                 self._waiting.put(seen)
-        for vehicle in self._vehicles.values():
+        for vehicle in self.vehicles.values():
             self._act(vehicle, vehicle.client.tick(time.monotonic()))
 
     def _take(self, received: Received, *, has_room: bool) -> Received | Rejection:
         """Acknowledge a message and reassemble its data; without room it is lost, as if the link had lost it."""
         message, kind, now = received.message, received.message.get_type(), received.time
-        vehicle = self._vehicles.get(received.system)
+        vehicle = self.vehicles.get(received.system)
         if kind in _KINDS:
             target = message.target_system, message.target_component
             if vehicle is None or not vehicle.client.accepts(*target):
@@ -170,10 +169,8 @@ class LogReceiver:
         elif kind == "HEARTBEAT":
             if vehicle is None:
                 system, component = self._ids
-                client = self.clients[received.system] = LogStreamClient(
-                    self._options.log, system=system, component=component
-                )
-                vehicle = self._vehicles[received.system] = _Vehicle(received.system, client, received.peer)
+                client = LogStreamClient(self._options.log, system=system, component=component)
+                vehicle = self.vehicles[received.system] = _Vehicle(received.system, client, received.peer)
             vehicle.peer = received.peer
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             self._act(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))

@@ -140,8 +140,8 @@ class _LinkSession:
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
-        if system not in self._logs and self._receiver and (client := self._receiver.clients.get(system)):
-            self._logs[system] = LogStream(self._name_of(system), self._options, client)
+        if system not in self._logs and self._receiver and (found := self._receiver.vehicles.get(system)):
+            self._logs[system] = LogStream(self._name_of(system), self._options, found.client)
         return self._logs.get(system)
 
     def _name_of(self, system: int) -> str:

@@ -127,8 +127,8 @@ class Vehicle:
             for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
                 self._reported.add(number)
                 name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
-                text, extra = "%s: the vehicle does not send %s on request", about("unsupported", address)
-                _log.info(text, address, name, extra=extra)
+                extra = about("unsupported", address)
+                _log.info("%s: the vehicle does not send %s on request", address, name, extra=extra)
         if not self._pending:
             return None
         number = self._pending.pop(0)

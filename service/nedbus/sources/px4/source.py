@@ -36,7 +36,7 @@ from nedbus.transport import (
 )
 from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
 
-from .streams import Definitions, Form, NotAcceptedError, Px4Stream, StreamRegistry
+from .streams import Definitions, NotAcceptedError, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
@@ -153,7 +153,12 @@ class Px4ZenohNode:
                 is_unexpected = stream.not_carried and not stream.tokens and not is_bridged  # else an absence, or none
                 reason = f"{stream.not_carried}: not selected by topics= or msg="
                 return Rejection(key, reason) if is_unexpected else None
-            definition, layout, unknown = stream.form or self._find_form(stream)
+            if (form := stream.form) is None:
+                form = self._streams.form_of(stream)
+                if form.unknown:
+                    extra = about("newer-layout", stream.address, source="px4-zenoh")
+                    _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
+            definition, layout, unknown = form
             address = stream.address
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
@@ -173,13 +178,6 @@ class Px4ZenohNode:
             _log.warning("%s: the publisher restarted, as the vehicle rebooted", key, extra=extra)
         source = _INPUT if stream.is_input else None
         return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
-
-    def _find_form(self, stream: Px4Stream) -> Form:
-        form = self._streams.form_of(stream)
-        if form.unknown:
-            extra = about("newer-layout", stream.address, source="px4-zenoh")
-            _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
-        return form
 
     def _on_token(self, text: str, *, alive: bool) -> None:
         now = time.monotonic()
