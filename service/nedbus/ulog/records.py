@@ -207,8 +207,7 @@ class LoggedStream:
     def __init__(self, vehicle: str, subscription: Subscription) -> None:
         topic, layout = subscription.name, subscription.layout
         self.subscription = subscription
-        self.names = tuple(field.name for field in layout.fields)
-        """Its fields in the log."""
+        self.names = tuple(field.name for field in layout.fields)  # in the log
         self.definition = BY_TOPIC.get(topic) or _define(
             "".join(part.capitalize() for part in topic.split("_")),
             tuple((field.name, field.kind) for field in layout.fields),

@@ -11,8 +11,7 @@ from typing import Any, Final
 
 from nedbus.errors import ConfigError, SourceError
 
-AUTOPILOT: Final = 1
-"""Component id of an autopilot; cameras, gimbals and ground stations have others."""
+AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 Peer = Any  # address of the other side, as its socket has it
 
 _CHANGES: Final = 5  # of the address within the window; a reconnect is one, and a packet that overtakes two more

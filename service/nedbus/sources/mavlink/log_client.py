@@ -8,7 +8,6 @@ from typing import Final, Literal, NamedTuple
 from pymavlink.dialects.v20 import common as dialect
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
-"""MAV_CMD by kind of command."""
 
 _TRIES: Final = 3  # of a command without an answer
 _RESTARTS: Final = 2  # after a START that was accepted without data

@@ -21,9 +21,7 @@ from .log_reassembly import Piece
 
 _log = logging.getLogger(__name__)
 
-SOURCE: Final = "mavlink-ulog"
-"""`sample.source` of a message from the stream; that of a converted one is `mavlink`."""
-
+_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; that of converted ones is `mavlink`
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _PIECE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
@@ -175,7 +173,7 @@ class LogStream:
         self._carried.add(stream.address)
         lost, self._owed, dropout, self._dropout = self._owed, 0, self._dropout, 0.0
         definition = stream.definition
-        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=SOURCE, dropout=dropout)
+        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
         """Count a gap; bounds are those of records of all kinds, by their least and greatest size."""
