@@ -15,7 +15,8 @@ from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.events import Account
 from nedbus.health import SourceStatus
-from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
+from nedbus.sources import Rejection, ReplayRun, ReplaySource, Source, SourceMessage
+from nedbus.sources.options import RecordedOptions
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition
 from tests.flights.first_message import decode, encode_fields
@@ -33,8 +34,7 @@ class StandingClock:
     seconds: float = 0.0
     waits: list[float] = field(default_factory=list)
 
-    @property
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         return self.seconds >= self.stop_at
 
     def now(self) -> float:
@@ -43,7 +43,7 @@ class StandingClock:
     def wait(self, seconds: float) -> bool:
         self.waits.append(round(seconds, 6))
         self.seconds += seconds
-        return self.stopped
+        return self.is_set()
 
 
 @dataclass
@@ -95,8 +95,12 @@ class FakeReplay:
     speed: float | None = 1.0
     loop: bool = False
     wait: bool = False
-    finite: bool = True
     run: Callable[[], Iterator[SourceMessage]] | None = None
+
+    @property
+    def source(self) -> ReplaySource:
+        options = RecordedOptions.model_construct(speed=self.speed, loop=self.loop, wait=self.wait)
+        return ReplaySource(options, self.open)
 
     def open(self) -> ReplayRun:
         if self.failures:
@@ -141,7 +145,9 @@ class Ran:
         self.ends = 0
         self.registry = FakeRegistry(clock)
         self.worker = Worker(
-            Planned(0, "ulog:flight.ulg", "1", cast("Source", source)),
+            Planned(
+                0, "ulog:flight.ulg", "1", source.source if isinstance(source, FakeReplay) else cast("Source", source)
+            ),
             cast("PublisherRegistry", self.registry),
             clock=cast("Clock", clock),
             account=Account(),
@@ -154,7 +160,7 @@ class Ran:
 
     @property
     def status(self) -> SourceStatus:
-        return self.worker.status
+        return self.worker.status()
 
     @property
     def times(self) -> list[float]:

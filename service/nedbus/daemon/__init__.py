@@ -1,6 +1,5 @@
 """The service: a Daemon runs one Worker per source, and answers queries for its status."""
 
-from .daemon import Daemon
+from .daemon import Daemon, plan_sources
 from .output import TOO_MANY
-from .plan import Planned, plan_sources
-from .worker import STATES, SourceMeasures
+from .worker import STATES, Planned, SourceMeasures

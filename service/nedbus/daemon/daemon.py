@@ -7,28 +7,63 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Final, Literal
 
 from nedbus import clock
 from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus, reply_parts
-from nedbus.errors import ConnectError
+from nedbus.errors import ConfigError, ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
-from nedbus.settings import Settings, locate_setting
-from nedbus.sources import LiveSource
-from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
+from nedbus.settings import Settings, locate_setting, locate_source
+from nedbus.sources import ReplaySource, Source, parse_source
+from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
-from .plan import Planned, is_finite, plan_sources
-from .worker import SourceMeasures, Worker, apply_plan, stop_workers
+from .worker import Planned, SourceMeasures, Worker, stop_workers
 from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s for sources to stop at shutdown
+_RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _POLL: Final = 1.0  # s between two polls of silent streams and of the link
 _RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
+_TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
+
+
+def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:
+    """Open the sources for a service with these endpoints; also return the mistakes, at most one per source."""
+    plan: list[Planned] = []
+    mistakes: list[ConfigError] = []
+    if not settings.source and "source" not in settings.left_out:
+        reason = "no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"
+        mistakes.append(ConfigError("source", reason))
+    tls = None
+    try:
+        tls = settings.tls
+    except ConfigError as exc:
+        if not settings.left_out.intersection(_TLS):
+            mistakes.append(
+                locate_setting(settings, next(name for name in _TLS if getattr(settings, name)), exc.reason)
+            )
+    routers = tuple(map(dial_endpoint, endpoints))
+    for index, given in enumerate(settings.source):
+        try:
+            spec = parse_source(given)
+            source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls)
+        except ConfigError as exc:
+            mistakes.append(locate_source(settings, index, exc))
+        else:
+            plan.append(Planned(index, spec.text, settings.vehicle, source))
+    if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
+        reason = "no source ever ends: give sim: a duration, or remove loop=1 from ulog:"
+        mistakes.append(ConfigError("until_done", reason))
+    return plan, mistakes
+
+
+def is_finite(source: Source) -> bool:
+    """Return True if a source ends by itself."""
+    return isinstance(source, ReplaySource) and source.finite
 
 
 class Daemon:
@@ -82,7 +117,7 @@ class Daemon:
     @property
     def sources(self) -> tuple[SourceStatus, ...]:
         """Current status of each source."""
-        return tuple(worker.status for worker in self._workers)
+        return tuple(worker.status() for worker in self._workers)
 
     @property
     def refused(self) -> Mapping[str, bool]:
@@ -126,7 +161,6 @@ class Daemon:
         )
 
     def _answer(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
-        """Answer a query with the status, or with the events if it has the parameter for them."""
         within, seconds = parameter(ACCOUNT_PARAMETER), 0.0
         with suppress(ValueError):
             seconds = float(within or 0.0)
@@ -151,17 +185,12 @@ class Daemon:
             self._settings, self._plan = settings, plan
             if self._registry is None:
                 return "no source is running yet"
-            before, make_worker = self._workers, partial(self._make_worker, self._registry)
-            self._workers = apply_plan(plan, before, make_worker)
+            before, kept = len(self._workers), self._apply_plan(self._registry)
         self._changed.set()
-        kept = len(set(before).intersection(self._workers))
-        return f"{len(plan) - kept} started, {len(before) - kept} stopped, {kept} unchanged"
+        return f"{len(plan) - kept} started, {before - kept} stopped, {kept} unchanged"
 
     def run(self) -> bool:
-        """Publish until done or stopped; return False if a source has failed.
-
-        Raises ListenError if the embedded router cannot listen, ConfigError for a mistake in its file.
-        """
+        """Publish until done or stopped; return False if a source has failed; raise ListenError or ConfigError."""
         session = self._session = self._open()
         if session is None:
             return True
@@ -171,7 +200,7 @@ class Daemon:
             queries.answer_json(status_key(self.id, prefix=settings.prefix), self._answer)
             with self._planning:
                 self._registry = registry
-                self._workers = apply_plan(self._plan, self._workers, partial(self._make_worker, registry))
+                self._apply_plan(registry)
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
             self._wait(registry, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
@@ -185,15 +214,28 @@ class Daemon:
                 self._permission.close()
         return not any(source.state == "failed" for source in self.sources)
 
-    def _make_worker(self, registry: PublisherRegistry, planned: Planned) -> Worker:
-        return Worker(
-            planned,
-            registry,
-            router=self._session if self.role == "router" else None,
-            account=self.account,
-            retry=not self.until_done,
-            on_end=self._changed.set,
-        )
+    def _apply_plan(self, registry: PublisherRegistry) -> int:
+        """Start new sources and stop removed ones, in the order of the plan; return the number of unchanged ones."""
+        left, ordered, new = list(self._workers), list[Worker](), list[Worker]()
+        router = self._session if self.role == "router" else None
+        for planned in self._plan:
+            worker = next((each for each in left if each.planned == planned), None)
+            if worker is not None:
+                left.remove(worker)
+            else:
+                retry, on_end = not self.until_done, self._changed.set
+                worker = Worker(planned, registry, router=router, account=self.account, retry=retry, on_end=on_end)
+                new.append(worker)
+            ordered.append(worker)
+        stop_workers(left, _RETIRE_TIMEOUT, release=True)
+        for worker in left:
+            if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
+                text = "%s: still stopping after %.0f s, maybe because of a slow reader"
+                _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
+        for worker in new:  # after the others have stopped: they may use the same addresses
+            worker.thread.start()
+        self._workers = ordered
+        return len(ordered) - len(new)
 
     def _make_plan(self, settings: Settings) -> list[Planned]:
         """Open the sources of these settings; raise ConfigError for the first mistake, with its location."""
@@ -234,10 +276,12 @@ class Daemon:
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
-                if all(worker.status.ended for worker in finite):
+                if all(worker.status().ended for worker in finite):
                     # Heartbeats tell readers of the last message, in case they missed it.
-                    speeds = [worker.source.speed for worker in finite if not isinstance(worker.source, LiveSource)]
-                    self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
+                    is_paced = any(
+                        isinstance(each.source, ReplaySource) and each.source.options.speed for each in finite
+                    )
+                    self._stop.wait(2 * HEARTBEAT if is_paced else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
             self._changed.wait(_POLL)

@@ -42,23 +42,16 @@ class _Stream:
 
 
 class SourceOutput:
-    """Publish the messages of a source.
-
-    `name`: name of the source in the log; `text`: the source as configured; `now`: monotonic clock [s].
-    """
+    """Publish the messages of a source with this name in the log and configured text; `now`: monotonic clock [s]."""
 
     def __init__(
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
-        self.rejections: Counter[str] = Counter()
-        """Number of rejected messages by violated rule."""
-        self.absence = Absence()
-        """Topics that vehicles publish and a live source does not deliver now."""
-        self.log_streams: dict[str, LogStreamStatus] = {}
-        """The ULog stream of each vehicle of a live source."""
-        self.durations = Histogram(_DURATIONS)
-        """Time to validate, encode and send a message [s]."""
+        self.rejections: Counter[str] = Counter()  # messages by violated rule
+        self.absence = Absence()  # topics that vehicles publish and a live source does not deliver now
+        self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
+        self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
         self._text = text
         self._kind = text.partition(":")[0]
@@ -104,10 +97,7 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher for an address if it has none of this definition.
-
-        Raises AddressInUseError if another source has one.
-        """
+        """Open a publisher for an address without one of this definition; raise AddressInUseError if another has it."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
@@ -140,7 +130,8 @@ class SourceOutput:
             fields.setdefault("timestamp", None)  # else invalid: it is never this host's
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
-            self._reject_invalid(message, _rule_of(exc), exc.reason)
+            field, violation = exc.violations[0]
+            self._reject_invalid(message, f"{field}: {violation.partition(' (')[0]}", exc.reason)  # without values
             return
         self.durations.add(time.perf_counter() - start)
         self.published += 1
@@ -240,10 +231,7 @@ class SourceOutput:
             _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
-        """Republish the topics without a rate of a vehicle that is back: it would not repeat them.
-
-        After a reboot they are outdated, and are dropped.
-        """
+        """Republish the topics without a rate of a vehicle that is back, as it will not, unless it rebooted since."""
         vehicle = message.address.vehicle
         known = [
             (address, stream, stream.last)
@@ -289,9 +277,3 @@ def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
 
 def _time_of(message: SourceMessage) -> int:
     return cast("int", message.fields.get("timestamp", 0))
-
-
-def _rule_of(error: InvalidMessageError) -> str:
-    """Return the first violated rule: the field, and the rule without values."""
-    field, rule = error.violations[0]
-    return f"{field}: {rule.partition(' (')[0]}"

@@ -3,21 +3,20 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, SourceMessage
+from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
 from .output import SourceOutput
-from .plan import Planned
 
 _log = logging.getLogger(__name__)
 
@@ -25,12 +24,21 @@ _MIN_RUN: Final = 0.1  # s, minimum of a looped run: a log of one message must n
 _MAX_DELAY: Final = 1.0  # s: a replay that is later than this shifts its schedule instead of catching up
 _STALE_POLL: Final = 0.5  # s between two checks for stale streams
 _READER_POLL: Final = 0.05  # s between two checks for a reader
-_RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _MAX_STREAMS: Final = 100  # in a status, which must fit into one message
 
 _Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A configured source, number `index` in the settings; a reload leaves it running if text and vehicle are equal."""
+
+    index: int = field(compare=False)
+    text: str
+    vehicle: str
+    source: Source = field(compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,19 +57,10 @@ class SourceMeasures:
         return {each.address: stream_state(each.health, publishers=each.address in alive).name for each in streams}
 
 
-class Clock:
-    """Monotonic time, and waits that end early when the worker is stopped; replaced in tests."""
+class Clock(threading.Event):
+    """Monotonic time, and waits that end early when the worker is stopped, as this is set; replaced in tests."""
 
-    def __init__(self) -> None:
-        self._event = threading.Event()
-        self.now = time.monotonic
-        self.stop = self._event.set
-        self.wait = self._event.wait
-
-    @property
-    def stopped(self) -> bool:
-        """True once the worker has to stop."""
-        return self._event.is_set()
+    now = staticmethod(time.monotonic)
 
 
 class Worker:
@@ -107,16 +106,12 @@ class Worker:
         return 0.0 if since is None else self._clock.now() - since
 
     @property
-    def status(self) -> SourceStatus:
-        """Current status of the source."""
-        return self._status(_MAX_STREAMS)
-
-    @property
     def measures(self) -> SourceMeasures:
         """Measurements of the source for metrics."""
-        return SourceMeasures(self._status(), self._output.durations)
+        return SourceMeasures(self.status(None), self._output.durations)
 
-    def _status(self, max_streams: int | None = None) -> SourceStatus:
+    def status(self, max_streams: int | None = _MAX_STREAMS) -> SourceStatus:
+        """Return the status of the source; `max_streams`: limit of its streams, None for all."""
         run, output = self._run, self._output
         return SourceStatus(
             source=self.text,
@@ -153,7 +148,7 @@ class Worker:
     def stop(self, *, release: bool) -> None:
         """Stop the source; with `release`, its thread closes the publishers, which may wait for slow readers."""
         self._release = release
-        self._clock.stop()
+        self._clock.set()
 
     def _run_and_release(self) -> None:
         self.run()
@@ -164,7 +159,7 @@ class Worker:
 
     def _run_until_done(self) -> None:
         failures = 0
-        while not self._clock.stopped:
+        while not self._clock.is_set():
             start = self._clock.now()
             try:
                 if isinstance(self.source, LiveSource):
@@ -180,7 +175,7 @@ class Worker:
                 _log.exception("%s: unexpected error", self._name, extra=about("retrying", source=self._name))
                 self._fail(_describe(exc))
             else:
-                if isinstance(self.source, LiveSource) or not self.source.loop:
+                if isinstance(self.source, LiveSource) or self.source.finite:
                     self._end("failed" if self._error else "done", self._error)
                     return
                 failures = 0
@@ -197,7 +192,7 @@ class Worker:
             failures += 1
 
     def _run_replay(self, source: ReplaySource) -> None:
-        run, last = source.open(), self._run
+        run, last, speed = source.open(), self._run, source.options.speed
         if last is None or last.summary != run.summary:
             _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
             self._warned.clear()
@@ -205,36 +200,35 @@ class Worker:
             run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that come later
         self._warn(run)
         self._run, self._done = run, 0
-        if source.wait and last is None:
+        if source.options.wait and last is None:
             self._state = "waiting"
             _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
             while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
                 pass
         self._output.release(keep=run.addresses)
-        self._output.claim_all(run, lossless=source.speed is None)
+        self._output.claim_all(run, lossless=speed is None)
         self._set_state("running")
         start = self._clock.now()
         for message in run.messages:
-            if source.speed is not None:
-                early = start + message.due / source.speed - self._clock.now()
+            if speed is not None:
+                early = start + message.due / speed - self._clock.now()
                 if early < -_MAX_DELAY:
                     extra = about("late", source=self._name)
                     _log.warning("%s: %.1f s late, shifting the schedule", self._name, -early, extra=extra)
                     start -= early
                 elif early > 0:
                     self._clock.wait(early)
-            if self._clock.stopped:
+            if self._clock.is_set():
                 return
             # A lossless publisher may wait for its readers.
-            self._turn = None if source.speed is None else self._clock.now()
-            self._output.publish_replay(message, lossless=source.speed is None)
+            self._turn = None if speed is None else self._clock.now()
+            self._output.publish_replay(message, lossless=speed is None)
             self._turn = None
             self._done += 1
         self._warn(run)
         self._error = run.damage
 
     def _warn(self, run: ReplayRun) -> None:
-        """Log the warnings of a run that were not logged yet."""
         for warning in run.warnings:
             if warning not in self._warned:
                 self._warned.add(warning)
@@ -246,7 +240,7 @@ class Worker:
             next_poll = 0.0
             for item in items:
                 now = self._turn = self._clock.now()
-                if self._clock.stopped:
+                if self._clock.is_set():
                     return
                 if isinstance(item, Rejection):
                     self._output.reject(item)
@@ -268,7 +262,7 @@ class Worker:
         self._state, self._error = state, None
 
     def _end(self, state: Literal["done", "failed"], reason: str | None) -> None:
-        if not self._clock.stopped:
+        if not self._clock.is_set():
             self._state, self._error = state, reason
             text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
             event = "failed" if state == "failed" else "done"
@@ -285,27 +279,6 @@ class Worker:
 
 def _describe(error: BaseException) -> str:
     return f"unexpected {type(error).__name__}: {error}"
-
-
-def apply_plan(
-    plan: Iterable[Planned], workers: Sequence[Worker], make_worker: Callable[[Planned], Worker]
-) -> list[Worker]:
-    """Start new sources, stop removed ones, and return the workers in the order of the plan."""
-    left, ordered = list(workers), []
-    for planned in plan:
-        same = next((worker for worker in left if worker.planned == planned), None)
-        if same is not None:
-            left.remove(same)
-        ordered.append(same or make_worker(planned))
-    stop_workers(left, _RETIRE_TIMEOUT, release=True)
-    for worker in left:
-        if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
-            text = "%s: still stopping after %.0f s, maybe because of a slow reader"
-            _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
-    for worker in ordered:  # after the others have stopped: they may use the same addresses
-        if worker not in workers:
-            worker.thread.start()
-    return ordered
 
 
 def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:

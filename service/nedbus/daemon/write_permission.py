@@ -58,16 +58,13 @@ class WritePermission:
         self._stop = threading.Event()
         self._denials: dict[str, int] = {}  # consecutive ones by vehicle; 0 if allowed, no entry if unknown
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
+        self.start = self._thread.start  # checks after changes of the link, for new vehicles, and rarely in between
 
     @property
     def refused(self) -> dict[str, bool]:
         """Known verdicts of the router by vehicle: True if access rules refuse it."""
         known = self._denials.copy().items()
         return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _BELIEVED}
-
-    def start(self) -> None:
-        """Start the thread; it checks after changes of the link, for new vehicles, and rarely in between."""
-        self._thread.start()
 
     def close(self) -> None:
         """Stop the thread; close the session first to abort a running check."""
@@ -106,7 +103,17 @@ class WritePermission:
                 self._denials[vehicle] = number + 1
             elif not number:  # else the router was slow: rules do not change while a link is up
                 self._denials.pop(vehicle, None)
-        self._log_changes(before)
+        now = self.refused
+        if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
+            _log.warning(
+                "the router refuses %s: its messages reach no reader; check that its access rules name it, and that"
+                " %s is its certificate ('nedbus pki rules', docs/security.md); checking again",
+                _name(new),
+                self._tls.certificate,
+                extra=about("refused"),
+            )
+        if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
+            _log.info("the router accepts %s now", _name(mended), extra=about("accepted"))
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
@@ -128,22 +135,8 @@ class WritePermission:
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}
 
-    def _log_changes(self, before: Mapping[str, bool]) -> None:
-        now = self.refused
-        if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
-            _log.warning(
-                "the router refuses %s: its messages reach no reader; check that its access rules name it, and that"
-                " %s is its certificate ('nedbus pki rules', docs/security.md); checking again",
-                _name(new),
-                self._tls.certificate,
-                extra=about("refused"),
-            )
-        if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router accepts %s now", _name(mended), extra=about("accepted"))
-
 
 def _routers_of(session: Session) -> set[str]:
-    """Return the ids of the routers that a session is linked to."""
     try:
         with while_open():
             return {str(zid) for zid in session.info.routers_zid()}

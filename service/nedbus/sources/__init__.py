@@ -3,6 +3,5 @@
 from .account import KEPT_OF_FILE, FileAccount, Flights, follow, read_account
 from .conversion import convert
 from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
-from .mavlink.link import Link, open_link, parse_link
-from .mavlink.senders import Senders, why_ignored
-from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
+from .mavlink.link import Link, Senders, open_link, parse_link, why_ignored
+from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage

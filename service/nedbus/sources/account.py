@@ -19,9 +19,7 @@ from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
 from .source import ReplayRun, ReplaySource, SourceMessage
 
-KEPT_OF_FILE: Final = 100_000
-"""Events kept per file; the oldest are discarded."""
-
+KEPT_OF_FILE: Final = 100_000  # events; the oldest are discarded
 _AHEAD: Final = 1000  # messages read for the start of a file
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are

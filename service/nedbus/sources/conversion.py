@@ -23,13 +23,7 @@ _CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses only a few se
 _MAX_LOGGED: Final = 5  # rejected messages logged per file
 
 
-def convert(
-    run: ReplayRun,
-    path: Path,
-    *,
-    source: str,
-    on_progress: Callable[[int], object],
-) -> str:
+def convert(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
     The publish time of a message is its PX4 timestamp, its log time that of the first message plus `due`.

@@ -1,8 +1,9 @@
 """Table of source kinds, and parser for sources: `KIND:TARGET?OPTION=VALUE&...`, or a TOML table."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Final, cast
 from urllib.parse import parse_qsl, unquote, urlencode
@@ -15,12 +16,12 @@ from nedbus.recording import find_format, format_of
 from nedbus.transport import Tls
 
 from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, SimulatorOptions
-from .source import Source, SourceContext
+from .source import LiveSource, ReplaySource, Source
 
 
 @dataclass(frozen=True, slots=True)
 class SourceKind:
-    """One kind of source: its options, its target, and its class, which is imported on first use.
+    """One kind of source: its options, its target, and its function or class, which is imported on first use.
 
     `target`: name of the part after the colon; None without one, in brackets if it is optional.
     `extra`: the extra of nedbus that it requires.
@@ -29,7 +30,7 @@ class SourceKind:
     options: type[Options]
     target: str | None
     module: str
-    class_name: str
+    name: str
     extra: str = ""
 
     def accepts(self, target: str) -> bool:
@@ -38,10 +39,10 @@ class SourceKind:
 
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
-    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator.source", "SimulatorSource"),
-    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
-    "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "McapSource", "mcap"),
-    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "TlogSource", "mavlink"),
+    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "open_simulator"),
+    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "open_ulog"),
+    "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "open_mcap", "mcap"),
+    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "open_tlog", "mavlink"),
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
@@ -58,16 +59,15 @@ class SourceSpec:
     options: Options
 
     def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
-        """Create the source, for a service with this default vehicle, router endpoints and TLS files.
-
-        Raises ConfigError for an invalid target, a path that is not a regular file, or a missing extra.
-        """
+        """Create the source for a service; raise ConfigError for a bad target or file, or a missing extra."""
         kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
         # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
             raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one first")
-        make = cast("Callable[..., Source]", getattr(needs(kind.extra, kind.module), kind.class_name))
-        return make(self.target, self.options, SourceContext(vehicle, routers, tls))
+        make = getattr(needs(kind.extra, kind.module), kind.name)
+        if isinstance(self.options, RecordedOptions | SimulatorOptions):
+            return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
+        return cast("LiveSource", make(self.target, self.options, vehicle, routers, tls))
 
 
 def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
@@ -94,7 +94,14 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
         options = kind.options.model_validate(dict(pairs))
     except ValidationError as exc:
-        reason, name = _explain(exc, kind)
+        detail = exc.errors()[0]
+        name = str(detail["loc"][0])
+        if (field := kind.options.model_fields.get(name)) is None:
+            reason = f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}"
+        elif isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
+            reason = str(cause)
+        else:
+            reason = f"{name}={detail['input']} is invalid: expected {field.description}"
         raise ConfigError(f"source {text!r}", reason, key=name) from exc
     except ValueError:
         hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
@@ -107,10 +114,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
 
 
 def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
-    """Return the source that replays a file with these options, as text: `ulog:flight.ulg?vehicle=7`.
-
-    Raises ConfigError for an unknown file suffix.
-    """
+    """Return the source that replays a file, as `ulog:flight.ulg?vehicle=7`; raise ConfigError for another suffix."""
     name = format_of(path)
     return _join(name, SOURCE_KINDS[name], str(path), {key: value for key, value in options.items() if value})
 
@@ -144,15 +148,3 @@ def _join(name: str, kind: SourceKind, target: str, options: Mapping[str, str]) 
     path = target.replace("%", "%25").replace("?", "%3F") if kind.target == "FILE" else target
     query = urlencode(options, safe=":,/")
     return f"{name}:{path}?{query}" if query else f"{name}:{path}"
-
-
-def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:
-    """Return the error text for an invalid option, and its name."""
-    detail = error.errors()[0]
-    name = str(detail["loc"][0])
-    field = kind.options.model_fields.get(name)
-    if field is None:
-        return f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}", name
-    if isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
-        return str(cause), name
-    return f"{name}={detail['input']} is invalid: expected {field.description}", name

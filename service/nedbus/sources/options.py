@@ -1,7 +1,8 @@
 """The options of each kind of source, as Pydantic models."""
 
+import re
 from collections.abc import Collection, Mapping, Set
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
@@ -29,12 +30,6 @@ def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
     return vehicles
 
 
-def _check_layout(name: str) -> str:
-    if name not in (*RELEASES, *DEFAULT.layouts):
-        raise ValueError(name)
-    return name
-
-
 def _parse_topics(text: object) -> object:
     """Parse `TOPIC,TOPIC`; the name of a message stands for all of its topics."""
     if not isinstance(text, str):
@@ -47,7 +42,6 @@ def _parse_topics(text: object) -> object:
 
 
 def _topics_of(name: str) -> Set[str]:
-    """Return all topics of a message, or the topic itself."""
     return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 
@@ -55,6 +49,7 @@ _Origin = tuple[
     Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
     Annotated[float, Field(ge=-500, le=1e4)],
 ]  # fmt: skip
+_LAYOUTS: Final = f"^({'|'.join(map(re.escape, (*RELEASES, *DEFAULT.layouts)))})$"
 Vehicle = Annotated[str, AfterValidator(check_vehicle)]
 Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
@@ -117,15 +112,10 @@ class Px4ZenohOptions(Options):
     )
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for topics without a namespace")
     vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
-    layout: Annotated[str, AfterValidator(_check_layout)] | None = Field(
+    layout: Annotated[str, Field(pattern=_LAYOUTS)] | None = Field(
         None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(RELEASES)}"
     )
     msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
-
-
-def _parse_log(text: object) -> object:
-    """Parse `log=`: 0 or 1, or `armed` and `take`, separated by a comma."""
-    return frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text
 
 
 def _check_save(folder: str, info: ValidationInfo) -> str:
@@ -146,7 +136,10 @@ class MavlinkOptions(Options):
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"
     )
-    log: Annotated[frozenset[Literal["1", "armed", "take"]], BeforeValidator(_parse_log)] = Field(
+    log: Annotated[
+        frozenset[Literal["1", "armed", "take"]],
+        BeforeValidator(lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text),
+    ] = Field(
         frozenset(),
         description="1 to request the ULog stream of each PX4 on the link, armed to start it in the air as well, take"
         " to end the stream of another client, or armed,take",

@@ -1,12 +1,14 @@
 """The two kinds of sources, replay and live, and the messages they yield."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from nedbus.client import LogStreamStatus
-from nedbus.transport import Session, Tls
+from nedbus.transport import Session
 from nedbus_msgs import Address, Definition
+
+from .options import RecordedOptions, SimulatorOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +38,7 @@ class SourceMessage:
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Input that a live source could not turn into a message.
-
-    `where`: its key, link or address; each is logged once.
-    `count`: number of rejected messages.
-    """
+    """Input that a live source could not turn into a message; each `where` (key, link or address) is logged once."""
 
     where: str
     reason: str
@@ -88,33 +86,17 @@ class ReplayRun:
 
 
 @dataclass(frozen=True, slots=True)
-class SourceContext:
-    """Settings of the service that runs a source.
+class ReplaySource:
+    """A source that can be replayed, once or repeatedly; `open` raises SourceError if it has no message to read."""
 
-    `vehicle`: the name for sources that set none.
-    `routers`: endpoints of the service's router; `tls`: the files to connect to them.
-    """
+    options: RecordedOptions | SimulatorOptions
+    open: Callable[[], ReplayRun]
 
-    vehicle: str
-    routers: tuple[str, ...] = ()
-    tls: Tls | None = None
-
-
-class ReplaySource(Protocol):
-    """A source that can be replayed, once or repeatedly.
-
-    `finite`: it ends by itself; `loop`: it restarts at its end; `wait`: it waits for a subscriber before it starts.
-    `speed`: factor of real time; None for as fast as readers receive, without loss.
-    """
-
-    finite: bool
-    loop: bool
-    wait: bool
-    speed: float | None
-
-    def open(self) -> ReplayRun:
-        """Open it for one run; raise SourceError if it cannot be opened or has no messages."""
-        ...
+    @property
+    def finite(self) -> bool:
+        """True if it ends by itself."""
+        options = self.options
+        return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
 
 @runtime_checkable

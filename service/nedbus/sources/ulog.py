@@ -11,7 +11,7 @@ from nedbus.ulog import SPOKEN, LoggedStream
 from nedbus_msgs import ALL, DEFAULT, Address
 
 from .options import RecordedOptions
-from .source import ReplayRun, SourceContext, SourceMessage
+from .source import ReplayRun, SourceMessage
 
 _AHEAD: Final = 1000  # messages read when a log is opened: their addresses are known from the start
 _MAX_STEP: Final = 1_000_000  # us; a longer step must be confirmed by the next message
@@ -19,60 +19,47 @@ _MAX_GAP: Final = 60_000_000  # us; a longer step is skipped
 _MAX_BEHIND: Final = 1000  # messages in a row that are older than that; then the clock goes back
 
 
-class UlogSource:
-    """A .ulg file, read chunk by chunk."""
+def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:
+    """Read the beginning; raise SourceError if it is not a ULog file or has none of the requested topics."""
+    path = Path(file).expanduser()
+    reader = UlogReader(path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=default_vehicle)
+    run = ReplayRun(iter(()), {}, None, "", position=0)
+    messages = _read(reader, run, path, options)
+    ahead = list(islice(messages, _AHEAD))
+    run.messages = (message for part in (ahead, messages) for message in part)
+    run.total, run.boot_utc = path.stat().st_size, reader.boot_utc
+    streams = list(reader.streams.values())
+    layouts = " and ".join(sorted({_layout_name(each) for each in streams if each.definition is DEFAULT}))
+    layout = f", layout {layouts}" if layouts else ""
+    run.summary = f"vehicle {streams[0].address.vehicle}{layout}, {run.total / 1e6:.1f} MB"
+    run.warnings = run.warnings or tuple(_warnings_of(reader))
+    return run
 
-    def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
-        self._path, self._options = Path(path).expanduser(), options
-        self._default_vehicle = context.vehicle
-        self.finite, self.loop = not options.loop, options.loop
-        self.speed, self.wait = options.speed, options.wait
 
-    def open(self) -> ReplayRun:
-        """Read the beginning; raise SourceError if it is not a ULog file or has none of the requested topics."""
-        options = self._options
-        reader = UlogReader(
-            self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
-        )
-        run = ReplayRun(iter(()), {}, None, "", position=0)
-        messages = self._read(reader, run)
-        ahead = list(islice(messages, _AHEAD))
-        run.messages = (message for part in (ahead, messages) for message in part)
-        run.total, run.boot_utc = self._path.stat().st_size, reader.boot_utc
-        streams = list(reader.streams.values())
-        layouts = " and ".join(sorted({_layout_name(each) for each in streams if each.definition is DEFAULT}))
-        layout = f", layout {layouts}" if layouts else ""
-        run.summary = f"vehicle {streams[0].address.vehicle}{layout}, {run.total / 1e6:.1f} MB"
-        run.warnings = run.warnings or tuple(_warnings_of(reader))
-        return run
-
-    def _read(self, reader: UlogReader, run: ReplayRun) -> Iterator[SourceMessage]:
-        """Yield the messages of a log, and update its run."""
-        clock = _Clock()
-        for due, stream, fields in clock.pace(reader):
-            run.addresses[stream.address], run.position = stream.definition, reader.position
-            dropout, reader.dropout = reader.dropout, 0.0
-            yield SourceMessage(due, stream.address, fields, definition=stream.definition, dropout=dropout)
-        warnings = _warnings_of(reader)
-        for address, count in clock.unordered.items():
-            warnings.append(f"{address}: {count} timestamps out of order; the log's own order is kept")
-        warnings += self._options.absent_from({address.topic for address in reader.streams}, "this log")
-        if clock.gaps:
-            warnings.append(f"skipped {clock.gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps")
-        run.warnings = tuple(warnings)
-        if reader.damaged:
-            run.damage = f"{self._path}: messages lost to damage: {'; '.join(reader.warnings)}"
+def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptions) -> Iterator[SourceMessage]:
+    """Yield the messages of a log, chunk by chunk, and update its run."""
+    clock = _Clock()
+    for due, stream, fields in clock.pace(reader):
+        run.addresses[stream.address], run.position = stream.definition, reader.position
+        dropout, reader.dropout = reader.dropout, 0.0
+        yield SourceMessage(due, stream.address, fields, definition=stream.definition, dropout=dropout)
+    warnings = _warnings_of(reader)
+    for address, count in clock.unordered.items():
+        warnings.append(f"{address}: {count} timestamps out of order; the log's own order is kept")
+    warnings += options.absent_from({address.topic for address in reader.streams}, "this log")
+    if clock.gaps:
+        warnings.append(f"skipped {clock.gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps")
+    run.warnings = tuple(warnings)
+    if reader.damaged:
+        run.damage = f"{path}: messages lost to damage: {'; '.join(reader.warnings)}"
 
 
 class _Clock:
-    """A clock that follows the timestamps of a log from the start of logging, and does not wait for outliers.
-
-    `gaps`: number of steps that were skipped as too long. `unordered`: number of timestamps out of order.
-    """
+    """A clock that follows the timestamps of a log from the start of logging, and does not wait for outliers."""
 
     def __init__(self) -> None:
-        self.gaps = 0
-        self.unordered: Counter[Address] = Counter()
+        self.gaps = 0  # steps that were skipped as too long
+        self.unordered: Counter[Address] = Counter()  # timestamps
         self._now = self._due = self._behind = 0  # us; messages
         self._is_running = False
 
@@ -118,7 +105,6 @@ class _Clock:
 
 
 def _warnings_of(reader: UlogReader) -> list[str]:
-    """Return the damage and the skipped parts so far."""
     warnings = reader.warnings
     for stream in reader.streams.values():
         unknown = sorted(set(stream.names) - stream.definition.known_types.keys())

@@ -1,6 +1,5 @@
 """ULog, PX4's log format: an incremental parser for files and streams, and the definitions of logged messages."""
 
-from .definitions import LoggedStream
 from .parser import UlogParser
 from .records import (
     Damage,
@@ -8,6 +7,7 @@ from .records import (
     Dropout,
     Header,
     Information,
+    LoggedStream,
     LoggedText,
     Parameter,
     Record,

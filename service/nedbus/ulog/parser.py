@@ -37,13 +37,10 @@ _CONTEXT: Final = 16  # bytes that a candidate can have
 
 
 class _Judgement(Enum):
-    SOUND = auto()
-    """A record whose content fits its type and size."""
-    OPAQUE = auto()
-    """A record of unknown type, message id or content, or none: only what follows can tell."""
+    SOUND = auto()  # a record whose content fits its type and size
+    OPAQUE = auto()  # a record of unknown type, message id or content, or none: only what follows can tell
     NONE = auto()
-    PARTIAL = auto()
-    """Bytes are missing."""
+    PARTIAL = auto()  # bytes are missing
 
 
 class _Seen(NamedTuple):
@@ -105,14 +102,13 @@ class UlogParser:
         return records
 
     def _begin(self, *, is_end: bool) -> None:
-        """Read the header, and the flag bits behind it."""
         kind, content = self._buffer[_START + 2 : _START + _HEADER], _START + _HEADER
         stop = content + int.from_bytes(self._buffer[_START : _START + 2], "little") if kind == b"B" else _START
         if is_end or (kind and stop <= len(self._buffer)):
             header = read_header(self._buffer[:_START])
             self._records.append(header)
             if header.version > 1:
-                self._records.append(Damage(f"unknown version {header.version} of the format", 7, 0))
+                self._records.append(Damage(f"unknown version {header.version} of the format"))
             offsets = read_flags(self._buffer[content:stop]) if kind == b"B" else ()
             self._boundaries = sorted(offset for offset in offsets if offset >= stop)
             self._drop(min(stop, len(self._buffer)))
@@ -133,7 +129,7 @@ class UlogParser:
                 after = self._search(at, is_end=is_end)
         self._drop(at if after is None else after)
         if is_end:
-            self._end_damage(self._offset)
+            self._end_damage()
 
     def _take_data(self, at: int) -> int:
         """Take messages up to the last one in a row, whose successor needs a closer look; return its position."""
@@ -188,15 +184,13 @@ class UlogParser:
         window = begun + 1 + number * _WINDOW
         start, found = self._find(at, window + (_WINDOW if number < 2 else _SAMPLE), is_end=is_end)
         if found is _Judgement.SOUND:
-            self._end_damage(self._offset + start)
+            self._end_damage()
             return start
         return None if found is _Judgement.PARTIAL else min(window + _WINDOW, len(self._buffer))
 
-    def _end_damage(self, offset: int) -> None:
+    def _end_damage(self) -> None:
         if self._damage is not None:
-            self._records.append(
-                Damage(f"no record begins at byte {self._damage}", self._damage, offset - self._damage)
-            )
+            self._records.append(Damage(f"no record begins at byte {self._damage}"))
             self._damage = None
 
     def _find(self, start: int, stop: int, *, is_end: bool) -> tuple[int, _Judgement]:
@@ -226,7 +220,6 @@ class UlogParser:
         return _Judgement.NONE
 
     def _look(self, at: int) -> _Seen:
-        """Judge a position of the buffer."""
         buffer = self._buffer
         known = self._known.get(buffer[at : at + _DATA_HEADER])
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
@@ -252,15 +245,14 @@ class UlogParser:
         return head[2] in READERS
 
     def _truncate(self, at: int) -> int:
-        """Report the record in which the log ends, if any."""
         end = len(self._buffer)
         if at < end:
-            self._records.append(Damage("the file ends inside a message", self._offset + at, end - at, is_end=True))
+            self._records.append(Damage("the file ends inside a message", is_end=True))
         return end
 
     def _emit(self, at: int, seen: _Seen) -> int:
         """Use a record; return the position after it."""
-        kind, offset, reason = self._buffer[at + 2], self._offset + at, ""
+        kind, reason = self._buffer[at + 2], ""
         if seen.record is not None:
             try:
                 self._records.extend(self._apply(seen.record))
@@ -272,9 +264,9 @@ class UlogParser:
         elif kind == ord("D"):
             self.undecodable += 1
         elif kind in READERS or seen.judgement is _Judgement.NONE:
-            reason = f"the record at byte {offset} is damaged"
+            reason = f"the record at byte {self._offset + at} is damaged"
         if reason:
-            self._records.append(Damage(reason, offset, seen.stop - at))
+            self._records.append(Damage(reason))
         return seen.stop
 
     def _apply(self, record: Record) -> list[Record]:

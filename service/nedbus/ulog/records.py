@@ -1,17 +1,16 @@
-"""The records of a ULog, named by its specification, and the readers of their content."""
+"""The records of a ULog, named by its specification, their readers, and the streams of logged messages."""
 
 import re
 import struct
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
 
-from nedbus_msgs import BASES
+from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, FieldType, define
 
 from .layout import BASIC_TYPES, FIELD, PayloadLayout
 
-SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
-"""Content of a sync record."""
-
+_SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 _MAX_TEXT: Final = 1024  # bytes of a logged text; PX4 logs at most 127
 _FORMAT = re.compile(rf"([A-Za-z][\w/-]*):((?:{FIELD.pattern})*)", re.ASCII)
 _NAME = re.compile(r"[A-Za-z][\w/-]{0,254}", re.ASCII)
@@ -40,18 +39,11 @@ class Format(NamedTuple):
 
 
 class Information(NamedTuple):
-    """A fact about the log."""
+    """A fact, or the default of a parameter; `continued`: it belongs to the preceding value of its key."""
 
     key: str
     value: Value
-
-
-class MultiInformation(NamedTuple):
-    """A part of a longer value; `continued`: it belongs to the preceding value of its key."""
-
-    key: str
-    value: Value
-    continued: bool
+    continued: bool = False
 
 
 class Parameter(NamedTuple):
@@ -61,19 +53,8 @@ class Parameter(NamedTuple):
     value: Value
 
 
-class ParameterDefault(NamedTuple):
-    """A default of a parameter; `types`: bit 0 for the system's default, bit 1 for that of the airframe."""
-
-    key: str
-    value: Value
-    types: int
-
-
 class Subscription(NamedTuple):
-    """One instance of a topic whose data follow under a message id.
-
-    Names of nested fields are flat: `esc[0].rpm` of the log is `esc_0_rpm`.
-    """
+    """One instance of a topic, with flat names of fields: `esc[0].rpm` of the log is `esc_0_rpm`."""
 
     message_id: int
     multi_id: int
@@ -117,15 +98,22 @@ class Damage(NamedTuple):
     """Bytes that are not used; `is_end`: the log ends inside a record, as after a loss of power."""
 
     reason: str
-    offset: int
-    size: int
     is_end: bool = False
 
 
 Record = (
-    Header | Format | Information | MultiInformation | Parameter | ParameterDefault | Subscription | Unsubscription
-    | Data | LoggedText | Sync | Dropout | Damage
-)  # fmt: skip
+    Header
+    | Format
+    | Information
+    | Parameter
+    | Subscription
+    | Unsubscription
+    | Data
+    | LoggedText
+    | Sync
+    | Dropout
+    | Damage
+)
 
 
 _UNRESOLVED: Final = PayloadLayout((), 0, 0)
@@ -139,10 +127,7 @@ def read_header(data: bytes) -> Header:
 
 
 def read_flags(content: bytes) -> tuple[int, ...]:
-    """Return the offsets of appended data in flag bits.
-
-    Raises UlogError for an unknown incompatible flag: the specification requires to refuse the log.
-    """
+    """Return the offsets of appended data; raise UlogError for an unknown incompatible flag, as the format requires."""
     incompatible, *offsets = struct.unpack_from("<8xQ3Q", content.ljust(40, b"\0"))
     if incompatible & ~1:
         raise UlogError(f"it has unknown incompatible flags ({incompatible:#x}): read it with a newer version")
@@ -183,7 +168,7 @@ def _subscription(content: bytes) -> Subscription:
 
 
 def _sync(content: bytes) -> Sync:
-    if not content.startswith(SYNC):
+    if not content.startswith(_SYNC):
         raise ValueError
     return Sync()
 
@@ -194,10 +179,10 @@ READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
     ord("F"): _format,
     ord("I"): lambda content: Information(*_key_and_value(content)),
     ord("L"): _text,
-    ord("M"): lambda content: MultiInformation(*_key_and_value(content[1:]), bool(content[0])),
+    ord("M"): lambda content: Information(*_key_and_value(content[1:]), bool(content[0])),
     ord("O"): lambda content: Dropout(struct.unpack_from("<H", content)[0]),
     ord("P"): lambda content: Parameter(*_key_and_value(content)),
-    ord("Q"): lambda content: ParameterDefault(*_key_and_value(content[1:]), content[0]),
+    ord("Q"): lambda content: Information(*_key_and_value(content[1:])),
     ord("R"): lambda content: Unsubscription(struct.unpack_from("<H", content)[0]),
     ord("S"): _sync,
 }
@@ -205,5 +190,51 @@ READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
 
 A subscription is returned without its layout.
 """
-EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC)}
+EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(_SYNC)}
 """Sizes of records that are recognized by their size; longer ones are read, too."""
+
+
+class LoggedStream:
+    """The messages of one subscription: their address, their definition, and the decoding of their payloads.
+
+    The definition is that of nedbus, or one of the log's format.
+    A topic without a file in nedbus has its plain address for the first instance, and the number for others: a stream
+    of data does not announce whether another instance will follow.
+
+    Raises ValueError for a format that cannot be a message, AddressError for an invalid vehicle or topic.
+    """
+
+    def __init__(self, vehicle: str, subscription: Subscription) -> None:
+        topic, layout = subscription.name, subscription.layout
+        self.subscription = subscription
+        self.names = tuple(field.name for field in layout.fields)  # in the log
+        self.definition = BY_TOPIC.get(topic) or _define(
+            "".join(part.capitalize() for part in topic.split("_")),
+            tuple((field.name, field.kind) for field in layout.fields),
+        )
+        has_number = TOPICS[topic].instances if topic in TOPICS else subscription.multi_id > 0
+        self.address = Address(vehicle, topic, subscription.multi_id if has_number else None)
+        self.converted: dict[str, FieldType] = {}
+        """Fields that the message has with another type, such as an int32 of PX4 1.9 that is a uint8: that type."""
+        for name, kind, _ in layout.fields:
+            known = self.definition.known_types.get(name, {kind})
+            if kind not in known:
+                self.converted[name] = self.definition.types.get(name) or next(iter(known))
+        self.unfit: dict[str, str] = {}
+        """By the name of a field, where it was left out for the first time because its value does not fit."""
+
+    def decode(self, payload: bytes) -> dict[str, Any]:
+        """Return the fields of a message, without those whose value does not fit their type."""
+        fields = self.subscription.layout.decode(payload)
+        for name, kind in self.converted.items():
+            value = fields.pop(name)
+            fitted = kind.fit(value)
+            if fitted is not None:
+                fields[name] = fitted
+            elif name not in self.unfit:
+                topic = self.subscription.name
+                self.unfit[name] = f"{topic}: left out {name} where it is not a {kind}, such as {value!r:.60}"
+        return fields
+
+
+_define = lru_cache(256)(define)  # shared by all instances and logs, since codecs are cached per definition

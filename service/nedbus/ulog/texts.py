@@ -1,17 +1,23 @@
-"""PX4's own words in a log, its texts and its events, as messages of `log_message`: each statement once."""
+"""PX4's own words in a log, its texts and its events, as messages of `log_message`: each statement once.
 
+The metadata of events, which a log contains, make a sentence of an event's number and arguments.
+Their format: https://github.com/mavlink/libevents. Everything in them may be hostile.
+"""
+
+import json
+import lzma
 import re
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from itertools import islice
+from typing import Any, Final, NamedTuple
 
 from nedbus_msgs import field_type
 
-from .event_metadata import MAX_PACKED, Event, EventMetadata
-from .layout import PayloadField, PayloadLayout
-from .records import Data, LoggedText, MultiInformation, Record, Subscription
+from .layout import BASIC_TYPES, PayloadField, PayloadLayout
+from .records import Data, Information, LoggedText, Record, Subscription
 
 _FORM: Final = struct.Struct("<QB127s")
 _FIELDS: Final = (("timestamp", "uint64", 0), ("severity", "uint8", 8), ("text", "char[127]", 9))
@@ -29,6 +35,19 @@ _MAX_BYTES: Final = 127
 _MAX_CHARACTERS: Final = 1000  # that are looked at, colours included
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
+_MAX_PACKED: Final = 2**18  # bytes; PX4's have 17,000
+_MAX_UNPACKED: Final = 2**21  # bytes; PX4's have 170,000
+_MAX_MEMORY: Final = 2**27  # bytes for the dictionary of xz
+_MAX_PARTS: Final = 64  # components, groups of events or modes, and modes of a group; PX4 has 30
+_MAX_TEXT: Final = 200  # characters of a template, and of one argument; PX4's longest template has 120
+_CHECKS: Final = ("arming_check", "health")
+_MARK = re.compile(
+    r"\\(?P<escaped>.)"
+    r'|<(?P<tag>[a-z]+)(?: [a-z]+="(?P<value>[^"]*)")?>(?P<content>.*?)</(?P=tag)>'
+    r"|\{(?P<number>\d{1,2})(?::(?:\.(?P<digits>\d))?)?(?P<unit>m_v|m/s|m\^2|m|C)?\}",
+    re.DOTALL,
+)
+_DAMAGED: Final = (LookupError, TypeError, ValueError, AttributeError, RecursionError, struct.error, lzma.LZMAError)
 
 
 def to_statement(text: str) -> str:
@@ -37,6 +56,93 @@ def to_statement(text: str) -> str:
     plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
     data = plain.encode()
     return plain if len(data) <= _MAX_BYTES else data[: _MAX_BYTES - 3].decode(errors="ignore") + "..."
+
+
+class _Event(NamedTuple):
+    """An event as a sentence.
+
+    `modes`: navigation states for which a check fails, as bits; None for any other event.
+    `lists_checks_of`: the navigation states whose failed checks belong behind the text, as bits.
+    """
+
+    group: str
+    text: str
+    modes: int | None
+    lists_checks_of: int
+
+
+class _EventMetadata:
+    """The events of one firmware; raises ValueError for metadata that are damaged, or larger than any of PX4's."""
+
+    def __init__(self, packed: bytes) -> None:
+        try:
+            xz = lzma.LZMADecompressor(memlimit=_MAX_MEMORY)
+            unpacked = xz.decompress(packed, _MAX_UNPACKED)
+            if not xz.eof:
+                raise ValueError(f"incomplete, or more than {_MAX_UNPACKED} bytes")
+            self._components: Mapping[str, Any] = json.loads(unpacked)["components"]
+            parts = [self._components, *(each["event_groups"] for each in self._components.values())]
+            if max(map(len, parts)) > _MAX_PARTS:
+                raise ValueError(f"more than {_MAX_PARTS} components, or groups of events")
+        except _DAMAGED as exc:
+            raise ValueError(f"the metadata of events cannot be read: {str(exc) or type(exc).__name__}") from exc
+
+    def decode(self, number: int, arguments: bytes) -> _Event | None:
+        """Return the event with this id; None if it is unknown, or does not fit its arguments."""
+        try:
+            component, key = self._components[str(number >> 24)], str(number & 0xFFFFFF)
+            group = next(name for name, each in component["event_groups"].items() if key in each["events"])
+            event = component["event_groups"][group]["events"][key]
+            types = [each["type"] for each in event.get("arguments", ())]
+            values, shown = self._read(types, component["namespace"], arguments)
+            masks = [value for name, value in zip(types, values, strict=True) if "navigation_mode_group_t" in name]
+            modes = masks[0] if masks and group in _CHECKS else None
+            listed = 0
+            if event.get("type") == "append_health_and_arming_messages":
+                of_modes = islice(component["navigation_mode_groups"]["groups"].items(), _MAX_PARTS)
+                listed = next((1 << int(bit) % 32 for bit, custom in of_modes if values[0] in custom[:_MAX_PARTS]), 0)
+            return _Event(group, _fill(event["message"][:_MAX_TEXT], shown), modes, listed)
+        except (StopIteration, *_DAMAGED):
+            return None
+
+    def _read(self, types: Sequence[str], namespace: str, data: bytes) -> tuple[list[Any], list[Any]]:
+        """Return the arguments as numbers, and as they are shown."""
+        values: list[Any] = []
+        shown: list[Any] = []
+        offset = 0
+        for name in types:
+            space, _, base = name.rpartition("::")
+            parts = (part for part in self._components.values() if part["namespace"] == (space or namespace))
+            enum = None if name in BASIC_TYPES else next(parts)["enums"][base]
+            code = f"<{BASIC_TYPES[enum['type'] if enum else name].form}"
+            values += struct.unpack_from(code, data, offset)
+            offset += struct.calcsize(code)
+            shown.append(_describe(enum, values[-1]) if enum else values[-1])
+        return values, shown
+
+
+def _describe(enum: Mapping[str, Any], value: int) -> str:
+    """Return the names of a value of an enumeration, or of its bits."""
+    bits = [1 << bit for bit in range(64) if value >> bit & 1] if enum.get("is_bitfield") else [value]
+    entries = enum["entries"]
+    names = (entries[str(each)]["description"] if str(each) in entries else f"(unknown: {value})" for each in bits)
+    return str(enum.get("separator", "|")).join(names)[:_MAX_TEXT]
+
+
+def _fill(template: str, values: Sequence[Any]) -> str:
+    """Return a text with its arguments, without marks."""
+
+    def replaced(found: re.Match[str]) -> str:
+        if found["escaped"] or found["tag"]:
+            shows = {"profile": found["value"] == "dev", "a": True, "param": True}  # other profiles are of end users
+            return found["escaped"] or (_fill(found["content"], values) if shows.get(found["tag"]) else "")
+        if not 0 < int(found["number"]) <= len(values):
+            return found[0]
+        value = values[int(found["number"]) - 1]
+        text = f"{value:.{found['digits']}f}" if found["digits"] and not isinstance(value, str) else str(value)
+        return f"{text} {found['unit'].removesuffix('_v')}" if found["unit"] else text
+
+    return _MARK.sub(replaced, template).strip()
 
 
 class TextLimit:
@@ -68,7 +174,7 @@ class Texts:
         self.limit = TextLimit()
         self.problem = ""
         self._packed = b""
-        self._metadata: EventMetadata | None = None
+        self._metadata: _EventMetadata | None = None
         self._said: deque[tuple[int, str]] = deque(maxlen=100)  # events without their text: time, words of a check
         self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log a topic twice
         self._failed: dict[str, tuple[int, int]] = {}  # level, and modes that they prevent, of the last report's
@@ -91,9 +197,9 @@ class Texts:
         """Return the statement that a record completes, None if there is none or it is a repetition."""
         if isinstance(record, LoggedText):
             return None if self._is_said(record) else record
-        if isinstance(record, MultiInformation) and record.key == "metadata_events" and isinstance(record.value, bytes):
+        if isinstance(record, Information) and record.key == "metadata_events" and isinstance(record.value, bytes):
             if self._metadata is None and not self.problem:  # the first metadata hold
-                self._packed = ((self._packed if record.continued else b"") + record.value)[:MAX_PACKED]
+                self._packed = ((self._packed if record.continued else b"") + record.value)[:_MAX_PACKED]
         elif isinstance(record, Data) and record.subscription.name == "event":
             return self._read_event(record.subscription.layout.decode(record.payload))
         elif isinstance(record, Data) and record.subscription.name == "vehicle_status":
@@ -105,7 +211,7 @@ class Texts:
         if (timestamp, *key) in self._seen or (event := self._decode(fields["id"], bytes(fields["arguments"]))) is None:
             return None
         self._seen.append((timestamp, *key))
-        is_check = event.group in ("arming_check", "health")
+        is_check = event.group in _CHECKS
         if level >= _PROTOCOL and event.group == "arming_check":  # the begin of a report
             self._failed, self._before = {}, self._failed
         if level >= _PROTOCOL or not (is_check or event.group == "default"):
@@ -125,10 +231,10 @@ class Texts:
         self._said.append((timestamp, _first_words(text) if is_check else ""))
         return LoggedText(level, timestamp, text)
 
-    def _decode(self, number: int, arguments: bytes) -> Event | None:
+    def _decode(self, number: int, arguments: bytes) -> _Event | None:
         if self._metadata is None and self._packed and not self.problem:
             try:
-                self._metadata = EventMetadata(self._packed)
+                self._metadata = _EventMetadata(self._packed)
             except ValueError as exc:
                 self.problem = str(exc)
         return self._metadata.decode(number, arguments) if self._metadata else None

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -67,8 +66,7 @@ def test_nothing_that_flies_is_not_healthy(endpoint: str, health: Judge) -> None
 def test_finished_replay_is_not_healthy(endpoint: str, health: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
     """The newest message must be fresh, whatever the state of the source; --max-age says how fresh."""
     passed = [0.0]
-    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + passed[0], time_ns=time.time_ns)
-    monkeypatch.setattr("nedbus.daemon.worker.time", clock)
+    monkeypatch.setattr("nedbus.daemon.worker.Clock.now", staticmethod(lambda: time.monotonic() + passed[0]))
     with serving(endpoint, "sim:?duration=0.1") as daemon:
         wait_for_state(daemon, "done")
         passed[0] = 100.0

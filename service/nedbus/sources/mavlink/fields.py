@@ -13,7 +13,6 @@ _FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: sta
 _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
-_SENSORS: Final = [f"onboard_control_sensors_{each}" for each in ("present", "enabled", "health")]
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; an older one means a reboot
 
 
@@ -24,14 +23,6 @@ def is_reboot(time_boot_ms: int, newest: int | None) -> bool:
 
 def _number(value: int, unit: float, *unknown: int) -> float | None:
     return None if value in unknown else value / unit
-
-
-def _local_position(message: Any) -> dict[str, object]:
-    return {name: getattr(message, name) for name in ("x", "y", "z", "vx", "vy", "vz")}
-
-
-def _global_position(message: Any) -> dict[str, object]:
-    return {"lat": message.lat / 1e7, "lon": message.lon / 1e7, "alt": message.alt / 1e3}
 
 
 def _home(message: Any) -> dict[str, object]:
@@ -75,11 +66,6 @@ def _status(message: Any) -> dict[str, object]:
     }  # fmt: skip
 
 
-def sensors_of(message: Any) -> dict[str, object]:
-    """Return the VehicleStatus fields in a SYS_STATUS."""
-    return {name: getattr(message, name) for name in _SENSORS}
-
-
 def _battery(message: Any) -> dict[str, object]:
     """Return the state of a battery without its cells: if they are not measured, the first one holds the total."""
     cells = [each for each in message.voltages if each != _U16]
@@ -113,8 +99,14 @@ def _odometry(message: Any) -> dict[str, object]:
 
 
 CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]] = {
-    "LOCAL_POSITION_NED": ("vehicle_local_position", _local_position),
-    "GLOBAL_POSITION_INT": ("vehicle_global_position", _global_position),
+    "LOCAL_POSITION_NED": (
+        "vehicle_local_position",
+        lambda each: {name: getattr(each, name) for name in ("x", "y", "z", "vx", "vy", "vz")},
+    ),
+    "GLOBAL_POSITION_INT": (
+        "vehicle_global_position",
+        lambda each: {"lat": each.lat / 1e7, "lon": each.lon / 1e7, "alt": each.alt / 1e3},
+    ),
     "ATTITUDE_QUATERNION": ("vehicle_attitude", lambda each: {"q": (each.q1, each.q2, each.q3, each.q4)}),
     "ATTITUDE": ("vehicle_attitude", lambda each: {"q": euler_to_quaternion(each.roll, each.pitch, each.yaw)}),
     "ODOMETRY": ("vehicle_odometry", _odometry),

@@ -1,7 +1,4 @@
-"""Client of one vehicle's ULog stream, as a state machine: events in, commands to send out; no I/O, no clock.
-
-Times are monotonic seconds of the caller's clock.
-"""
+"""Client of one vehicle's ULog stream, a state machine: events in, commands out; no I/O, times of the caller [s]."""
 
 import math
 from collections.abc import Mapping, Set
@@ -12,7 +9,6 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.timings import TIMINGS
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
-"""MAV_CMD by kind of command."""
 
 _TRIES: Final = 3  # of a command without an answer
 _RESTARTS: Final = 2  # after a START that was accepted without data

@@ -2,12 +2,13 @@
 
 import logging
 import math
+import struct
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
-from nedbus import ulog
+from nedbus import clock, ulog
 from nedbus.client import LogStreamStatus
 from nedbus.errors import OutputError
 from nedbus.log_event import about
@@ -16,25 +17,24 @@ from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .log_client import LogStatus, LogStreamClient
-from .log_file import LogFile
 from .log_reassembly import Piece
 
 _log = logging.getLogger(__name__)
 
-SOURCE: Final = "mavlink-ulog"
-"""`sample.source` of a message from the stream; that of a converted one is `mavlink`."""
-
+_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; that of converted ones is `mavlink`
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _PIECE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
+_FILE_HEADER: Final = 16  # bytes
+_RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
+_DROPOUT: Final = struct.Struct("<HBH")  # a record of type O: duration [ms]
+_MAX_DROPOUT: Final = 2**16 - 1  # ms
+_MAX_SAME_NAME: Final = 100
 
 
 class LogStream:
-    """State of the stream of one vehicle, in the thread of the source.
-
-    `client`: its requests and acknowledgements, in the thread that reads the link.
-    """
+    """The stream of one vehicle, in the thread of the source; `client`: its requests, in that of the link."""
 
     def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
         self._name, self._client = name, client
@@ -73,17 +73,17 @@ class LogStream:
         """Yield the messages that a piece completes."""
         if piece.begins:
             self._restart()
-            self._open_file()
+            self.close()
         if piece.lost:
-            self._count_gap(piece.lost, now)
+            self._count_gap(piece.lost)
         if piece.verdict == "unsynchronised":
-            self._at_most += self._most_records(_PIECE)
+            self._at_most += math.ceil(_PIECE / self._record_sizes()[0])
+        self._save(piece, now)
         self._last_piece = now
         if not piece.data:
             return
         self._received += len(piece.data)
         self._window_bytes += len(piece.data)
-        self._save(piece.data)
         known, before, omitted = self._parser, self._parser.undecodable, self._texts.limit.omitted
         try:
             records = known.feed(piece.data)
@@ -173,44 +173,88 @@ class LogStream:
         self._carried.add(stream.address)
         lost, self._owed, dropout, self._dropout = self._owed, 0, self._dropout, 0.0
         definition = stream.definition
-        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=SOURCE, dropout=dropout)
+        return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
-    def _count_gap(self, lost: int, now: float) -> None:
+    def _count_gap(self, lost: int) -> None:
         """Count a gap; bounds are those of records of all kinds, by their least and greatest size."""
         self._gaps += 1
         self._lost += lost
-        sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
-        least = max(1, math.ceil(_PIECE * lost / max(sizes, default=_PIECE)))
+        smallest, largest = self._record_sizes()
+        least = max(1, math.ceil(_PIECE * lost / largest))
         self._at_least += least
         self._owed += least
-        self._at_most += self._most_records(_PIECE * (lost + 1)) + 1  # the end of the gap, and the record that it cut
+        # The end of the gap, and the record that it cut.
+        self._at_most += math.ceil(_PIECE * (lost + 1) / smallest) + 1
         self._parser.gap()
-        if self._file is not None:
-            with self._saving():
-                self._file.mark_gap(now - (self._last_piece or now))
 
-    def _most_records(self, size: int) -> int:
+    def _record_sizes(self) -> tuple[int, int]:
         sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
-        return math.ceil(size / min(sizes, default=_DATA_HEADER))
+        return min(sizes, default=_DATA_HEADER), max(sizes, default=_PIECE)
 
-    def _open_file(self) -> None:
-        self.close()
-        if self._folder is None:
-            return
-        with self._saving():
-            self._file = LogFile(self._folder, self._name)
-            _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log-stream"))
-
-    def _save(self, data: bytes) -> None:
-        if self._file is not None:
-            with self._saving():
-                self._file.write(data)
-
-    @contextmanager
-    def _saving(self) -> Iterator[None]:
-        """Give up saving this stream after an error in the block; publishing goes on."""
+    def _save(self, piece: Piece, now: float) -> None:
+        """Save a piece of the stream; after an error its rest is not saved, while publishing goes on."""
         try:
-            yield
+            if piece.begins and self._folder is not None:
+                self._file = LogFile(self._folder, self._name)
+                _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log-stream"))
+            if self._file is not None:
+                if piece.lost:
+                    self._file.mark_gap(now - (self._last_piece or now))
+                self._file.write(piece.data)
         except OutputError as exc:
             self.close()
             _log.error("%s: the ULog stream is no longer saved: %s", self._name, exc, extra=about("log-stream"))
+
+
+class LogFile:
+    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, such as for a full disk."""
+
+    def __init__(self, folder: Path, vehicle: str) -> None:
+        self.path, self._file = _create(folder, vehicle)
+        self._partial = bytearray()  # the last record, until it is complete
+        self._begins = True
+
+    def write(self, data: bytes) -> None:
+        """Append bytes of the stream; only whole records reach the file."""
+        self._partial += data
+        end = position = 0
+        if self._begins and len(self._partial) >= _FILE_HEADER:
+            end = position = _FILE_HEADER
+            self._begins = False
+        while not self._begins and position + _RECORD_HEADER <= len(self._partial):
+            position += _RECORD_HEADER + int.from_bytes(self._partial[position : position + 2], "little")
+            if position <= len(self._partial):
+                end = position
+        self._append(bytes(self._partial[:end]))
+        del self._partial[:end]
+
+    def mark_gap(self, seconds: float) -> None:
+        """Discard the record that the gap cut, and record a dropout of this duration."""
+        self._partial.clear()
+        if not self._begins:
+            self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        with suppress(OSError):
+            self._file.close()
+
+    def _append(self, data: bytes) -> None:
+        try:
+            self._file.write(data)
+        except OSError as exc:
+            raise OutputError(self.path, exc) from exc
+
+
+def _create(folder: Path, vehicle: str) -> tuple[Path, BinaryIO]:
+    name = f"{vehicle}_{clock.now():%Y-%m-%d_%H-%M-%S}"
+    path = folder / f"{name}.ulg"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in range(2, _MAX_SAME_NAME):
+            with suppress(FileExistsError):
+                return path, path.open("xb", buffering=0)
+            path = folder / f"{name}_{number}.ulg"
+        return path, path.open("xb", buffering=0)
+    except OSError as exc:
+        raise OutputError(path, exc) from exc

@@ -1,18 +1,29 @@
-"""Reader of a link: messages of autopilots with their sender."""
+"""Readers of a link: messages of autopilots with their sender; with `log=`, in a thread that requests ULog streams."""
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection
 
-from .link import Link
-from .log_reassembly import Piece
-from .senders import Peer, why_ignored
+from .fields import is_reboot
+from .link import AUTOPILOT, Link, Peer, why_ignored
+from .log_client import COMMANDS, Command, LogStreamClient
+from .log_reassembly import Piece, Reassembly
 
 _MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
+_KINDS: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
+_MAX_WAITING: Final = 16_384  # messages read ahead; more are lost, as the sequence numbers of both protocols show
+_MAX_READ: Final = 100  # messages per call
+_TICK: Final = 0.05  # s, the longest wait of the thread
+_STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
 class Received(NamedTuple):
@@ -66,3 +77,118 @@ def new_parser() -> Any:
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
     return parser
+
+
+@dataclass(slots=True)
+class _Vehicle:
+    system: int
+    client: LogStreamClient
+    peer: Peer
+    reassembly: Reassembly = field(default_factory=Reassembly)
+    newest: int = 0  # ms since boot
+
+
+class LogReceiver:
+    """Reads a link in a thread of its own, so that PX4's log stream is acknowledged while publishing waits.
+
+    `send`: sends a MAVLink message to a peer; it must not wait. `vehicles`: those with a heartbeat so far.
+    """
+
+    def __init__(
+        self,
+        reader: LinkReader,
+        options: MavlinkOptions,
+        send: Callable[[Any, Peer], object],
+        *,
+        system: int,
+        component: int,
+    ) -> None:
+        self._reader, self._options, self._send = reader, options, send
+        self._ids = system, component
+        self.vehicles: dict[int, _Vehicle] = {}
+        self._waiting: SimpleQueue[Received | Rejection | Exception] = SimpleQueue()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="nedbus-mavlink", daemon=True)
+        self._thread.start()
+
+    def read(self, timeout: float) -> Iterator[Received | Rejection]:
+        """Yield what was read; wait up to `timeout` seconds for the first. Raises the error that ended the thread."""
+        with suppress(Empty):
+            for number in range(_MAX_READ):
+                item = self._waiting.get_nowait() if number else self._waiting.get(timeout=timeout)
+                if isinstance(item, Exception):
+                    raise item
+                yield item
+
+    def close(self) -> None:
+        """End the streams and the thread; wait until the vehicles have confirmed it, or do not answer."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._turn()
+            end = time.monotonic() + _STOP_TIMEOUT
+            for vehicle in self.vehicles.values():
+                self._act(vehicle, vehicle.client.stop(time.monotonic()))
+            while time.monotonic() < end and any(
+                vehicle.client.status.state == "stopping" for vehicle in self.vehicles.values()
+            ):
+                self._turn()
+        except Exception as exc:  # noqa: BLE001 - raised again by `read`, in the thread of the source
+            self._waiting.put(exc)
+
+    def _turn(self) -> None:
+        for item in self._reader.read(_TICK):
+            has_room = self._waiting.qsize() < _MAX_WAITING
+            seen = self._take(item, has_room=has_room) if isinstance(item, Received) else item
+            if has_room:
+                self._waiting.put(seen)
+        for vehicle in self.vehicles.values():
+            self._act(vehicle, vehicle.client.tick(time.monotonic()))
+
+    def _take(self, received: Received, *, has_room: bool) -> Received | Rejection:
+        """Acknowledge a message and reassemble its data; without room it is lost, as if the link had lost it."""
+        message, kind, now = received.message, received.message.get_type(), received.time
+        vehicle = self.vehicles.get(received.system)
+        if kind in _KINDS:
+            target = message.target_system, message.target_component
+            if vehicle is None or not vehicle.client.accepts(*target):
+                if target != self._ids:
+                    return received
+                where = f"{self._reader.name} system {received.system}"
+                return Rejection(where, f"{kind} of a stream that was not requested")
+            begins = False
+            if has_room:
+                fields = message.sequence, message.length, message.first_message_offset, message.data
+                piece = vehicle.reassembly.add(*fields)
+                received, begins = received._replace(piece=piece), piece.begins
+            is_acked = kind == _KINDS[0]
+            self._act(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
+        elif kind == "HEARTBEAT":
+            if vehicle is None:
+                system, component = self._ids
+                client = LogStreamClient(self._options.log, system=system, component=component)
+                vehicle = self.vehicles[received.system] = _Vehicle(received.system, client, received.peer)
+            vehicle.peer = received.peer
+            armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+            self._act(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
+        elif vehicle is not None and kind == "COMMAND_ACK":
+            target = message.target_system, message.target_component
+            self._act(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
+        elif vehicle is not None and (ms := getattr(message, "time_boot_ms", None)) is not None:
+            if is_reboot(ms, vehicle.newest):
+                vehicle.client.on_reboot()
+                vehicle.newest = ms
+            vehicle.newest = max(ms, vehicle.newest)
+        return received
+
+    def _act(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
+        for command in commands:
+            if command.kind == "acknowledge":
+                message: Any = dialect.MAVLink_logging_ack_message(vehicle.system, AUTOPILOT, command.sequence)
+            else:
+                parameters = [COMMANDS[command.kind], 0, *(0,) * 7]
+                message = dialect.MAVLink_command_long_message(vehicle.system, AUTOPILOT, *parameters)
+            self._send(message, vehicle.peer)

@@ -13,18 +13,16 @@ from nedbus.client import LogStreamStatus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
-from nedbus.sources.source import Rejection, SourceContext, SourceMessage
+from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 from nedbus.ulog import SPOKEN
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
-from .link import Link, open_link, parse_link
-from .log_receiver import LogReceiver
+from .link import AUTOPILOT, Link, Peer, Senders, open_link, parse_link
 from .log_stream import LogStream
-from .reader import LinkReader, Received
-from .senders import AUTOPILOT, Peer, Senders
+from .reader import LinkReader, LogReceiver, Received
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -44,7 +42,7 @@ class MavlinkSource:
     Validity is approximated from ESTIMATOR_STATUS, as LOCAL_POSITION_NED is sent even while it is invalid.
     """
 
-    def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
+    def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
         parse_link(link)
         known = {SPOKEN.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
@@ -102,7 +100,11 @@ class _LinkSession:
                     log.log_changes(now)
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
-                self._send_heartbeat()
+                # Routers and vehicles send only to components that they know.
+                kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
+                heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
+                for peer in {self._link.peer} - {None} or set(self._peers.values()):
+                    self._send(heartbeat, peer)
             if now >= next_status:
                 next_status = now + _STATUS_INTERVAL
                 for system, log in self._logs.items():
@@ -138,8 +140,8 @@ class _LinkSession:
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
-        if system not in self._logs and self._receiver and (client := self._receiver.client(system)):
-            self._logs[system] = LogStream(self._name_of(system), self._options, client)
+        if system not in self._logs and self._receiver and (found := self._receiver.vehicles.get(system)):
+            self._logs[system] = LogStream(self._name_of(system), self._options, found.client)
         return self._logs.get(system)
 
     def _name_of(self, system: int) -> str:
@@ -155,14 +157,6 @@ class _LinkSession:
                 parameters = [number, 1e6 / rate if rate else 0, 0, 0, 0, 0, 0]
                 message = dialect.MAVLink_command_long_message(system, AUTOPILOT, command, 0, *parameters)
                 self._send(message, self._peers[system])
-
-    def _send_heartbeat(self) -> None:
-        """Announce this component: routers and vehicles send only to components that they know."""
-        heartbeat = dialect.MAVLink_heartbeat_message(
-            dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
-        )
-        for peer in {self._link.peer} - {None} or set(self._peers.values()):
-            self._send(heartbeat, peer)
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread that reads the link acknowledges its data

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.errors import SourceError
 from nedbus.recording import open_flight
 from nedbus.sources.options import MavlinkOptions, RecordedOptions
-from nedbus.sources.source import Rejection, ReplayRun, SourceContext, SourceMessage
+from nedbus.sources.source import Rejection, ReplayRun, SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Definition
 
 from .reader import new_parser, parse
@@ -27,14 +27,11 @@ _SIGNATURE: Final = 13  # bytes
 
 
 class TlogReader:
-    """Reads the messages of all autopilots in a .tlog; `due` is the host's time since its first frame [s].
-
-    `definitions`: those of each address so far.
-    """
+    """Reads the messages of all autopilots in a .tlog; `due` is the host's time since its first frame [s]."""
 
     def __init__(self, path: Path, topics: Collection[str] | None = None, *, vehicle: str | None = None) -> None:
         self._path, self._options, self._vehicle = path, MavlinkOptions(topics=tuple(topics or ())), vehicle
-        self.definitions: dict[Address, Definition[Any] | None] = {}
+        self.definitions: dict[Address, Definition[Any] | None] = {}  # of each address so far
         self._boots: set[int] = set()  # Unix times [us]
         self._damaged_bytes = self.position = 0
 
@@ -95,34 +92,28 @@ class TlogReader:
                 self.position, data = self.position + length, data[length:]
 
 
-class TlogSource:
-    """A .tlog file, read frame by frame."""
+def open_tlog(file: str, options: RecordedOptions, _: str) -> ReplayRun:
+    """Read the beginning; raise SourceError if it has none of the requested topics."""
+    path = Path(file).expanduser()
+    reader = TlogReader(path, options.topics, vehicle=options.vehicle)
+    run = ReplayRun(iter(()), reader.definitions, None, "", position=0)
+    messages = _read(reader, run, path, options)
+    ahead = list(islice(messages, _AHEAD))
+    vehicles = sorted({address.vehicle for address in reader.definitions})
+    run.messages = (message for part in (ahead, messages) for message in part)
+    run.total = path.stat().st_size
+    run.summary = f"vehicle {', '.join(vehicles)}, {run.total / 1e6:.1f} MB"
+    return run
 
-    def __init__(self, path: str, options: RecordedOptions, _: SourceContext) -> None:
-        self._path, self._options = Path(path).expanduser(), options
-        self.finite, self.loop = not options.loop, options.loop
-        self.speed, self.wait = options.speed, options.wait
 
-    def open(self) -> ReplayRun:
-        """Read the beginning; raise SourceError if it has none of the requested topics."""
-        reader = TlogReader(self._path, self._options.topics, vehicle=self._options.vehicle)
-        run = ReplayRun(iter(()), reader.definitions, None, "", position=0)
-        messages = self._read(reader, run)
-        ahead = list(islice(messages, _AHEAD))
-        vehicles = sorted({address.vehicle for address in reader.definitions})
-        run.messages = (message for part in (ahead, messages) for message in part)
-        run.total = self._path.stat().st_size
-        run.summary = f"vehicle {', '.join(vehicles)}, {run.total / 1e6:.1f} MB"
-        return run
-
-    def _read(self, reader: TlogReader, run: ReplayRun) -> Iterator[SourceMessage]:
-        for message in reader.messages():
-            run.position = reader.position
-            yield message
-        absent = self._options.absent_from({address.topic for address in reader.definitions}, "this file")
-        run.warnings = (*reader.warnings, *absent)
-        if reader.damaged:
-            run.damage = f"{self._path}: messages lost to damage: {'; '.join(reader.warnings)}"
+def _read(reader: TlogReader, run: ReplayRun, path: Path, options: RecordedOptions) -> Iterator[SourceMessage]:
+    for message in reader.messages():
+        run.position = reader.position
+        yield message
+    absent = options.absent_from({address.topic for address in reader.definitions}, "this file")
+    run.warnings = (*reader.warnings, *absent)
+    if reader.damaged:
+        run.damage = f"{path}: messages lost to damage: {'; '.join(reader.warnings)}"
 
 
 def _length(data: bytes) -> int:

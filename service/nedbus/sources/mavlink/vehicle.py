@@ -1,10 +1,8 @@
-"""State of one MAVLink vehicle: takes MAVLink messages, returns PX4 messages and requests; no I/O, no clock.
-
-Times are monotonic seconds of the caller's clock unless stated otherwise.
-"""
+"""State of one MAVLink vehicle: MAVLink in, PX4 messages and requests out; no I/O, monotonic times of a caller [s]."""
 
 import logging
 import math
+from collections import deque
 from collections.abc import Collection
 from typing import Any, Final, cast
 
@@ -13,11 +11,10 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import SPOKEN, TextLimit
-from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, is_unix_time
+from nedbus.ulog import SPOKEN, TextLimit, to_statement
+from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
 
-from .fields import CONVERSIONS, is_reboot, sensors_of
-from .status_texts import StatusTexts
+from .fields import CONVERSIONS, is_reboot
 
 _log = logging.getLogger(__name__)
 
@@ -28,6 +25,11 @@ _FIRST_ROUNDS: Final = 3  # times that each request is sent at first, as links l
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
+_CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
+_CHUNK: Final = 50  # bytes; a shorter one is the last
+_MAX_WAITING: Final = 100  # texts
+_MAX_BYTES: Final = 500  # of a text
+_DEBUG: Final = 7
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
 _POSITION, _STATUS, _QUATERNION = 32, 230, 31
@@ -93,7 +95,7 @@ class Vehicle:
         self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
         self._last: dict[Address, int] = {}  # timestamps
         self._sequence: int | None = None
-        self._texts = StatusTexts()
+        self._texts = _StatusTexts()
         self._started = now
         self._arrivals: dict[int, float] = {}  # of requested messages
         self._pending = [*self._rates] * _FIRST_ROUNDS
@@ -121,18 +123,16 @@ class Vehicle:
         if not self._pending and now >= self._next_round:
             self._next_round = now + _REQUEST_INTERVAL
             self._pending = [each for each in self._rates if now - self._arrivals.get(each, 0.0) > _SILENCE_TIMEOUT]
-            self._log_missing()
+            # The origin needs a global position first.
+            for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
+                self._reported.add(number)
+                name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
+                extra = about("unsupported", address)
+                _log.info("%s: the vehicle does not send %s on request", address, name, extra=extra)
         if not self._pending:
             return None
         number = self._pending.pop(0)
         return number, self._rates[number]
-
-    def _log_missing(self) -> None:
-        """Log each requested message that never arrived, once; the origin needs a global position first."""
-        for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
-            self._reported.add(number)
-            name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
-            _log.info("%s: the vehicle does not send %s on request", address, name, extra=about("unsupported", address))
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
         """Convert a message; return None if it has nothing for the chosen topics, a Rejection if it is late."""
@@ -167,7 +167,6 @@ class Vehicle:
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
-        """Keep fields that complete later messages."""
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
@@ -185,7 +184,13 @@ class Vehicle:
                 bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
                 self._keep("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
             case "ODOMETRY":
-                self._keep("velocity", now + _VALUE_TIMEOUT, **_velocity_deviations(message.velocity_covariance))
+                covariance, known = message.velocity_covariance, {}
+                north, east, down = covariance[0], covariance[6], covariance[11]
+                if math.isfinite(north + east) and min(north, east) >= 0:
+                    known["evh"] = math.sqrt(north + east)
+                if math.isfinite(down) and down >= 0:
+                    known["evv"] = math.sqrt(down)
+                self._keep("velocity", now + _VALUE_TIMEOUT, **known)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
                 known = {name: value for name, value in deviations.items() if math.isfinite(value)}
@@ -195,7 +200,8 @@ class Vehicle:
                 on_globe = {"lat_lon_valid": valid["xy_valid"] and is_global, "alt_valid": valid["z_valid"]}
                 self._keep("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
-                self._keep("sensors", now + _STATUS_TIMEOUT, **sensors_of(message))
+                names = [f"onboard_control_sensors_{part}" for part in ("present", "enabled", "health")]
+                self._keep("sensors", now + _STATUS_TIMEOUT, **{name: getattr(message, name) for name in names})
             case "SYSTEM_TIME" if timestamp is not None and is_unix_time(message.time_unix_usec):
                 self._keep("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
 
@@ -207,7 +213,6 @@ class Vehicle:
         return fields if now <= until else {}
 
     def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
-        """Add the fields kept from earlier messages."""
         match topic:
             case "vehicle_local_position":
                 for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
@@ -256,12 +261,32 @@ def _validity(bits: int) -> dict[str, object]:
     }
 
 
-def _velocity_deviations(covariance: Any) -> dict[str, object]:
-    """Return evh and evv from the diagonal of a covariance, without unknown ones."""
-    north, east, down = covariance[0], covariance[6], covariance[11]
-    fields: dict[str, object] = {}
-    if math.isfinite(north + east) and min(north, east) >= 0:
-        fields["evh"] = math.sqrt(north + east)
-    if math.isfinite(down) and down >= 0:
-        fields["evv"] = math.sqrt(down)
-    return fields
+class _StatusTexts:
+    """The texts of one vehicle, joined from the chunks of STATUSTEXT, as severity and text."""
+
+    def __init__(self) -> None:
+        self._of = (0, 0)  # severity and id of the text that is not complete
+        self._data, self._next, self._time = b"", 0, 0.0
+        self._waiting: deque[dict[str, object]] = deque(maxlen=_MAX_WAITING)
+
+    def add(self, message: Any, now: float) -> None:
+        """Take a STATUSTEXT; chunks that are missing leave "..."."""
+        data, sequence = message._text_raw, message.chunk_seq  # noqa: SLF001 - `text` is ASCII only
+        of = min(message.severity, _DEBUG), message.id
+        if self._next and (self._of != of or sequence < self._next):
+            self._finish("...")
+        gap = b"..." if sequence > self._next else b""
+        self._data = (self._data + gap + data.partition(b"\0")[0])[:_MAX_BYTES]
+        self._of, self._next, self._time = of, sequence + 1, now
+        if not message.id or len(data) < _CHUNK or b"\0" in data:
+            self._finish()
+
+    def take(self, now: float) -> dict[str, object]:
+        """Return severity and text of the next statement; nothing if none is complete or timed out."""
+        if self._next and now - self._time > _CHUNK_TIMEOUT:
+            self._finish("...")
+        return self._waiting.popleft() if self._waiting else {}
+
+    def _finish(self, end: str = "") -> None:
+        self._waiting.append({"severity": self._of[0], "text": to_statement(decode_text(self._data) + end)})
+        self._data, self._next = b"", 0

@@ -1,39 +1,72 @@
-"""Receive from PX4's Zenoh module, and from any other publisher of px4_msgs over rmw_zenoh."""
+"""Receive from PX4's Zenoh module, and from any other publisher of px4_msgs over rmw_zenoh, as a node of ROS 2."""
 
 import logging
+import os
+import queue
+import threading
+import time
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from nedbus.errors import ConfigError, ConnectError, SourceError
+import zenoh
+
+from nedbus.errors import AddressError, ConfigError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.source import Absence, Rejection, SourceContext, SourceMessage
-from nedbus.transport import Session, check_endpoints, open_client
-from nedbus_msgs import Definition, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
+from nedbus.sources.source import Absence, Rejection, SourceMessage
+from nedbus.timings import TIMINGS
+from nedbus.transport import (
+    BRIDGED_ENCODING,
+    LONGEST_TOKEN,
+    PX4_TYPES,
+    AliveTokens,
+    Attachment,
+    PublisherToken,
+    Session,
+    Tls,
+    TopicKey,
+    check_endpoints,
+    node_token,
+    open_client,
+    px4_publishers_key_expr,
+    subscription_token,
+    while_open,
+)
+from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
 
-from .node import Px4ZenohNode
-from .streams import Definitions, StreamRegistry
+from .streams import Definitions, NotAcceptedError, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service must be able to stop within 1 s, and it retries
+_REPORT_INTERVAL: Final = 1.0  # s between reports of absent topics
+_MAX_PENDING: Final = 4096  # samples waiting to be decoded
+_MAX_PENDING_BYTES: Final = 4096  # per payload
+_RING_SIZE: Final = 16_384  # samples waiting for the thread
+_MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
+_JOIN_TIMEOUT: Final = 3.0  # s
+_INPUT: Final = "px4-zenoh-input"  # `sample.source` of messages to a vehicle
+_TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
+_TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes, or a key that is too long"
 
 
 class Px4ZenohSource:
-    """All publishers of px4_msgs at a router: the service's own, or another one."""
+    """All publishers of px4_msgs at a router: the service's own, which has the endpoints `routers`, or another one."""
 
-    def __init__(self, endpoint: str, options: Px4ZenohOptions, context: SourceContext) -> None:
+    def __init__(
+        self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
+    ) -> None:
         if endpoint:
             check_endpoints([endpoint], where="px4-zenoh")
-        self._endpoints = (endpoint,) if endpoint else context.routers
-        self._is_own = not endpoint or endpoint in context.routers
-        self._tls = context.tls
+        self._endpoints = (endpoint,) if endpoint else routers
+        self._is_own = not endpoint or endpoint in routers
+        self._tls = tls
         self._options = options
         self._given = _read_definitions(options.msg)
-        self._vehicle = options.vehicle or context.vehicle
-        self._name = f"px4-zenoh:{' or '.join(self._endpoints)}"
+        self._vehicle = options.vehicle or vehicle
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
         """Receive; raise SourceError if no router answers."""
@@ -42,18 +75,144 @@ class Px4ZenohSource:
                 # A separate client would lose the messages that do not fit the queue of its link.
                 session = router
             else:
-                session = self._open_session()
+                try:
+                    session = open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
+                except ConnectError as exc:
+                    reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
+                    raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
-            node = closing.enter_context(Px4ZenohNode(session, streams, domain=self._options.domain))
+            node = Px4ZenohNode(session, streams, domain=self._options.domain)
+            closing.callback(node.close)
             yield from node.run()  # a session that loses its router reconnects by itself
 
-    def _open_session(self) -> Session:
+
+class Px4ZenohNode:
+    """Receive from all publishers, convert samples to messages or rejections, and appear in ROS 2, until closed.
+
+    Samples wait in a channel in Rust, which a thread of this node drains: a callback would make Zenoh wait for the
+    GIL. Its liveliness tokens make ROS 2 list this source, and publishers in ROS 2 see a subscriber.
+    """
+
+    def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
+        self._session, self._streams = session, streams
+        self._pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._tokens = AliveTokens(session, px4_publishers_key_expr(domain))
+        self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
+        self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
+        self._subscriptions: dict[TopicKey, zenoh.LivelinessToken] = {}
+        self._entities = 0
+        self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
+        self._reported = Counter[tuple[str, str]]()
+        key_expr = f"{'*' if domain is None else domain}/**/{PX4_TYPES}/*"
+        with while_open():
+            self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
+        handler = self._subscriber.handler
+        self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
+        self._thread.start()
+
+    def run(self) -> Iterator[SourceMessage | Rejection | Absence | None]:
+        """Yield events until the iterator is closed."""
+        yield None
+        last: Absence | None = None
+        next_report = 0.0
+        while True:
+            new = self._dropped - self._reported
+            for (where, reason), count in new.items():
+                yield Rejection(where, reason, count=count)
+            self._reported += new
+            sample: zenoh.Sample | None = None
+            with suppress(queue.Empty):
+                sample = self._pending.get(timeout=TIMINGS.source_tick)
+            for token, alive in self._tokens.take():  # older than the sample
+                self._on_token(token, alive=alive)
+            yield None if sample is None else self._decode(sample)
+            if (now := time.monotonic()) >= next_report:
+                next_report = now + _REPORT_INTERVAL
+                if (absence := self._streams.report(now)) != last:
+                    yield (last := absence)
+
+    def close(self) -> None:
+        """Leave ROS 2, and end the thread."""
+        with suppress(zenoh.ZError):  # the session may be closed already
+            for token in (*self._subscriptions.values(), *self._nodes.values()):
+                token.undeclare()
+            self._tokens.undeclare()
+            self._subscriber.undeclare()
+        self._thread.join(_JOIN_TIMEOUT)
+
+    def _decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return None
+        key, now = str(sample.key_expr), time.monotonic()
+        is_bridged = str(sample.encoding) == BRIDGED_ENCODING
+        address: Address | None = None
         try:
-            return open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
-        except ConnectError as exc:
-            reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
-            raise SourceError(self._name, reason) from exc
+            stream = self._streams.hear(key, now)
+            if stream.not_carried is not None:
+                is_unexpected = stream.not_carried and not stream.tokens and not is_bridged  # else an absence, or none
+                reason = f"{stream.not_carried}: not selected by topics= or msg="
+                return Rejection(key, reason) if is_unexpected else None
+            if (form := stream.form) is None:
+                form = self._streams.form_of(stream)
+                if form.unknown:
+                    extra = about("newer-layout", stream.address, source="px4-zenoh")
+                    _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
+            definition, layout, unknown = form
+            address = stream.address
+            attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
+            if is_bridged:
+                if not stream.is_bridged:
+                    extra = about("looped", source="px4-zenoh")
+                    _log.info("%s comes from nedbus ros2: ignored to avoid a loop", key, extra=extra)
+                stream.is_bridged = True
+                return None
+            fields = decode_with(definition, sample.payload.to_bytes(), layout)
+            lost, rebooted = self._streams.accept(stream, attachment, now)
+        except (AddressError, DecodeError, NotAcceptedError) as exc:
+            return Rejection(key, exc.reason if isinstance(exc, DecodeError) else str(exc), address)
+        for name in unknown:
+            del fields[name]
+        if rebooted:
+            extra = about("rebooted", address, source="px4-zenoh")
+            _log.warning("%s: the publisher restarted, as the vehicle rebooted", key, extra=extra)
+        source = _INPUT if stream.is_input else None
+        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
+
+    def _on_token(self, text: str, *, alive: bool) -> None:
+        now = time.monotonic()
+        try:
+            token = PublisherToken.parse(text)
+            if alive:
+                self._streams.add_publisher(token, now)
+        except (AddressError, DecodeError, NotAcceptedError):
+            return  # its messages are rejected
+        if alive and not token.node.startswith("nedbus_"):
+            key = token.key
+            if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
+                return
+            if key.domain not in self._nodes:
+                self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
+            self._entities += 1
+            self._subscriptions[key] = self._declare(subscription_token(key, self._zid, self._node, self._entities))
+        elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
+            with suppress(zenoh.ZError):  # the session may be closed already
+                self._subscriptions.pop(token.key).undeclare()
+
+    def _declare(self, text: str) -> zenoh.LivelinessToken:
+        with while_open():
+            return self._session.liveliness().declare_token(text)
+
+    def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
+        with suppress(zenoh.ZError):  # undeclared
+            while True:
+                sample = handler.recv()
+                if self._pending.qsize() >= _MAX_PENDING:
+                    self._dropped[_TOO_FAST] += 1
+                elif len(sample.payload) > _MAX_PENDING_BYTES or len(str(sample.key_expr)) > LONGEST_TOKEN:
+                    self._dropped[_TOO_LARGE] += 1
+                else:
+                    self._pending.put(sample)
 
 
 def _read_definitions(paths: str) -> Definitions:

@@ -1,7 +1,4 @@
-"""Assign messages from rmw_zenoh publishers to addresses, and detect absent topics; no I/O, no clock.
-
-Times are monotonic seconds of the caller's clock.
-"""
+"""Assign messages of rmw_zenoh to addresses, and detect absent topics; no I/O, monotonic times of the caller [s]."""
 
 import math
 from collections.abc import Mapping
@@ -136,10 +133,7 @@ class StreamRegistry:
         return not stream.tokens
 
     def hear(self, key: str, now: float) -> Px4Stream:
-        """Return the stream of a key, and note that a message arrived on it.
-
-        Raises DecodeError or AddressError for a key that is not of a PX4 topic, NotAcceptedError beyond the limit.
-        """
+        """Return the stream of a key with a new message; raise DecodeError, AddressError or NotAcceptedError."""
         stream = self._streams.get(key) or self._find(TopicKey.parse(key))
         stream.heard = now
         return stream
@@ -177,7 +171,12 @@ class StreamRegistry:
                 lost = step - 1
             stream.sequence = attachment.sequence
         stream.received, stream.restarted = now, False
-        return lost, restarted and not stream.is_input and self._is_first_to_reboot(stream)
+        if stream.is_input or not restarted:
+            return lost, False
+        known = self._reboots.get(stream.address.vehicle, 0)
+        is_first = stream.reboots == known  # of its vehicle's streams to restart
+        self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
+        return lost, is_first
 
     def report(self, now: float) -> Absence:
         """Return messages that are not carried, and topics that are silent while others of the same node arrive."""
@@ -226,13 +225,6 @@ class StreamRegistry:
                 raise NotAcceptedError(f"two publishers share this key: {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
             stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
-
-    def _is_first_to_reboot(self, stream: Px4Stream) -> bool:
-        """Count the restart of a stream; return whether it is the first stream of its vehicle to restart."""
-        known = self._reboots.get(stream.address.vehicle, 0)
-        is_first = stream.reboots == known
-        self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
-        return is_first
 
     def _why_not_carried(self, key: TopicKey, topic: str) -> str | None:
         """Return None if the messages of a key are carried, else the value for `not_carried`."""

@@ -14,7 +14,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.errors import OutputError
-from nedbus.sources.mavlink.log_file import LogFile
+from nedbus.sources.mavlink.log_stream import LogFile
 from tests.flights.ulogs import write_log
 from tests.peers.processes import unmeasured
 from tests.service.ulog.test_parser import small_log
@@ -27,7 +27,7 @@ PIECE: Final = 249
 SAVE: Final = f"""
 import os, sys, time
 from pathlib import Path
-from nedbus.sources.mavlink.log_file import LogFile
+from nedbus.sources.mavlink.log_stream import LogFile
 log = Path(sys.argv[1]).read_bytes()
 for folder in sys.stdin:
     if not (pid := os.fork()):

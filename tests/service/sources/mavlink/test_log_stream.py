@@ -19,7 +19,7 @@ from pyulog import ULog
 
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
-from nedbus.sources.mavlink import log_receiver
+from nedbus.sources.mavlink import reader
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
 from nedbus.sources.mavlink.log_reassembly import Piece
 from nedbus.sources.mavlink.log_stream import LogStream
@@ -52,7 +52,7 @@ def recorded_flight(test: Any) -> Any:
 def patience(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
     """Let messages wait, as a flight is sent as fast as it is read, and let the header and answers take long."""
     timings.log_answer, timings.log_link, timings.log_header = DEADLINE, DEADLINE, 10 * DEADLINE
-    monkeypatch.setattr(log_receiver, "_MAX_WAITING", 1_000_000)
+    monkeypatch.setattr(reader, "_MAX_WAITING", 1_000_000)
 
 
 Attack = Callable[[bytes, int], None]

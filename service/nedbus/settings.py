@@ -1,0 +1,318 @@
+"""Settings from `nedbus.toml`, the environment and flags, each overriding the previous one; read here alone."""
+
+import difflib
+import logging
+import os
+import re
+import tomllib
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
+from pydantic_core import ErrorDetails
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from nedbus.errors import ConfigError
+from nedbus.log_event import about
+from nedbus.transport import Tls, check_endpoints, dial_endpoint, router_endpoints
+from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_name
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_FILE: Final = Path("nedbus.toml")
+_MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters from which a variable counts as the beginning of a setting's name
+
+_Place = tuple[int | None, int | None]  # line and column, counted from 1; None if unknown
+
+
+def split_sources(value: object) -> object:
+    """Split at semicolons and line breaks; if there are none, at commas followed by `KIND:`."""
+    if not isinstance(value, str):
+        return value
+    parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
+    return tuple(part.strip() for part in parts if part.strip())
+
+
+def split_values(value: object) -> object:
+    """Split a text at commas."""
+    return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+
+
+def split_http(where: str) -> tuple[str, int]:
+    """Parse HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
+    host, _, port = where.rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
+        raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
+    return bare, int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a server on this address can be reached from this host only."""
+    return host in {"127.0.0.1", "::1", "localhost"}
+
+
+def _checked(check: Callable[[str], object]) -> AfterValidator:
+    """Return a validator that runs a check, which raises for an invalid value, and keeps the value."""
+
+    def validate(value: str) -> str:
+        check(value)
+        return value
+
+    return AfterValidator(validate)
+
+
+_Endpoint = Annotated[str, _checked(lambda endpoint: check_endpoints((endpoint,), where="endpoint"))]
+Endpoints = Annotated[tuple[_Endpoint, ...], NoDecode, BeforeValidator(split_values)]
+
+
+class Settings(BaseSettings):
+    """All settings. Each is also NEDBUS_<FIELD> in the environment, with several values separated by commas.
+
+    Separate sources by semicolons if their options contain commas.
+    Create it with `load_settings`, whose errors name the flag, the variable, or file, line and column.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
+
+    connect: Endpoints = Field((), description="Endpoints of Zenoh routers; the first one that answers is joined")
+    tls_ca: Path | None = Field(None, description="Authority that signed the routers of tls/ endpoints, PEM")
+    tls_certificate: Path | None = Field(None, description="Certificate that this client presents to routers, PEM")
+    tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
+    listen: Endpoints = Field((), description="Endpoints of the embedded router")
+    router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
+    prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
+    vehicle: Annotated[str, BeforeValidator(vehicle_name), _checked(check_vehicle)] = Field(
+        "1", description="Vehicle of sources that name none"
+    )
+    source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
+        (), description="Published sources: texts, or tables of TOML"
+    )
+    http: Annotated[str, _checked(split_http)] | None = Field(
+        None, description="HOST:PORT of /metrics, /healthz, /readyz, /vehicles and /status"
+    )
+    until_done: bool = Field(False, description="End when every finite source has ended")
+
+    _set_by: dict[str, str] = PrivateAttr(default_factory=dict)
+    _file: Path | None = PrivateAttr(None)
+    _left_out: frozenset[str] = PrivateAttr(frozenset())
+
+    @property
+    def routers(self) -> tuple[str, ...]:
+        """The endpoints for a client to join: `connect`, else those of the router that these settings start."""
+        return self.connect or tuple(map(dial_endpoint, self.router_endpoints))
+
+    @property
+    def router_endpoints(self) -> tuple[str, ...]:
+        """The endpoints that the embedded router of a service listens on."""
+        return router_endpoints(self.listen, self.router_config)
+
+    @property
+    def is_client(self) -> bool:
+        """True if a service joins other routers without being one itself."""
+        return bool(self.connect) and not (self.listen or self.router_config)
+
+    def set_by(self, name: str) -> str:
+        """Return the origin of a setting: the name of the flag, variable or file; "" for a default."""
+        return self._set_by.get(name, "")
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The settings that `find_mistakes` left out, in whole or in part, as they are invalid or cannot be read."""
+        return self._left_out
+
+    @property
+    def tls(self) -> Tls | None:
+        """The files for tls/ endpoints; raises ConfigError if some are missing."""
+        if self.tls_ca is None:
+            if self.tls_certificate or self.tls_key:
+                raise ConfigError("tls_ca", "a certificate is set, but not the authority to trust: set both")
+            return None
+        return Tls(self.tls_ca, self.tls_certificate, self.tls_key)
+
+
+def load_settings(
+    file: str | Path | None = None, needed: Collection[str] | None = None, /, **given: object
+) -> Settings:
+    """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if it exists) and the environment.
+
+    Keyword arguments that are not None override both. `needed`: the settings to read from the file; None for all.
+
+    Raises ConfigError, with file, line and column, or with the name of the flag or variable.
+    """
+    settings, mistakes = find_mistakes(file, needed, **given)
+    if mistakes:
+        raise mistakes[0]
+    return settings
+
+
+def load_client_settings(
+    file: str | Path | None, *, connect: str | Sequence[str] | None, prefix: str | None, tls: Tls | None
+) -> Settings:
+    """Return the settings of a client; with `connect`, those that it does not need may be wrong in the file."""
+    needed: set[str] | None = None
+    if connect is not None:
+        needed = {"prefix"} if prefix is None else set()
+        if tls is None and any(scheme in str(connect) for scheme in ("tls/", "quic/")):
+            needed |= {"tls_ca", "tls_certificate", "tls_key"}
+    return load_settings(file, needed, connect=connect, prefix=prefix)
+
+
+def find_mistakes(
+    file: str | Path | None = None, needed: Collection[str] | None = None, /, **given: object
+) -> tuple[Settings, list[ConfigError]]:
+    """Return the settings as `load_settings` does, without invalid values, and the errors for those."""
+    flags = {name: value for name, value in given.items() if value is not None}
+    mistakes: list[ConfigError] = []
+    path, content = None, dict[str, object]()
+    try:
+        path = _settings_file(file)
+        content = _read_toml(path) if path and needed != set() else {}
+        content = {name: value for name, value in content.items() if needed is None or name in needed}
+    except ConfigError as exc:
+        mistakes.append(exc)
+    is_read, details = not mistakes, list[ErrorDetails]()
+    values: dict[str, Any] = {name: value for name, value in content.items() if not _from_environment(name)} | flags
+    try:
+        settings = Settings(**values)
+    except ValidationError as exc:
+        details = exc.errors()
+        settings = Settings(**_without_mistakes(values, details))
+    _warn_of_misspelt_variables()
+    settings._file, wrong = path, {str(detail["loc"][0]) for detail in details}
+    settings._set_by.update({name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set})
+    mistakes += [_setting_error(settings, detail) for detail in details]
+    settings._left_out = frozenset(wrong if is_read else wrong | (Settings.model_fields.keys() - settings._set_by))
+    return settings, mistakes
+
+
+def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
+    """Return an error for a setting with its location: file, line and column, or the name of the flag or variable."""
+    path, setter = settings._file, settings.set_by(name) or name
+    if path is None or setter != str(path):
+        return ConfigError(setter, reason)
+    line, column = _find_key(_read_text(path), name)
+    return ConfigError.in_file(path, reason, line=line, column=column)
+
+
+def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
+    """Return the error of a source with its location: file, line and column, or the name of the variable."""
+    setter = settings.set_by("source")
+    if settings._file is None or setter != str(settings._file):
+        return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
+    line, column = _find_source(_read_text(settings._file), settings.source, index, error.key)
+    return ConfigError.in_file(settings._file, str(error), line=line, column=column)
+
+
+def _settings_file(given: str | Path | None) -> Path | None:
+    """Return the file to read, None if there is none; raise ConfigError if a named one does not exist."""
+    named = given or os.environ.get("NEDBUS_CONFIG")
+    if not named:
+        return DEFAULT_FILE if DEFAULT_FILE.is_file() else None
+    if not Path(named).is_file():
+        raise ConfigError.in_file(Path(named), "there is no such file")
+    return Path(named)
+
+
+def _variable(name: str) -> str:
+    return f"NEDBUS_{name.upper()}"
+
+
+def _from_environment(name: str) -> str | None:
+    return os.environ.get(_variable(name))
+
+
+def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
+    """Return the values with each invalid setting replaced by its default, or without the invalid items of a list."""
+    wrong: dict[str, set[int | str]] = defaultdict(set)
+    for detail in details:
+        wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
+    kept = {name: value for name, value in values.items() if name not in wrong}
+    for name in wrong.keys() & Settings.model_fields.keys():
+        value = values.get(name) or _from_environment(name)
+        items = split_sources(value) if name == "source" else split_values(value)
+        if wrong[name] and isinstance(items, list | tuple):
+            kept[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])
+        else:
+            kept[name] = Settings.model_fields[name].default
+    return kept
+
+
+def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
+    """Return the origin of a setting: the name of the flag, the environment variable or the file."""
+    if name in flags:
+        return name
+    return _variable(name) if _from_environment(name) else str(path or name)
+
+
+def _warn_of_misspelt_variables() -> None:
+    known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
+    for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
+        longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)
+        if near := longer or difflib.get_close_matches(variable, known, 1, 0.85):
+            _log.warning("%s is not a setting: did you mean %s?", variable, " or ".join(near), extra=about("setting"))
+
+
+def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
+    name = str(detail["loc"][0])
+    reason = detail["msg"].removeprefix("Value error, ").removeprefix("endpoint: ")
+    if detail["type"] == "extra_forbidden":
+        reason = f"there is no setting {name!r}: choose from {', '.join(Settings.model_fields)}"
+    elif "ctx" not in detail:
+        reason = f"{name}: {reason} (is {detail['input']!r:.60})"
+    return locate_setting(settings, name, reason)
+
+
+def _read_text(path: Path) -> str:
+    """Return the text of a file without a byte order mark; raise ConfigError if it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as exc:
+        raise ConfigError.in_file(path, "not UTF-8 text") from exc
+    except OSError as exc:
+        raise ConfigError.in_file(path, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    text = _read_text(path)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
+        reason = re.sub(r" \(at .*\)", "", str(exc))
+        if position is None:  # "at end of document"
+            lines = text.splitlines() or [""]
+            raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
+        raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
+
+
+def _find_key(text: str, name: str) -> _Place:
+    """Return line and column of a key or a table, which TOML parsers do not keep."""
+    found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
+    return place_at(text, found.start(1)) if found else (None, None)
+
+
+def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Place:
+    """Return line and column of the source with this index, a table or a text in a list, or of one of its options."""
+    source = sources[index]
+    headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
+    if not isinstance(source, str) and index < len(headers):
+        start = headers[index].start(1)
+        end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
+        option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
+        return place_at(text, start + option.start(1) if option else start)
+    if isinstance(source, str):
+        found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
+        before = sources[:index].count(source)
+        if before < len(found):
+            return place_at(text, found[before])
+    return _find_key(text, "source")
+
+
+def place_at(text: str, start: int) -> _Place:
+    """Return line and column of an index into a text; unknown for a negative index, as from `str.find`."""
+    if start < 0:
+        return None, None
+    return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

@@ -1,5 +1,0 @@
-"""Settings from `nedbus.toml`, the environment and flags; no other package reads them."""
-
-from .load import find_mistakes, load_client_settings, load_settings, locate_setting, locate_source
-from .model import Settings, is_loopback, split_http
-from .toml_file import place_at

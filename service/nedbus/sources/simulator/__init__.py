@@ -1,1 +1,0 @@
-"""The simulated flight: `sim:`, the same seed gives the same messages, to the bit."""
