@@ -1,9 +1,10 @@
-"""Plot of a log or recording: track, altitude, speed, flags over time, and resets."""
+"""Plot of a log or recording: track, altitude, speed, flags over time, resets, and events."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -13,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
-from nedbus.events import Times, to_clock, unit_of
+from nedbus.events import KINDS, SEVERITIES, Event, Severity, Times, spans_of, to_clock, unit_of
 from nedbus.whole_file import whole_file
-from nedbus_msgs import Address
+from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import missing_of
@@ -27,13 +28,19 @@ _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _DPI: Final = 120
 _WIDTH: Final = 12.0  # inches
 _HEIGHT: Final = 6.0  # inches for track, altitude and speed
-_ROW: Final = 0.2  # inches per row of flags below these
+_ROW: Final = 0.2  # inches per row of flags or events below these
 _FRAME: Final = 0.6  # inches for the title and axis of the rows
 _COLORS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 _WARNING_COLOR: Final = "#d62728"
+_MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
+    "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
+}  # fmt: skip
+_LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
 _STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21_600)  # s between ticks
 _TICKS: Final = 6  # on a time axis
 _BOOT: Final = Times()
+_NEAR: Final = 1.0  # s between an event and the message with its position
+_GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
 """Maximum number of streams in one plot."""
 
@@ -56,8 +63,22 @@ class _Stream(NamedTuple):
         return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
 
 
+class _Mark(NamedTuple):
+    """An event with its text, from begin to end [s]; both are equal for an instantaneous event."""
+
+    event: Event
+    text: str
+    begin: float
+    end: float
+
+
 def draw(
-    streams: Sequence[tuple[Address, MessageArray]], path: str | Path, *, title: str, times: Times = _BOOT
+    streams: Sequence[tuple[Address, MessageArray]],
+    path: str | Path,
+    *,
+    title: str,
+    events: Iterable[Event] = (),
+    times: Times = _BOOT,
 ) -> None:
     """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
@@ -65,6 +86,7 @@ def draw(
     The time axis has UTC if `times` has that of all vehicles, else seconds since boot.
     Positions are local NED in metres; altitude is -z.
     Fields named by `missing_of` are not plotted; a note lists them.
+    `events`: for the streams' vehicles, events of severity bad or watch, mode changes, arming and landing are marked.
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
@@ -72,40 +94,49 @@ def draw(
         raise ConfigError(str(path), f"not a picture format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
         with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
-            draw_figure(streams, title=title, times=times).savefig(part)  # a glyph missing in the font: only a warning
+            figure = draw_figure(streams, title=title, events=events, times=times)
+            figure.savefig(part)  # a glyph missing in the font is only a warning
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
 
-def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, times: Times = _BOOT) -> Figure:
+def draw_figure(
+    streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = (), times: Times = _BOOT
+) -> Figure:
     """Return the figure that `draw` saves."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
     drawn = [
         _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
         for (address, messages), color in zip(streams, _COLORS, strict=False)
     ]
-    rows = _rows(drawn)
-    height = _FRAME + _ROW * len(rows)
-    figure = Figure(figsize=(_WIDTH, _HEIGHT + height), dpi=_DPI, layout="constrained")
+    rows, marks = _rows(drawn), _marks(drawn, start / 1e6, events)
+    heights = [_FRAME + _ROW * len(each) for each in (rows, marks) if each]
+    figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    mosaic: list[HashableList[str]] = [["track", "altitude"], ["track", "speed"], ["flags", "flags"]]
-    ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, height]
-    axes = figure.subplot_mosaic(mosaic, height_ratios=ratios, width_ratios=[1, 1.2])
-    for name in ("speed", "flags"):
+    mosaic: list[HashableList[str]] = [
+        ["track", "altitude"], ["track", "speed"], ["flags", "flags"], ["events", "events"]
+    ]  # fmt: skip
+    ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights]
+    axes = figure.subplot_mosaic(mosaic[: len(ratios)], height_ratios=ratios, width_ratios=[1, 1.2])
+    for name in axes.keys() - {"track", "altitude"}:
         axes[name].sharex(axes["altitude"])
     _draw_estimates(axes, drawn)
     _draw_flags(axes["flags"], rows)
+    by_time = sorted((mark for own in marks.values() for mark in own), key=lambda mark: mark.begin)
+    _mark_events(axes, drawn, by_time)
     axes["track"].legend(fontsize="small", loc="best")
-    seconds = np.concatenate([stream.seconds for stream in drawn])
+    seconds = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in by_time)])
     margin = 0.02 * (np.ptp(seconds) or 1.0)
-    axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + margin)
+    axes["altitude"].set_xlim(seconds.min() - margin, seconds.max() + 3 * margin)  # room for the last label
     label = _label_times(axes["altitude"], drawn, start / 1e6, times)
-    for name in ("speed", "flags"):
+    for name in ("speed", "events" if marks else "flags"):
         axes[name].set_xlabel(label)
     figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
     missing = {each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))] for each in drawn}
     notes = (f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)
     figure.supxlabel("\n".join(notes), fontsize="small")
+    if marks:
+        _draw_events(figure, axes["events"], marks)
     return figure
 
 
@@ -185,3 +216,88 @@ def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
     axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
+
+
+def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> dict[str, list[_Mark]]:
+    """Return the marks of the streams' vehicles by row, the most severe first, each row in order of time.
+
+    Events far from all messages are left out: their time is damaged.
+    """
+    timed = [event for event in events if event.boot is not None]
+    rows = defaultdict[str, dict[Event, _Mark]](dict)
+    vehicles = sorted({stream.address.vehicle for stream in streams})
+    for vehicle in vehicles:
+        seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
+        first, last = float(seconds.min()), float(seconds.max())
+        for span in spans_of([event for event in timed if event.vehicle == vehicle]):
+            event = span.begin
+            if span.initial or event.boot is None or (event.severity == "info" and not KINDS[event.kind].phase):
+                continue
+            offset = event.boot - start - event.time
+            begin = span.since + offset
+            if max(first - begin, begin - last) > last - first + _NEAR:
+                continue
+            row = KINDS[event.kind].row or event.kind.replace("_", " ")
+            text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
+            marks = rows[f"{row} {vehicle}" if len(vehicles) > 1 else row]
+            end = max(begin, last if span.until is None else min(span.until + offset, last))
+            # Conditions that began together share a mark until the last of them ends.
+            marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
+
+    def order(marks: list[_Mark]) -> tuple[int, float]:
+        return min((SEVERITIES.index(mark.event.severity), mark.begin) for mark in marks)
+
+    by_row = {row: sorted(marks.values(), key=lambda mark: mark.begin) for row, marks in rows.items()}
+    return dict(sorted(by_row.items(), key=lambda row: order(row[1])))
+
+
+def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
+    """Mark the begin of bad and watch events on the track and on the time axes of altitude and speed."""
+    by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
+    main = {stream.address.vehicle: stream for stream in by_preference}
+    for severity, label in _LEGEND.items():
+        marker, color, size = _MARKERS[severity]
+        own = [mark for mark in marks if mark.event.severity == severity]
+        if not own:
+            continue
+        style: dict[str, Any] = {"marker": marker, "color": color, "fillstyle": "none", "linestyle": "none"}
+        places = []
+        for mark in own:
+            stream = main[mark.event.vehicle]
+            nearest = np.abs(stream.seconds - mark.begin).argmin()
+            if abs(stream.seconds[nearest] - mark.begin) <= _NEAR:
+                places.append((stream.messages["y"][nearest], stream.messages["x"][nearest]))
+        if places:
+            found = Line2D(*zip(*places, strict=True), label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3)
+            found.set(**style)
+            axes["track"].add_artist(found)
+        for name in ("altitude", "speed"):
+            bottom = axes[name].get_xaxis_transform()
+            times = [mark.begin for mark in own]
+            axes[name].add_artist(Line2D(times, [0.03] * len(own), transform=bottom, markersize=size - 1, **style))
+
+
+def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
+    """Plot the marks row by row, and label each if the text fits before the next mark."""
+    for number, marks in enumerate(rows.values()):
+        for mark in marks:
+            marker, color, size = _MARKERS[mark.event.severity]
+            bar = [(mark.begin, mark.end - mark.begin)]
+            axes.broken_barh(bar, (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0)
+            axes.plot(mark.begin, number, marker, color=color, markersize=size)
+    axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
+    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
+    axes.grid(axis="x", alpha=0.3)
+    figure.draw_without_rendering()  # lays out the axes, which determines the room for labels
+    gap = _GAP * _DPI / 72
+    for number, marks in enumerate(rows.values()):
+        places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
+        for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
+            text = axes.annotate(
+                mark.text, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
+                fontsize="x-small", parse_math=False,
+            )  # fmt: skip
+            text.set_in_layout(False)
+            box = text.get_window_extent()
+            if box.x0 + 1.05 * box.width > after - gap:  # text width differs slightly between file formats
+                text.remove()

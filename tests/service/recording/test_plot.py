@@ -1,17 +1,27 @@
-"""Plots of flights: the scale, the resets of height, and the clock of the time axes."""
+"""Plots of flights: the scale, the resets of height, and the events that are marked."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from nedbus.events import Event, Times
+import nedbus
+from nedbus.events import KINDS, Event, Times
+from nedbus.sources import read_account
 from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
 from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay
+from tests.flights.ulogs import LOGS
+from tests.peers.command_line import run_command
+
+REAL = sorted(LOGS.parent.glob("*/*.ulg"))
 
 
 def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, MessageArray]:
@@ -25,12 +35,26 @@ def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, Message
     return Address(vehicle, VLP), array
 
 
-def drawn(streams: Sequence[tuple[Address, MessageArray]], times: Times | None = None) -> dict[str, Any]:
+def drawn(
+    streams: Sequence[tuple[Address, MessageArray]], events: Sequence[Event] = (), times: Times | None = None
+) -> dict[str, Any]:
     """Return the parts of a plot, by name."""
     plot = pytest.importorskip("nedbus.recording.plot", exc_type=ImportError)  # takes a second, for Matplotlib
-    figure = plot.draw_figure(streams, title="a flight", times=times or Times())
+    figure = plot.draw_figure(streams, title="a flight", events=events, times=times or Times())
     figure.draw_without_rendering()
     return {str(axes.get_label()): axes for axes in figure.axes}
+
+
+def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) -> Event:
+    """Return an event, whose account began with the flight."""
+    return Event("7", kind, change, severity, fields.pop("text", kind.replace("_", " ")), boot - 1.0, boot, **fields)
+
+
+def told_by(path: Path) -> list[Event]:
+    """Return the events of a log, and the begin of what held all the time."""
+    account = read_account(path).account
+    held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
+    return [*held, *account.events_since(0)[0]]
 
 
 def marks_of(axes: Any, marker: str) -> list[tuple[float, float]]:
@@ -42,6 +66,16 @@ def marks_of(axes: Any, marker: str) -> list[tuple[float, float]]:
 def rows_of(axes: Any) -> list[str]:
     """Return the labels of the rows."""
     return [label.get_text() for label in axes.get_yticklabels()]
+
+
+def bars_of(axes: Any) -> dict[str, list[tuple[float, float]]]:
+    """Return begin and end of the bars of each row."""
+    found: dict[str, list[tuple[float, float]]] = {row: [] for row in rows_of(axes)}
+    for bar in axes.collections:
+        for path in bar.get_paths():
+            (left, low), (right, high) = path.vertices.min(axis=0), path.vertices.max(axis=0)
+            found[rows_of(axes)[round((low + high) / 2)]].append((round(float(left), 6), round(float(right), 6)))
+    return found
 
 
 @pytest.mark.parametrize("others", [[], [flight_of(vehicle="8")]], ids=["one", "with another"])
@@ -91,6 +125,45 @@ def test_height_shows_its_own_resets() -> None:
     assert [x for x, _ in marks_of(parts["flags"], "|")] == [1.0, 2.0, 3.0, 4.0, 5.0]
 
 
+def test_events_are_marked_by_severity() -> None:
+    """A condition is a bar from begin to end, the shape of a mark is its severity; ticks are info. Events made up."""
+    lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix 3D to none")
+    events = [
+        event_of("mode", "once", "info", 2.0, names=("Hold", "Mission")),
+        event_of("dist_bottom_invalid", "begin", "info", 3.0),
+        lost,
+        event_of("xy_invalid", "begin", "bad", 6.0, text="xy not valid", names=("xy_valid",)),
+        event_of("failsafe", "begin", "bad", 6.5, names=("failsafe",)),
+        event_of("gps_fix_lost", "end", "info", 8.0),
+        event_of("reset", "once", "watch", 8.5, text="reset of xy by 3.0 m"),
+        event_of("xy_invalid", "end", "info", 9.0, names=("xy_valid",)),
+        event_of("battery", "begin", "bad", 90_000.0),  # of a damaged timestamp
+    ]
+    parts = drawn([flight_of()], events)
+    assert bars_of(parts["events"]) == {
+        "xy invalid": [(5.0, 8.0)],
+        "failsafe": [(5.5, 9.9)],  # to the last message
+        "gps fix lost": [(3.0, 7.0)],
+        "reset": [(7.5, 7.5)],
+        "mode": [(1.0, 1.0)],
+    }
+    assert marks_of(parts["events"], "x") == [(5.0, 0), (5.5, 1)]
+    assert marks_of(parts["events"], "D") == [(3.0, 2), (7.5, 3)]
+    assert marks_of(parts["events"], "|") == [(1.0, 4)]
+    assert {text.get_text() for text in parts["events"].texts} >= {"xy not valid", "GPS fix 3D to none", "Mission"}
+    assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 5.0), (0.0, 5.5)])
+    assert np.allclose(marks_of(parts["track"], "D"), [(0.0, 3.0), (0.0, 7.5)])
+    for name in ("altitude", "speed"):
+        assert [x for x, _ in marks_of(parts[name], "x")] == [5.0, 5.5]
+        assert [x for x, _ in marks_of(parts[name], "D")] == [3.0, 7.5]
+    assert len({parts[name].get_xlim() for name in ("altitude", "speed", "flags", "events")}) == 1
+    labels = [text.get_text() for text in parts["track"].get_legend().get_texts()]
+    assert labels == [f"7/{VLP}", "watch event", "bad event"]
+    others = drawn([flight_of(vehicle="8")], events)
+    assert "events" not in others, "events of a vehicle that is not drawn"
+    assert not marks_of(others["track"], "x")
+
+
 @pytest.mark.parametrize(
     ("offsets", "ticks", "label"),
     [
@@ -101,19 +174,104 @@ def test_height_shows_its_own_resets() -> None:
 )
 def test_time_axis_names_its_clock(offsets: dict[str, float], ticks: list[str], label: str) -> None:
     """Ticks are round times of the clock that `why` and `events` use, UTC or seconds since boot. Messages made up."""
-    times = Times(offsets=offsets)
-    parts = drawn([flight_of()], times)
-    assert parts["speed"].get_xlabel() == parts["flags"].get_xlabel() == label
-    for name in ("altitude", "speed", "flags"):
+    event = event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",))
+    parts = drawn([flight_of()], [event], Times(offsets=offsets))
+    assert parts["speed"].get_xlabel() == parts["events"].get_xlabel() == label
+    for name in ("altitude", "speed", "flags", "events"):
         low, high = parts[name].get_xlim()
         assert all(low <= place <= high for place in parts[name].get_xticks())
         assert [text.get_text() for text in parts[name].get_xticklabels()] == ticks
-    event = Event("7", "failsafe", "begin", "bad", "failsafe", time=3.0, boot=4.0)
-    for place, text in zip(parts["flags"].get_xticks(), ticks, strict=True):
-        assert times.find(text, event) == pytest.approx(place)
+    [(place, _)] = marks_of(parts["events"], "x")
+    times = Times(offsets=offsets)
+    shown = dict(zip(parts["events"].get_xticks(), ticks, strict=True))
+    nearest = min(shown, key=lambda each: abs(each - place))
+    assert times.find(shown[nearest], event) - event.time == pytest.approx(nearest - place)
 
 
 def test_time_axis_of_different_clocks_is_since_boot() -> None:
     """Vehicles that booted at different times share an axis only since boot. Messages made up."""
     parts = drawn([flight_of(), flight_of(vehicle="8")], times=Times(offsets={"7": 1.7e9, "8": 1.7e9 + 30}))
     assert parts["speed"].get_xlabel() == "time [s since boot]"
+
+
+def test_bar_ends_when_all_flags_are_over() -> None:
+    """A begin of two flags that end one after the other has one mark, and one bar until the last. Events made up."""
+    events = [
+        event_of("failsafe_flag", "begin", "watch", 3.0, names=("a", "b")),
+        event_of("failsafe_flag", "end", "info", 5.0, names=("a",)),
+        event_of("failsafe_flag", "end", "info", 7.0, names=("b",)),
+    ]
+    assert bars_of(drawn([flight_of()], events)["events"]) == {"failsafe flag": [(2.0, 6.0)]}
+
+
+def test_events_of_several_vehicles_have_their_own_rows() -> None:
+    """With events of two vehicles each row names its own, at the times of its own clock. Events made up."""
+    events = [
+        event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",)),
+        Event("8", "failsafe", "begin", "bad", "failsafe", 99.0, 6.0, names=("failsafe",)),
+    ]
+    parts = drawn([flight_of(), flight_of(vehicle="8")], events)
+    assert bars_of(parts["events"]) == {"failsafe 7": [(3.0, 9.9)], "failsafe 8": [(5.0, 9.9)]}
+    assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 3.0), (0.0, 5.0)])
+
+
+def test_command_marks_events(tmp_path: Path) -> None:
+    """`nedbus plot` marks what happens in the loss of GPS of a simulated flight, recorded; no file but that."""
+    flight = tmp_path / "flight.mcap"
+    convert_replay("sim:?duration=80", flight)
+    with pytest.importorskip("matplotlib").rc_context({"svg.fonttype": "none"}):
+        plot = run_command("plot", str(flight), "-o", str(tmp_path / "a.svg"))
+    assert plot.exit_code == 0, plot.err
+    texts = set(re.findall(r"<text[^>]*>([^<]*)</text>", (tmp_path / "a.svg").read_text()))
+    assert {"xy invalid", "gps fix lost", "mode", "Mission", "only 0 satellites", "bad event"} <= texts
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not REAL, reason="no real logs")
+@pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
+def test_texts_of_real_flights_do_not_overlap(path: Path) -> None:
+    """In each row of events, texts and marks are beside each other, within the plot. Real: the logs of PX4."""
+    streams = [(Address("1", VLP), nedbus.read(path))]
+    events = told_by(path)
+    parts = drawn(streams, events)
+    axes = parts["events"]
+    frame = axes.get_window_extent()
+    rows: dict[int, list[tuple[float, float]]] = {}
+    for line in axes.lines:
+        [x], [y] = line.get_data()
+        place = axes.transData.transform((x, y))[0]
+        rows.setdefault(int(y), []).append((place, place))
+    for text in axes.texts:
+        extent = text.get_window_extent()
+        if extent.width:
+            assert frame.x0 <= extent.x0 < extent.x1 <= frame.x1, text.get_text()
+            rows[int(text.xy[1])].append((extent.x0, extent.x1))
+    for intervals in rows.values():
+        for (_, end), (begin, _) in pairwise(sorted(intervals)):
+            assert end <= begin
+    titles = [parts[name].title.get_window_extent() for name in ("track", "altitude")]
+    assert titles[0].x1 < titles[1].x0
+    bad = {KINDS[event.kind].row or event.kind.replace("_", " ") for event in events if event.severity != "info"}
+    assert bad <= set(rows_of(axes))
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not REAL, reason="no real logs")
+def test_real_loss_of_gps_is_marked() -> None:
+    """The loss of GPS of a real simulation of PX4: what was not valid is bad, from 32.3 s to 48.1 s. Real: its log."""
+    path = LOGS.parent / "px4" / "twelve_messages.ulg"
+    array = nedbus.read(path)
+    parts = drawn([(Address("1", VLP), array)], told_by(path))
+    bars = bars_of(parts["events"])
+    assert bars["xy invalid"] == bars["v xy invalid"]
+    [(begin, end)] = bars["xy invalid"]
+    seconds = (array["timestamp"] - array["timestamp"][0]) / 1e6
+    invalid = seconds[~array["xy_valid"] & (seconds > 10)]
+    assert begin == pytest.approx(invalid[0], abs=1e-5)
+    assert 0 < end - invalid[-1] < 0.1
+    [(lost, _)] = bars["gps fix lost"]
+    assert begin - 6 < lost < begin - 4
+    place = array[np.argmax(seconds >= begin - 1e-6)]
+    assert marks_of(parts["track"], "x")[0] == pytest.approx((place["y"], place["x"]), abs=1e-3)
+    valid = array[array["xy_valid"]]
+    assert parts["speed"].get_ylim()[1] < 1.1 * np.hypot(valid["vx"], valid["vy"]).max()

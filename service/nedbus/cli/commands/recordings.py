@@ -16,8 +16,8 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
-from nedbus.events import Times
-from nedbus.sources import LiveSource, parse_source, source_text_of_file
+from nedbus.events import Event, Times
+from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
 from nedbus.sources import convert as convert_messages
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
@@ -102,7 +102,7 @@ def plot(
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
 ) -> None:
-    """Plot a flight: track, altitude, speed, flags and resets."""
+    """Plot a flight: track, altitude, speed, flags, resets and events."""
     draw, limit = recording.draw, recording.MAX_STREAMS
     selection = Selection(topic, vehicle, instance)
     if topic not in (ANY, *DEFAULT.topics):
@@ -121,9 +121,16 @@ def plot(
         if not streams:
             raise SourceError(str(source), "nothing to plot: the selected streams have no valid message")
         target = output or source.with_suffix(".png")
-        known = {name: recording.utc_of(source, vehicle=name) for name in {each.vehicle for each, _ in streams}}
-        times = Times(offsets={name: utc.offset_us / 1e6 for name, utc in known.items() if utc})
-        draw(streams, target, title=source.name, times=times)
+        events, times = _read_events(source)
+        draw(streams, target, title=source.name, events=events, times=times)
         write(str(target))
         if flight.damaged:
             raise SourceError(str(source), "the file is damaged: only the readable messages were plotted")
+
+
+def _read_events(path: Path) -> tuple[list[Event], Times]:
+    """Return the events of a file, preceded by the conditions that held throughout the file, and their times."""
+    read = read_account(path)
+    account = read.account
+    held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
+    return [*dict.fromkeys(each.begin for each in held), *account.events_since(0)[0]], read.times
