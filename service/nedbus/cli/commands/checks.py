@@ -3,7 +3,7 @@
 import json
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Final
@@ -15,7 +15,7 @@ from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, SourceStatus, to_age
-from nedbus.doctor import Finding, check_router_file, check_service, examine, worst_state
+from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
 from nedbus.settings import Settings
@@ -203,21 +203,15 @@ def doctor(
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
     else:
-        write(_to_report(findings))
+        for each in findings:
+            name = f"{each.check} {each.subject}".rstrip(" :")
+            write(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
+            if each.advice:
+                write(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
+        counts = Counter(each.state for each in findings)
+        write(f"\n{', '.join(f'{count} {name}' for name, count in counts.items())}")
     if state == "wrong":
         raise typer.Exit(1)
-
-
-def _to_report(findings: Sequence[Finding]) -> str:
-    """Format findings as lines, followed by the number of findings in each state."""
-    lines = []
-    for each in findings:
-        name = f"{each.check} {each.subject}".rstrip(" :")
-        lines.append(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
-        if each.advice:
-            lines.append(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
-    counts = Counter(each.state for each in findings)
-    return "\n".join([*lines, "", ", ".join(f"{count} {state}" for state, count in counts.items())])
 
 
 @command
