@@ -205,20 +205,19 @@ class Fleet:
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
-        rows = [self._row(name, each, states.get(name, _OK), logs.get(name)) for name, each in lines.items()]
+        rows = []
+        for name, each in lines.items():
+            main = min(each, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
+            self._numbers[name] = self._numbers.pop(name) if name in self._numbers else next(self._next_number)
+            if len(self._numbers) > MAX_STREAMS:
+                del self._numbers[next(iter(self._numbers))]
+            number, held = self._numbers[name], states.get(name, _OK)
+            rows.append(Row(name, held, main, tuple(each), _facts(each), number, logs.get(name)))
         order = {row.vehicle: _DIGITS.sub(lambda found: found[0].zfill(20), row.vehicle) for row in rows}  # 2 before 10
         rows.sort(key=lambda row: (GRADES.index(row.grade), order[row.vehicle]))
         rejected = self._rejected.total()
         self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture
-
-    def _row(self, vehicle: str, lines: Sequence[Line], state: State, log: LogStreamStatus | None) -> Row:
-        main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
-        number = self._numbers.pop(vehicle) if vehicle in self._numbers else next(self._next_number)
-        self._numbers[vehicle] = number
-        if len(self._numbers) > MAX_STREAMS:
-            del self._numbers[next(iter(self._numbers))]
-        return Row(vehicle, state, main, tuple(lines), _facts(lines), number, log)
 
     def _make_room(self, time: float) -> bool:
         """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""
