@@ -14,7 +14,7 @@ from nedbus import __version__
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, Sample, SourceStatus, to_age
+from nedbus.client import Bus, Sample, to_age
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
@@ -93,7 +93,12 @@ class _Check:
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self.services = [each for each in bus.services() if not self._is_local or each.host == _HOST]
         self.sources = [source for service in self.services for source in service.sources]
-        self.ages = _ages(self.sources)
+        self.ages: dict[str, float] = {}  # measured by the services
+        for source in self.sources:
+            for stream in source.streams:
+                name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
+                if age is not None and stream.address in source.addresses:
+                    self.ages[name] = min(age, self.ages.get(name, age))
         self._reports = bus.accounts(within=expected.within or 0.0)
         self._known = {name for report in self._reports for name in report.vehicles}
         self._publishers = bus.publishers()
@@ -106,8 +111,9 @@ class _Check:
         if vehicle is not None:
             latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]
             self._is_refused = vehicle in self.ages and not latencies
-            age = self.ages.get(vehicle, min((max(0.0, each) for each in latencies if each is not None), default=None))
-            self.ages = {vehicle: age} if latencies and age is not None else {}
+            measured = min((max(0.0, each) for each in latencies if each is not None), default=None)
+            newest = self.ages.get(vehicle, measured)
+            self.ages = {vehicle: newest} if latencies and newest is not None else {}
 
     def service_faults(self) -> Iterator[str]:
         """Yield the first fault of the services, their sources, or the age of the newest message."""
@@ -166,17 +172,6 @@ def _report_of(samples: Iterable[Sample[Message]]) -> AccountReport:
             vehicles[sample.vehicle] = report
         vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
     return AccountReport("", _HOST, 0.0, vehicles)
-
-
-def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:
-    """Return the age of the newest message of each published vehicle, measured by its service [s]."""
-    ages: dict[str, float] = {}
-    for source in sources:
-        for stream in source.streams:
-            vehicle, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
-            if age is not None and stream.address in source.addresses:
-                ages[vehicle] = min(age, ages.get(vehicle, age))
-    return ages
 
 
 @command
