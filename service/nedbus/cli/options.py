@@ -141,7 +141,6 @@ def _read_settings(
 
 
 def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> Bus:
-    """Connect to the router; with `wait`, retry until it answers."""
     settings = _read_settings(**settings_options)
     try:
         return connect_with(settings, timeout=1.0)
@@ -160,10 +159,7 @@ def _select(
     instance: InstanceOption = None,
     default: str,
 ) -> Selection:
-    """Return the selection from the options, or from an argument [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints it.
-
-    Raises ConfigError if both name a topic, AddressError for an invalid selection.
-    """
+    """Return the selection of the options, or of an argument [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints it."""
     if topic is None:
         return Selection(default if topic_option is None else topic_option, vehicle, instance)
     if topic_option is not None:

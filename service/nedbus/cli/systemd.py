@@ -125,7 +125,6 @@ class Notifier:
                 return
 
     def _status(self) -> str:
-        """Return the line of `systemctl status`: published streams, then faults."""
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)

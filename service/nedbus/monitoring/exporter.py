@@ -118,10 +118,7 @@ class Exporter(Observer):
             self.add(sample)
 
     def _ask_peers(self, stop: threading.Event) -> None:
-        """Query the session counts of all routers, and the ULog streams of services, until `stop` is set.
-
-        A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
-        """
+        # A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
         due = 0.0
         while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, due - time.monotonic()))):
             if time.monotonic() >= due:

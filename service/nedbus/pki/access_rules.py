@@ -68,7 +68,6 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
-    """Return the blocks between the marks: rules, subjects and policies."""
     try:
         blocks = list(_BLOCK.finditer(file.read_text(encoding="utf-8")))
     except OSError as exc:
@@ -85,10 +84,7 @@ def _find_blocks(file: Path) -> list[re.Match[str]]:
 
 
 def _sections(vehicles: Sequence[str], prefix: str) -> tuple[list[str], list[str], list[str]]:
-    """Return the lines of rules, subjects and policies, in the order of the file.
-
-    There is one subject for all vehicles, for their common permissions, and one for each; a certificate matches both.
-    """
+    """Return the lines of rules, subjects and policies; a certificate matches the subject of all and its own."""
     names = [certificate_name(vehicle) for vehicle in vehicles]
     rules, subjects, policies = [], [f'{{ id: "vehicles", cert_common_names: {json.dumps(names)} }},'], []
     for name, vehicle in zip(names, vehicles, strict=True):

@@ -79,5 +79,4 @@ class Certificate:
 
 
 def _common_name(name: Any) -> str:
-    """Return the common name of an `x509.Name`."""
     return next((str(each.value) for each in name if each.rfc4514_attribute_name == "CN"), "unnamed")

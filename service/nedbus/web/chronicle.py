@@ -105,7 +105,6 @@ class Chronicle:
         return sorted(stories, key=lambda each: each[1].since)
 
     def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:
-        """Return the stories of an event, a time, or all times."""
         events, (topics, held) = self._by_vehicle.get(vehicle, []), self._known(vehicle)
         if isinstance(at, Event):
             story = story_of(at, events, held, topics=topics)

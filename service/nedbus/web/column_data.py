@@ -76,7 +76,6 @@ class Tracks:
         self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
 
     def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
-        """Add the changed cells, by column and slot."""
         history, number = track
         step, ring = self._step, self._slots
         seen, end = self._seen[index], history.written  # read once: another thread adds points

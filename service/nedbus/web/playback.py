@@ -148,7 +148,6 @@ class Player:
         self._is_dragged = self._is_dragged or seconds != self._shown
 
     def _feed(self) -> None:
-        """Add the messages up to the playback position."""
         end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
             self._show(index)

@@ -190,7 +190,6 @@ class Viewer:
             self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
 
     def _plot(self, picture: Picture, chosen: Row | None, now: float) -> None:
-        """Update the plots, event marks and time axes."""
         vehicle, is_long_trail = self.chosen or "", self._map.is_long
         is_long = is_long_trail or now < picture.time - _MINUTE
         main = truth = None

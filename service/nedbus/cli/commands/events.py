@@ -231,7 +231,6 @@ def _name(files: Sequence[Path]) -> str:
 
 
 def _read(files: Sequence[Path]) -> tuple[FileAccount, list[Event]]:
-    """Read the account of files and its events in order of time; write warnings to stderr."""
     read = read_account(*files)
     found, told = read.account.events_since(0)
     for warning in read.warnings:
@@ -281,7 +280,6 @@ def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
 
 
 def _choose_vehicles(where: object, names: Collection[str], vehicle: str) -> list[str]:
-    """Return the vehicle, or all for "*"; raise ConfigError if it is not among them."""
     if vehicle == ANY or vehicle in names:
         return sorted(names) if vehicle == ANY else [vehicle]
     check_vehicle(vehicle)

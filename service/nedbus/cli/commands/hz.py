@@ -62,7 +62,6 @@ def hz(
 
 
 def _states(bus: Bus, monitor: Monitor) -> Iterator[tuple[Address, Health, StreamState]]:
-    """Yield all streams with their states; forget those that have been gone for more than a minute."""
     publishers = bus.publishers(timeout=0.5)
     for address, health in monitor.snapshot().items():
         state = stream_state(health, publishers=publishers[address], connected=bus.connected)

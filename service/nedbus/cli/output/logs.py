@@ -202,7 +202,6 @@ def _is_journal() -> bool:
 
 
 def _log_uncaught_errors() -> None:
-    """Log uncaught errors; Python would print them as several lines."""
 
     def log(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
         if not issubclass(kind, SystemExit):

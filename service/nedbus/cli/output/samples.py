@@ -75,14 +75,12 @@ class Lines:
         return f"{head}\n{line}"
 
     def _join(self, cells: dict[str, str]) -> str:
-        """Join cells to a line; numbers are right-aligned, and the state at the end is not padded."""
         address, *numbers, state = cells.items()
         padded = [cell.rjust(self._widths[name]) for name, cell in numbers]
         return COLUMN_GAP.join([address[1].ljust(self._widths[_ADDRESS]), *padded, state[1]])
 
 
 def _cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
-    """Return the cells by heading: time, then these fields, or position, velocity, heading and eph; NED, degrees."""
     message = sample.message
     time = {"TIME s": f"{message.timestamp / 1e6:8.2f}"}
     if fields:
@@ -102,7 +100,6 @@ def _to_state(sample: Sample[Any]) -> str:
 
 
 def _is_position(message: Message) -> bool:
-    """Return True for the message with columns for position, flags and doubts."""
     return message.DEFINITION is DEFAULT
 
 
@@ -174,11 +171,7 @@ class CsvLines:
 
 
 def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
-    """Return names and cells of a CSV row: address, time of sending (UTC, and [ns]), PX4's time [us], these fields.
-
-    An array has one cell per element; the cell of a field that this message does not have is empty.
-    A position ends with its state, "ok" or the doubts about it.
-    """
+    """Return names and cells of a CSV row; an array has one cell per element, an absent field an empty cell."""
     address, message = sample.address, sample.message
     row: list[tuple[str, object]] = [
         *asdict(address).items(),
@@ -199,7 +192,6 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
-    """Return the value of a field as text, "-" if the message has no such field."""
     kind = sample.message.DEFINITION.types.get(name)
     return "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
 
