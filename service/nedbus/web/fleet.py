@@ -20,6 +20,7 @@ from nedbus.client import (
     stream_state,
 )
 from nedbus.events import FIXES, MODES, State
+from nedbus.monitoring import Snapshot
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.messages import VehicleStatus
 
@@ -117,18 +118,14 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Snapshot of all vehicles, the most severe first.
-
-    `link`: the fault of the link, "" if it is up; `own`: the backlog of this page, "" while it keeps up.
-    """
+    """Snapshot of all vehicles, the most severe first; `alarms`: the faults of the link and of this page."""
 
     time: float
     rows: Sequence[Row] = ()
     reports: Sequence[RejectionReport] = ()
     rejected: int = 0
     left_out: int = 0
-    link: str = ""
-    own: str = ""
+    alarms: Sequence[str] = ()
 
     def row(self, vehicle: str | None) -> Row | None:
         """Return the row of a vehicle, None if there is none."""
@@ -184,25 +181,21 @@ class Fleet:
             part.clear()
 
     def update(
-        self, time: float, healths: Mapping[Address, Health], states: Mapping[str, State], *,
-        alive: Counter[Address] | None = None, link: str = "", own: str = "",
-        logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
-    ) -> Picture:  # fmt: skip
-        """Take a picture at `time` [s], keep it in `picture` and return it.
-
-        `states`, `logs`: states and ULog streams by vehicle; `alive`: the number of publishers of each address, None
-        if unknown.
-        """
-        if alive is not None and not link:
-            known, silent = {*alive, *healths}, time - _SILENT
+        self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus] = MappingProxyType({})
+    ) -> None:
+        """Take a picture and keep it in `picture`; `states`, `logs`: states and ULog streams by vehicle."""
+        self.reject(now.rejected)
+        time, alive = now.time, now.alive
+        if alive is not None and not now.link:
+            known, silent = {*alive, *now.healths}, time - _SILENT
             self._gone = [key for key, stream in [*self.streams.items()] if key not in known and stream.time < silent]
             self._left_out.intersection_update(alive)
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
                 continue
-            health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
-            state = stream_state(health, publishers=None if alive is None else alive[address], connected=not link)
+            health = now.healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
+            state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
         rows = []
@@ -215,9 +208,9 @@ class Fleet:
             rows.append(Row(name, held, main, tuple(each), _facts(each), number, logs.get(name)))
         order = {row.vehicle: _DIGITS.sub(lambda found: found[0].zfill(20), row.vehicle) for row in rows}  # 2 before 10
         rows.sort(key=lambda row: (GRADES.index(row.grade), order[row.vehicle]))
+        alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
         rejected = self._rejected.total()
-        self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
-        return self.picture
+        self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), alarms)
 
     def _make_room(self, time: float) -> bool:
         """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""

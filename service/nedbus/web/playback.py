@@ -15,6 +15,7 @@ from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
+from nedbus.monitoring import Snapshot
 from nedbus.sources import KEPT_OF_FILE, Flights, SourceMessage, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
@@ -153,7 +154,7 @@ class Player:
             self._show(index)
         self._next = max(self._next, end)
         states = {name: state_at(spans, self.time) for name, spans in self.recording.chronicle.spans.items()}
-        self.fleet.update(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
+        self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states)
 
     def _show(self, index: int) -> None:
         due, (address, kept) = self.recording.dues[index], self.recording.entries[index]

@@ -125,14 +125,9 @@ class LiveFleet(Exporter):
         snapshot, account = super().poll(), self.account
         ahead = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
         self.chronicle.start, self.chronicle.times = ahead, Times(is_live=True, ahead=ahead)
-        self.fleet.reject(snapshot.rejected)
         vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}
-        own = snapshot.behind.replace("this reader", "this page")
-        self.fleet.update(
-            snapshot.time, snapshot.healths, states,
-            alive=snapshot.alive, link=snapshot.link, own=own, logs=self.log_streams,
-        )  # fmt: skip
+        self.fleet.update(snapshot, states, self.log_streams)
         return snapshot
 
 
