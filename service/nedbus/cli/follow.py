@@ -13,8 +13,7 @@ from .output.streams import write_stderr
 
 _log = logging.getLogger("nedbus")
 
-SILENCE_TIMEOUT: Final = 2.0
-"""Time without a first sample until a notice is written to stderr [s]."""
+SILENCE_TIMEOUT: Final = 2.0  # time without a first sample until a notice is written to stderr [s]
 
 
 def follow(

@@ -54,11 +54,8 @@ CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="S
 DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")]
 
 
-ALL: Final = Selection()
-"""Default selection of commands that show all topics."""
-
-POSITIONS: Final = Selection(DEFAULT_TOPIC)
-"""Default selection of commands that show positions."""
+ALL: Final = Selection()  # default selection of commands that show all topics
+POSITIONS: Final = Selection(DEFAULT_TOPIC)  # default selection of commands that show positions
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:

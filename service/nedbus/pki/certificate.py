@@ -10,17 +10,12 @@ from typing import Any, Final
 from nedbus.extras import needs
 from nedbus_msgs import AddressError, check_vehicle
 
-DAYS: Final = 825
-"""Days of validity of a certificate."""
-
-RENEW_WITHIN: Final = 30
-"""Days before expiry from which a certificate is due for renewal."""
-
+DAYS: Final = 825  # days of validity of a certificate
+RENEW_WITHIN: Final = 30  # days before expiry from which a certificate is due for renewal
 CERTIFICATE_PREFIX: Final = "vehicle-"
 """Prefix of the vehicle's id in the common name of its certificate, so no vehicle has the name of a reader."""
 
-MAX_NAME: Final = 64
-"""Characters of the longest common name that X.509 allows."""
+MAX_NAME: Final = 64  # characters of the longest common name that X.509 allows
 
 
 def certificate_name(vehicle: str) -> str:

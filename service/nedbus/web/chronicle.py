@@ -21,9 +21,7 @@ from nedbus.events import (
     verdict_of,
 )
 
-PAST: Final = 600.0
-"""Seconds of history on a live page."""
-
+PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
 _TENTH: Final = 0.1  # s; time resolution of the page's URL
 

@@ -5,6 +5,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import count
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -29,9 +30,7 @@ from .stream import LONG, Origin, PageStream, is_position
 GRADES: Final = ("bad", "watch", "ok")
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
-MAX_STREAMS: Final = 1000
-"""Streams shown on a page, positions before others; further streams are only counted."""
-
+MAX_STREAMS: Final = 1000  # streams shown on a page, positions before others; further streams are only counted
 _SILENT: Final = 60.0  # s without a message after which a stream makes room for another
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
@@ -144,8 +143,8 @@ class Fleet:
         self.streams: dict[Address, PageStream] = {}
         self.picture = Picture(0.0)
         self._long = long
-        self._numbers: dict[str, int] = {}  # most recently shown last
-        self._next_number = count()
+        numbers = count()
+        self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
         self._left_out: set[Address] = set()
         self._gone: list[Address] = []  # removed by the thread that adds samples
         self._rejected: Counter[Address] = Counter()
@@ -201,10 +200,7 @@ class Fleet:
         rows = []
         for name, each in lines.items():
             main = min(each, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
-            self._numbers[name] = self._numbers.pop(name) if name in self._numbers else next(self._next_number)
-            if len(self._numbers) > MAX_STREAMS:
-                del self._numbers[next(iter(self._numbers))]
-            number, held = self._numbers[name], states.get(name, _OK)
+            held, number = states.get(name, _OK), self._number_of(name)
             rows.append(Row(name, held, main, tuple(each), _facts(each), number, logs.get(name)))
         order = {row.vehicle: _DIGITS.sub(lambda found: found[0].zfill(20), row.vehicle) for row in rows}  # 2 before 10
         rows.sort(key=lambda row: (GRADES.index(row.grade), order[row.vehicle]))

@@ -41,9 +41,7 @@ from .viewer import Viewer
 
 _log = logging.getLogger(__name__)
 
-MAX_VIEWERS: Final = 32
-"""Maximum number of pages open at the same time: each has a WebSocket."""
-
+MAX_VIEWERS: Final = 32  # maximum number of pages open at the same time: each has a WebSocket
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - wildcard hosts, only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
 _MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before Host is checked

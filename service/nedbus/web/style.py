@@ -23,8 +23,7 @@ SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "
 """Text symbol of a grade or of an event's severity."""
 MARKERS: Final[Mapping[str, str]] = {"bad": "square", "watch": "triangle", "ok": "circle", "info": "circle"}
 """Bokeh marker of the same shape."""
-PALETTE: Final = 8
-"""Number of vehicle colours, all distinct from the colours of states."""
+PALETTE: Final = 8  # number of vehicle colours, all distinct from the colours of states
 
 
 def read_asset(name: str) -> str:

@@ -18,12 +18,8 @@ from nedbus.log_event import EVENTS, About, about
 
 from .streams import MAX_TEXT, STRUCTURED, printable, to_text
 
-BURST: Final = 50
-"""Lines of one kind that may be logged at once."""
-
-PER_MINUTE: Final = 6
-"""Lines of one kind that may be logged per minute after a burst."""
-
+BURST: Final = 50  # lines of one kind that may be logged at once
+PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a burst
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
 _MAX_KINDS: Final = 1000  # nedbus itself has about 40
