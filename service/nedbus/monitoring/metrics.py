@@ -208,7 +208,11 @@ def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iter
 
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     """Yield all metrics of a service."""
-    sources = _by_label(daemon.measures)
+    seen, sources = Counter[str](), dict[str, SourceMeasures]()
+    for measures in daemon.measures:  # numbered where two have the same text: time series must be unique
+        text = measures.status.source
+        seen[text] += 1
+        sources[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures
     yield build_info(daemon.version)
     yield from make_metrics({
         "nedbus_start_time_seconds": [((), daemon.started + clock.to_utc())],
@@ -262,17 +266,6 @@ def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any
         for bound, count in (("least", each.lost_at_least), ("most", each.lost_at_most))
     ]
     return rows
-
-
-def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:
-    """Return the sources by label, numbered where two have the same text: time series must be unique."""
-    seen: Counter[str] = Counter()
-    labelled = {}
-    for measures in sources:
-        text = measures.status.source
-        seen[text] += 1
-        labelled[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures
-    return labelled
 
 
 def _histogram_row(labels: Sequence[str], measured: Histogram) -> tuple[Any, ...]:

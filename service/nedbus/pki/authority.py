@@ -82,7 +82,20 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
     Raises PkiError if the folder has no CA, or a certificate cannot be read.
     """
     authority = load_certificate(folder / "ca.crt")
-    found = [_describe(path, authority) for path in folder.glob("*.crt")]
+    found = []
+    for path in folder.glob("*.crt"):
+        loaded, certificate, problem = load_certificate(path), Certificate.read(path), ""
+        with suppress(OSError, ValueError, TypeError):  # the key is elsewhere, or this user may not read it
+            key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
+            problem = "" if key.public_key() == loaded.public_key() else "does not match the key beside it"
+        try:
+            loaded.verify_directly_issued_by(authority)
+        except (ValueError, TypeError, InvalidSignature):
+            problem = _FOREIGN
+        is_authority = path.name == "ca.crt"
+        name = path.stem if is_authority else certificate.subject
+        use = "authority" if is_authority else "router" if certificate.hosts else "client"
+        found.append(CertificateEntry(path, name, use, certificate, problem))
     return sorted(found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name))
 
 
@@ -227,18 +240,3 @@ def _host(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
-
-
-def _describe(path: Path, authority: x509.Certificate) -> CertificateEntry:
-    loaded, certificate, problem = load_certificate(path), Certificate.read(path), ""
-    with suppress(OSError, ValueError, TypeError):  # the key is elsewhere, or this user may not read it
-        key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
-        problem = "" if key.public_key() == loaded.public_key() else "does not match the key beside it"
-    try:
-        loaded.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature):
-        problem = _FOREIGN
-    if path.name == "ca.crt":
-        return CertificateEntry(path, path.stem, "authority", certificate, problem)
-    use = "router" if certificate.hosts else "client"
-    return CertificateEntry(path, certificate.subject, use, certificate, problem)

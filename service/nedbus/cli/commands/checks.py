@@ -149,7 +149,15 @@ class _Check:
         for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
             if not expected.expect or name in expected.expect:
                 yield f"vehicle {name} has several publishers: stop one, or give it another vehicle"
-        reports = [*self._reports, _report_of(others)]
+        vehicles: dict[str, VehicleReport] = {}
+        for sample in others:
+            if sample.topic == DEFAULT_TOPIC:
+                unknown = tuple(sample.missing.intersection(VALID.values()))
+                invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
+                flags = dict.fromkeys(invalid)
+                vehicles[sample.vehicle] = VehicleReport("info", "ok", flags=flags, has_position=True, unknown=unknown)
+            vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
+        reports = [*self._reports, AccountReport("", _HOST, 0.0, vehicles)]
         for fault in faults_of(reports, expected, only=_HOST if self._is_local else None):
             if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
                 yield fault
@@ -159,19 +167,6 @@ class _Check:
                 if service.service not in remembering:
                     name = to_text(service.service, 64)
                     yield f"service {name} keeps no history of its vehicles: update nedbus there"
-
-
-def _report_of(samples: Iterable[Sample[Message]]) -> AccountReport:
-    """Return the account of vehicles from their last messages alone."""
-    vehicles: dict[str, VehicleReport] = {}
-    for sample in samples:
-        if sample.topic == DEFAULT_TOPIC:
-            unknown = tuple(sample.missing.intersection(VALID.values()))
-            invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
-            report = VehicleReport("info", "ok", flags=dict.fromkeys(invalid), has_position=True, unknown=unknown)
-            vehicles[sample.vehicle] = report
-        vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
-    return AccountReport("", _HOST, 0.0, vehicles)
 
 
 @command

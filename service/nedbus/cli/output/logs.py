@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
@@ -172,13 +173,17 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 
 def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     """Log to stderr, one line per record, with syslog priorities if stderr is the journal."""
-    is_journal, is_json = _is_journal(), log_format == "json"
+    is_journal, is_json = False, log_format == "json"
+    with suppress(OSError, ValueError):  # stderr is closed, or not a file
+        status = os.fstat(sys.stderr.fileno())
+        is_journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"  # see systemd.exec(5)
     formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
     handler = _StderrHandler()
     handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
     if is_journal or is_json:
         handler.name = STRUCTURED
-        _log_uncaught_errors()
+        sys.excepthook = _log_uncaught
+        threading.excepthook = lambda caught: _log_uncaught(caught.exc_type, caught.exc_value, caught.exc_traceback)
     limit = RateLimit(handler.handle)
     handler.addFilter(limit)
     atexit.register(limit.flush)
@@ -188,22 +193,8 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     logging.getLogger().setLevel(max(number, logging.WARNING))
 
 
-def _is_journal() -> bool:
-    """Return True if stderr is connected to the journal; see JOURNAL_STREAM in systemd.exec(5)."""
-    try:
-        status = os.fstat(sys.stderr.fileno())
-    except (OSError, ValueError):  # closed, or not a file
-        return False
-    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
-
-
-def _log_uncaught_errors() -> None:
-
-    def log(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
-        if not issubclass(kind, SystemExit):
-            exc_info = None if error is None else (kind, error, traceback)
-            text = str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
-            _log.error("%s", text, exc_info=exc_info, extra=about("error"))
-
-    sys.excepthook = log
-    threading.excepthook = lambda caught: log(caught.exc_type, caught.exc_value, caught.exc_traceback)
+def _log_uncaught(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
+    if not issubclass(kind, SystemExit):
+        exc_info = None if error is None else (kind, error, traceback)
+        text = str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
+        _log.error("%s", text, exc_info=exc_info, extra=about("error"))
