@@ -16,7 +16,7 @@ from nedbus.errors import NedbusError
 from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.sources import KEPT_OF_FILE, Flights, SourceMessage, follow
+from nedbus.sources import KEPT_OF_FILE, Flights, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .chronicle import Chronicle
@@ -63,27 +63,24 @@ class Recording:
         try:
             self.chronicle.times = flights.times
             for message, reason, payload in follow(flights.messages(), account, ended=flights.ended):
-                self._add(message, reason, payload)
+                address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
+                kept: bytes | str | int = stamp if reason is None else reason
+                if payload is not None and (is_position(address) or address.topic in _KEPT):
+                    kept = payload
+                    if is_position(address):
+                        row = codec_of(DEFAULT).decode_row(payload)
+                        self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
+                if reason is None and address not in self.indices and is_position(address):
+                    self.chronicle.set_start(address.vehicle, stamp / 1e6, message.due)
+                self.indices.setdefault(address, []).append(len(self.entries))
+                self.entries.append((address, kept))
+                self.dues.append(message.due)
             for warning in flights.warnings:
                 _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=self.name, reason=str(exc)))
         finally:
             self.is_read = True
-
-    def _add(self, message: SourceMessage, reason: str | None, payload: bytes | None) -> None:
-        address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
-        kept: bytes | str | int = stamp if reason is None else reason
-        if payload is not None and (is_position(address) or address.topic in _KEPT):
-            kept = payload
-            if is_position(address):
-                row = codec_of(DEFAULT).decode_row(payload)
-                self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
-        if reason is None and address not in self.indices and is_position(address):
-            self.chronicle.set_start(address.vehicle, stamp / 1e6, message.due)
-        self.indices.setdefault(address, []).append(len(self.entries))
-        self.entries.append((address, kept))
-        self.dues.append(message.due)
 
 
 class Player:

@@ -223,8 +223,14 @@ class _Names(NullAuth):
     def __init__(self, where: Where) -> None:
         async def check(handler: RequestHandler) -> str:
             _require_name(handler, where)
-            if handler.request.path.endswith("/ws"):
-                _require_token(handler)
+            if handler.request.path.endswith("/ws"):  # without a page's token, Bokeh would log a traceback
+                name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
+                try:
+                    is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
+                except Exception:  # noqa: BLE001 - Bokeh raises whatever its decoders raise
+                    is_valid = False
+                if not is_valid:
+                    raise HTTPError(403, reason="no valid token of a page")
             return "viewer"
 
         self.get_user_async = check
@@ -241,17 +247,6 @@ def _require_name(handler: RequestHandler, where: Where) -> None:
         raise HTTPError(403, reason=f"host name {name[:100]} is not allowed: add it with --origin")
     if headers.get("Sec-Fetch-Site") == "cross-site" and headers.get("Sec-Fetch-Dest") != "document":
         raise HTTPError(403, reason="part of a page of another site")
-
-
-def _require_token(handler: RequestHandler) -> None:
-    """Refuse a WebSocket without the token of a page, which Bokeh would log with a traceback."""
-    name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
-    try:
-        is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
-    except Exception:  # noqa: BLE001 - Bokeh raises whatever its decoders raise
-        is_valid = False
-    if not is_valid:
-        raise HTTPError(403, reason="no valid token of a page")
 
 
 class _Text(RequestHandler):
