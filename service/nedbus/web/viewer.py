@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from string import Template
 from typing import Any, Final
 from urllib.parse import urlencode
 
@@ -13,6 +14,7 @@ from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, GlobalInlineStyleSheet, LayoutDOM
 from bokeh.models.widgets import Div, TextInput
+from bokeh.themes import Theme
 
 from nedbus.events import ALL, Event, state_at
 from nedbus_msgs import Address
@@ -87,7 +89,8 @@ class Viewer:
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
         self._on_tap(self._map.events, lambda: self._map.shown_events, self._show)
         self._on_tap(self._timeline.marks, lambda: self._timeline.shown, self._show)
-        document.title, document.theme = title, self._style.theme
+        theme = Template(read_asset("theme.json")).substitute(self._style.colours)
+        document.title, document.theme = title, Theme(json=json.loads(theme))
         document.config.update(reconnect_session=False, notify_connection_status=False)
         document.js_on_event(ConnectionLost, CustomJS(code=read_asset("lost.js")))
         args = {"message": self._message, "map": self._map.figure, "search": self._search}
@@ -290,5 +293,7 @@ class Viewer:
             marked = column(slider, text["marks"], sizing_mode="stretch_width")
             parts.insert(1, row(*controls, marked, sizing_mode="stretch_width", css_classes=["ctrl"]))
         parts += [self._update_number, self._drawn, self._message, self._url]
-        page: list[Any] = [GlobalInlineStyleSheet(css=self._style.page_css), read_asset("layout.css")]
+        variables = " ".join(f"--{name}: {colour};" for name, colour in self._style.colours.items())
+        css = f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"
+        page: list[Any] = [GlobalInlineStyleSheet(css=css), read_asset("layout.css")]
         return column(*parts, sizing_mode="stretch_width", stylesheets=page)
