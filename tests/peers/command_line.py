@@ -24,7 +24,7 @@ from unittest.mock import patch
 import typer
 
 from nedbus.cli.app import app
-from nedbus.cli.output.log_limit import RateLimit
+from nedbus.cli.output.logs import RateLimit
 
 from .processes import Forked, Zygote, unmeasured
 

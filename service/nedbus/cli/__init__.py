@@ -15,7 +15,11 @@ def main() -> None:
     """Run `nedbus`."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the imports
-    _fill_closed_streams()
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass  # a socket could reuse the descriptor of a closed standard stream, and receive the output
+    os.close(descriptor)
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - open until exit
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # before the slow imports below
         return
@@ -25,15 +29,6 @@ def main() -> None:
 
     gc.enable()
     app()
-
-
-def _fill_closed_streams() -> None:
-    """Open /dev/null for closed standard streams: a socket could reuse their descriptors and receive the output."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
-    if sys.stderr is None:
-        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - open until exit
 
 
 def _give_up_stderr() -> None:

@@ -54,11 +54,8 @@ CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="S
 DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")]
 
 
-ALL: Final = Selection()
-"""Default selection of commands that show all topics."""
-
-POSITIONS: Final = Selection(DEFAULT_TOPIC)
-"""Default selection of commands that show positions."""
+ALL: Final = Selection()  # default selection of commands that show all topics
+POSITIONS: Final = Selection(DEFAULT_TOPIC)  # default selection of commands that show positions
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -141,7 +138,6 @@ def _read_settings(
 
 
 def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> Bus:
-    """Connect to the router; with `wait`, retry until it answers."""
     settings = _read_settings(**settings_options)
     try:
         return Bus(settings, timeout=1.0)
@@ -160,10 +156,7 @@ def _select(
     instance: InstanceOption = None,
     default: str,
 ) -> Selection:
-    """Return the selection from the options, or from an argument [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints it.
-
-    Raises ConfigError if both name a topic, AddressError for an invalid selection.
-    """
+    """Return the selection of the options, or of an argument [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints it."""
     if topic is None:
         return Selection(default if topic_option is None else topic_option, vehicle, instance)
     if topic_option is not None:

@@ -85,23 +85,16 @@ def run_until_stopped(
         _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("ending"))
     thread.join(_END_TIMEOUT)
     if thread.is_alive():
-        _force_exit()
-    succeeded = outcome.result() is not False
-    if signals[:1] == [signal.SIGINT]:
-        raise typer.Exit(130)
-    if not succeeded:
-        raise typer.Exit(1)
-
-
-def _force_exit() -> None:
-    text = "shutdown took more than %g s, maybe because of a blocked reader: unsent messages are lost"
-    _log.error(text, _END_TIMEOUT, extra=about("ending"))
-    sys.stderr.flush()
-    os._exit(1)
+        text = "shutdown took more than %g s, maybe because of a blocked reader: unsent messages are lost"
+        _log.error(text, _END_TIMEOUT, extra=about("ending"))
+        sys.stderr.flush()
+        os._exit(1)
+    failed, interrupted = outcome.result() is False, signals[:1] == [signal.SIGINT]
+    if failed or interrupted:
+        raise typer.Exit(130 if interrupted else 1)
 
 
 def _has_terminal() -> bool:
-    """Return whether this process has a controlling terminal."""
     with suppress(OSError):
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
         return True

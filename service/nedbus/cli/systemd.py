@@ -5,8 +5,9 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Final, Self
 
 from nedbus.daemon import Daemon
@@ -20,28 +21,20 @@ _log = logging.getLogger("nedbus")
 _START_INTERVAL: Final = 0.1  # s between two checks until the service is ready
 
 
-class NotifySocket:
-    """Datagrams to NOTIFY_SOCKET, see sd_notify(3); without such a socket, sending does nothing.
+def notify(address: str, **fields: object) -> bool:
+    """Send these fields to NOTIFY_SOCKET as one datagram, see sd_notify(3); return True if it was accepted.
 
     Never raises and never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not report
     whether a datagram was accepted.
     """
-
-    def __init__(self, address: str) -> None:
-        self.active = address.startswith(("/", "@"))
-        self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
-
-    def send(self, **fields: object) -> bool:
-        """Send these fields as one datagram; return True if it was accepted."""
-        if not self.active:
+    where = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+        try:
+            sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), where)
+        except OSError as exc:  # no reader, or a full queue: READY and STATUS are sent again
+            _log.debug("cannot notify systemd: %s", exc)
             return False
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-            try:
-                sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), self._address)
-            except OSError as exc:  # no reader, or a full queue: READY and STATUS are sent again
-                _log.debug("cannot notify systemd: %s", exc)
-                return False
-        return True
+    return True
 
 
 class Notifier:
@@ -58,7 +51,9 @@ class Notifier:
 
     def __init__(self, daemon: Daemon, *, environment: Mapping[str, str] = os.environ) -> None:
         self._daemon = daemon
-        self._socket = NotifySocket(environment.get("NOTIFY_SOCKET", ""))
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._is_active = address.startswith(("/", "@"))
+        self._send: Callable[..., bool] = partial(notify, address) if self._is_active else lambda **_: False
         self._watchdog = watchdog_interval(environment)
         self._router_deadline = time.monotonic() + TIMINGS.systemd_patience
         self._counted = time.monotonic(), 0  # time, and messages published until then
@@ -68,7 +63,7 @@ class Notifier:
         self._thread = threading.Thread(target=self._run, name="nedbus-systemd", daemon=True)
 
     def __enter__(self) -> Self:
-        if self._socket.active:
+        if self._is_active:
             self._thread.start()
         return self
 
@@ -85,13 +80,13 @@ class Notifier:
         """Report STOPPING once; safe in signal handlers."""
         if not self._stop.is_set():
             self._stop.set()
-            self._socket.send(STOPPING=1, STATUS="stopping")
+            self._send(STOPPING=1, STATUS="stopping")
 
     @contextmanager
     def reloading(self) -> Iterator[None]:
         """Report RELOADING, then READY; an error stays in the status text until the next reload."""
         now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-        self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reloading the configuration")
+        self._send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reloading the configuration")
         self._rejected = ""
         try:
             yield
@@ -108,21 +103,20 @@ class Notifier:
             has_waited = self._daemon.role == "client" and now >= self._router_deadline
             if not self._is_ready and (self._daemon.ready.is_set() or has_waited):
                 self._is_ready = True  # set before sending: a reload may unset it at any moment
-                if not self._socket.send(READY=1, STATUS=self._status()):
+                if not self._send(READY=1, STATUS=self._status()):
                     self._is_ready = False
             elif now >= next_status:
-                self._socket.send(STATUS=self._status())
+                self._send(STATUS=self._status())
                 next_status = now + TIMINGS.systemd_status
             interval = self._watchdog
             if interval is not None and now >= next_ping and self._ticked and self._daemon.busy < interval:
                 self._ticked, next_ping = False, now + interval
-                self._socket.send(WATCHDOG=1)
+                self._send(WATCHDOG=1)
             pause = TIMINGS.systemd_status if self._is_ready else _START_INTERVAL
             if self._stop.wait(pause if interval is None else min(pause, interval / 2)):
                 return
 
     def _status(self) -> str:
-        """Return the line of `systemctl status`: published streams, then faults."""
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)

@@ -23,14 +23,7 @@ from nedbus.transport import RouterState, Session, ask_routers
 from nedbus_msgs import Address, Selection
 
 from .http_server import Page
-from .metrics import (
-    MeasuredStream,
-    build_info,
-    make_metrics,
-    metrics_page,
-    stream_metrics,
-    vehicle_metrics,
-)
+from .metrics import MeasuredStream, build_info, make_metrics, metrics_page, stream_metrics, vehicle_metrics
 from .observer import Observer, Snapshot
 from .pages import vehicles_page
 
@@ -39,32 +32,24 @@ _MAX_ROUTERS: Final = 16  # routers exported; any peer may claim to be one
 _SERVICES_INTERVAL: Final = 5.0  # s between queries of services, while messages from MAVLink arrive
 
 
-class Exporter:
-    """Subscribe to a selection and serve metrics about it.
+class Exporter(Observer):
+    """Observer that serves metrics about its streams and vehicles; `pages`: the HTTP pages by path."""
 
-    `account`: the events and states of its vehicles; `pages`: the HTTP pages by path.
-    `on_sample` is called with each sample, `on_poll` with a `Snapshot` of all vehicles twice a second.
-    """
-
-    def __init__(
-        self,
-        bus: Bus,
-        selection: Selection,
-        *,
-        version: str,
-        on_sample: Callable[[Sample[Any]], object] = lambda _: None,
-        on_poll: Callable[[Snapshot], object] = lambda _: None,
-    ) -> None:
-        self._bus, self._version = bus, version
-        self._on_sample, self._on_poll = on_sample, on_poll
-        self._observer = Observer(bus, selection)
-        self._subscription, self.account = self._observer.subscription, self._observer.account
+    def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
+        super().__init__(bus, selection)
+        self._version = version
         self.pages: Mapping[str, Callable[[], Page]] = {
             "/metrics": lambda: metrics_page(self._metrics()),
             "/healthz": lambda: Page.text("ok"),
             "/readyz": lambda: Page.verdict(self._faults(), "ready"),
             "/vehicles": self._vehicles,
-            "/status": self._status,
+            "/status": lambda: Page.json(
+                {
+                    "connected": self._bus.connected,
+                    **asdict(self.subscription.counts),
+                    "streams": {str(address): asdict(each) for address, (each, _) in self.measure().items()},
+                }
+            ),
         }
         self._routers: list[RouterState] = []
         self.log_streams: Mapping[str, LogStreamStatus] = {}
@@ -80,29 +65,42 @@ class Exporter:
                 task.add_done_callback(lambda _: stop.set())
             try:
                 while not stop.wait(_POLL_INTERVAL):
-                    snapshot = self._observer.poll()
-                    for address in [*self._sources]:
-                        if address not in snapshot.healths:
-                            del self._sources[address]
-                    self._on_poll(snapshot)
+                    self.poll()
             finally:
                 stop.set()
                 if self._session is not None:
                     self._session.close()  # aborts a query that a router does not answer
-                self._subscription.close()
+                self.subscription.close()
             for task in tasks:
                 task.result()
 
+    def poll(self) -> Snapshot:
+        """Poll all vehicles; `run` calls it twice a second."""
+        snapshot = super().poll()
+        for address in [*self._sources]:  # a copy: another thread adds streams
+            if address not in snapshot.healths:
+                del self._sources[address]
+        return snapshot
+
+    def add(self, sample: Sample[Any]) -> None:
+        """Add a sample; `run` calls it with each that is read."""
+        super().add(sample)
+        self._sources[sample.address] = sample.source or ""
+
     def _metrics(self) -> Iterator[Metric]:
-        counts, streams = self._subscription.counts, self._streams()
+        counts = self.subscription.counts
+        streams = [
+            MeasuredStream((address.vehicle, address.stream, self._sources.get(address, "")), health, latencies=each)
+            for address, (health, each) in self.measure().items()
+        ]
         yield build_info(self._version)
         yield from make_metrics({
             "nedbus_connected": [((), self._bus.connected)],
             "nedbus_messages_dropped": [((), counts.dropped)],
             "nedbus_messages_invalid": [((), counts.invalid)],
-            "nedbus_queue_messages": [((), self._subscription.waiting)],
+            "nedbus_queue_messages": [((), self.subscription.waiting)],
             "nedbus_limit_reached": [
-                (("vehicles",), self.account.refused), (("streams",), self._observer.monitor.evicted),
+                (("vehicles",), self.account.refused), (("streams",), self.monitor.evicted),
                 (("keys",), counts.forgotten),
             ],
             "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
@@ -113,26 +111,12 @@ class Exporter:
         yield from stream_metrics(streams, messages="nedbus_messages_received")
         yield from vehicle_metrics(self.account, streams)
 
-    def _streams(self) -> list[MeasuredStream]:
-        return [
-            MeasuredStream(
-                (address.vehicle, address.stream, self._sources.get(address, "")), health,
-                latencies=latencies,
-            )
-            for address, (health, latencies) in self._observer.measure().items()
-        ]  # fmt: skip
-
     def _read(self) -> None:
-        for sample in self._subscription.rows():
-            self._observer.add(sample)
-            self._sources[sample.address] = sample.source or ""
-            self._on_sample(sample)
+        for sample in self.subscription.rows():
+            self.add(sample)
 
     def _ask_peers(self, stop: threading.Event) -> None:
-        """Query the session counts of all routers, and the ULog streams of services, until `stop` is set.
-
-        A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
-        """
+        # A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
         due = 0.0
         while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, due - time.monotonic()))):
             if time.monotonic() >= due:
@@ -159,7 +143,3 @@ class Exporter:
             return Page.verdict(self._faults(), "")
         host, now = socket.gethostname(), clock.steady()
         return vehicles_page(report_of(self.account, "export", host, now, within=0.0, to_utc=clock.to_utc()))
-
-    def _status(self) -> Page:
-        streams = {str(address): asdict(health) for address, (health, _) in self._observer.measure().items()}
-        return Page.json({"connected": self._bus.connected, **asdict(self._subscription.counts), "streams": streams})

@@ -114,7 +114,7 @@ class MeasuredStream:
     `active` is False once the source has ended; then only counts are exported, no age or rate.
     """
 
-    labels: tuple[str, str, str]
+    labels: tuple[str, ...]
     health: Health
     active: bool = True
     latencies: Histogram | None = None
@@ -208,7 +208,11 @@ def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iter
 
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     """Yield all metrics of a service."""
-    sources = _by_label(daemon.measures)
+    seen, sources = Counter[str](), dict[str, SourceMeasures]()
+    for measures in daemon.measures:  # numbered where two have the same text: time series must be unique
+        text = measures.status.source
+        seen[text] += 1
+        sources[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures
     yield build_info(daemon.version)
     yield from make_metrics({
         "nedbus_start_time_seconds": [((), daemon.started + clock.to_utc())],
@@ -216,7 +220,11 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
         "nedbus_sessions_max": [] if daemon.max_sessions is None else [((daemon.role,), daemon.max_sessions)],
         "nedbus_vehicle_refused": [((vehicle,), is_refused) for vehicle, is_refused in daemon.refused.items()],
     })  # fmt: skip
-    streams = [stream for label, measures in sources.items() for stream in _streams(label, measures)]
+    streams = [
+        MeasuredStream((*each.address.split("/", 1), label), each.health, active=not measures.status.ended)
+        for label, measures in sources.items()
+        for each in measures.status.streams
+    ]
     yield from stream_metrics(streams, messages="nedbus_messages_published")
     account = daemon.look(list(sources.values()))
     yield from vehicle_metrics(account, streams)
@@ -258,23 +266,6 @@ def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any
         for bound, count in (("least", each.lost_at_least), ("most", each.lost_at_most))
     ]
     return rows
-
-
-def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:
-    """Return the sources by label, numbered where two have the same text: time series must be unique."""
-    seen: Counter[str] = Counter()
-    labelled = {}
-    for measures in sources:
-        text = measures.status.source
-        seen[text] += 1
-        labelled[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures
-    return labelled
-
-
-def _streams(source: str, measures: SourceMeasures) -> Iterator[MeasuredStream]:
-    for stream in measures.status.streams:
-        vehicle, _, topic = stream.address.partition("/")
-        yield MeasuredStream((vehicle, topic, source), stream.health, active=not measures.status.ended)
 
 
 def _histogram_row(labels: Sequence[str], measured: Histogram) -> tuple[Any, ...]:

@@ -2,8 +2,8 @@
 
 import threading
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from nedbus import clock
@@ -22,17 +22,18 @@ _SETTLING_TIME: Final = 3.0  # s after a reconnect until delayed messages have a
 class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
-    `time`: by the steady clock [s], as the times of `rejected`; `alive`: the number of publishers of each address.
+    `time`: by the steady clock [s], as the times of `rejected`.
     `healths`: without streams that are forgotten, as their vehicles are, or were silent for an hour.
+    `alive`: the number of publishers of each address, None if unknown.
     `link`, `behind`: the fault of the link and of this reader, "" if there is none.
     """
 
     time: float
-    alive: Counter[Address]
-    rejected: list[RejectionReport]
-    link: str
-    healths: Mapping[Address, Health]
-    behind: str
+    healths: Mapping[Address, Health] = field(default_factory=dict)
+    alive: Counter[Address] | None = None
+    rejected: Sequence[RejectionReport] = ()
+    link: str = ""
+    behind: str = ""
 
 
 class Observer:
@@ -101,4 +102,4 @@ class Observer:
         behind = ""
         if self.account.overload is not None:
             behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"
-        return Snapshot(now, alive, rejected, link, healths, behind)
+        return Snapshot(now, healths, alive, rejected, link, behind)

@@ -6,7 +6,7 @@ its own rule, subject and policy. These go between marks in the file; the rest o
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -54,7 +54,20 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
     names = sorted(set(vehicles))
     if not names:  # a router does not start with a subject without names
         raise ConfigError.in_file(file, "name at least one vehicle")
-    text, sections = _find_blocks(file)[0].string, iter(_sections(names, prefix))
+    text = _find_blocks(file)[0].string
+    # There is one subject for all vehicles, for their common permissions, and one for each; a certificate matches both.
+    subjects = [f'{{ id: "vehicles", cert_common_names: {json.dumps(list(map(certificate_name, names)))} }},']
+    rules, policies = list[str](), list[str]()
+    for vehicle, name in zip(names, map(certificate_name, names), strict=True):
+        keys = json.dumps([key.format(p=prefix, v=vehicle) for key in _KEYS])
+        rules += [
+            f'{{ id: "{name}-in", permission: "allow", flows: ["ingress"],',
+            f"  messages: {_MESSAGES},",
+            f"  key_exprs: {keys} }},",
+        ]
+        subjects.append(f'{{ id: "{name}", cert_common_names: ["{name}"] }},')
+        policies.append(f'{{ rules: ["{name}-in"], subjects: ["{name}"] }},')
+    sections = iter((rules, subjects, policies))  # in the order of the file
 
     def fill(block: re.Match[str]) -> str:
         return "".join([block["begin"], *(f"{block['indent']}{line}\n" for line in next(sections)), block["end"]])
@@ -68,7 +81,6 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
-    """Return the blocks between the marks: rules, subjects and policies."""
     try:
         blocks = list(_BLOCK.finditer(file.read_text(encoding="utf-8")))
     except OSError as exc:
@@ -82,22 +94,3 @@ def _find_blocks(file: Path) -> list[re.Match[str]]:
         )
         raise ConfigError.in_file(file, reason)
     return blocks
-
-
-def _sections(vehicles: Sequence[str], prefix: str) -> tuple[list[str], list[str], list[str]]:
-    """Return the lines of rules, subjects and policies, in the order of the file.
-
-    There is one subject for all vehicles, for their common permissions, and one for each; a certificate matches both.
-    """
-    names = [certificate_name(vehicle) for vehicle in vehicles]
-    rules, subjects, policies = [], [f'{{ id: "vehicles", cert_common_names: {json.dumps(names)} }},'], []
-    for name, vehicle in zip(names, vehicles, strict=True):
-        keys = json.dumps([key.format(p=prefix, v=vehicle) for key in _KEYS])
-        rules += [
-            f'{{ id: "{name}-in", permission: "allow", flows: ["ingress"],',
-            f"  messages: {_MESSAGES},",
-            f"  key_exprs: {keys} }},",
-        ]
-        subjects.append(f'{{ id: "{name}", cert_common_names: ["{name}"] }},')
-        policies.append(f'{{ rules: ["{name}-in"], subjects: ["{name}"] }},')
-    return rules, subjects, policies

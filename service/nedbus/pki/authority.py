@@ -9,10 +9,10 @@ import datetime as dt
 import ipaddress
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
@@ -29,7 +29,6 @@ from .certificate import DAYS, MAX_NAME, Certificate
 
 _CA_DAYS: Final = 3650
 _FOREIGN: Final = "signed by another authority"
-_UNFIT: Final = "does not match the key beside it"
 _USAGES: Final = (
     "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
     "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
@@ -44,7 +43,7 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
     Raises PkiError if there is a CA already, or the folder cannot be written.
     """
     key = new_key()
-    return write_files(folder / "ca", sign_authority(key, days=days), key)
+    return _write_files(folder / "ca", sign_authority(key, days=days), key)
 
 
 def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
@@ -58,7 +57,7 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
         raise PkiError(f"{name!r} is not a name for a certificate: use 1 to {MAX_NAME} characters without /")
     authority = Authority.read(folder)
     key = new_key()
-    return write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
+    return _write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +82,20 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
     Raises PkiError if the folder has no CA, or a certificate cannot be read.
     """
     authority = load_certificate(folder / "ca.crt")
-    found = [_describe(path, authority) for path in folder.glob("*.crt")]
+    found = []
+    for path in folder.glob("*.crt"):
+        loaded, certificate, problem = load_certificate(path), Certificate.read(path), ""
+        with suppress(OSError, ValueError, TypeError):  # the key is elsewhere, or this user may not read it
+            key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
+            problem = "" if key.public_key() == loaded.public_key() else "does not match the key beside it"
+        try:
+            loaded.verify_directly_issued_by(authority)
+        except (ValueError, TypeError, InvalidSignature):
+            problem = _FOREIGN
+        is_authority = path.name == "ca.crt"
+        name = path.stem if is_authority else certificate.subject
+        use = "authority" if is_authority else "router" if certificate.hosts else "client"
+        found.append(CertificateEntry(path, name, use, certificate, problem))
     return sorted(found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name))
 
 
@@ -98,18 +110,17 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
     folder = entry.path.parent
     authority = Authority.read(folder)
     if entry.use == "authority":
-        return write_files(folder / "ca", sign_authority(authority.key, days=days), replace=True)
+        return _write_files(folder / "ca", sign_authority(authority.key, days=days), replace=True)
     if entry.problem == _FOREIGN:
         raise PkiError(f"{entry.path} is {_FOREIGN}: renew it in the folder of that authority")
     # The private key may be on its vehicle only; the public key is in the old certificate.
     key = new_key() if replace_key else None
     public_key = key.public_key() if key else load_certificate(entry.path).public_key()
     signed = authority.sign(entry.name, public_key, hosts=entry.certificate.hosts, days=days)
-    return write_files(entry.path.with_suffix(""), signed, key, replace=True)
+    return _write_files(entry.path.with_suffix(""), signed, key, replace=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Authority:
+class Authority(NamedTuple):
     """The CA of a folder: its certificate and its private key."""
 
     certificate: x509.Certificate
@@ -131,17 +142,12 @@ class Authority:
         self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
     ) -> x509.Certificate:
         """Sign a key, for a router if hosts are given; the certificate never outlives the CA's."""
-        # A router is also a client of other routers.
-        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
-        extensions: list[x509.ExtensionType] = [x509.ExtendedKeyUsage(purposes)]
-        if hosts:
-            extensions.append(x509.SubjectAlternativeName(list(map(_host, hosts))))
-        return _sign(name, key, self.key, DAYS if days is None else days, extensions, issuer=self.certificate)
+        return _sign(name, key, self.key, DAYS if days is None else days, issuer=self.certificate, hosts=hosts)
 
 
 def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
     """Return a self-signed CA certificate for a key; certificates that the key signed before stay valid."""
-    return _sign("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days, [])
+    return _sign("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days)
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
@@ -149,38 +155,15 @@ def new_key() -> ec.EllipticCurvePrivateKey:
     return ec.generate_private_key(ec.SECP256R1())
 
 
-def write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Write a key to a new file that only its owner can read."""
-    pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    _write_new(path, key.private_bytes(serialization.Encoding.PEM, pkcs8, plain), 0o600)
-
-
-def write_certificate(path: Path, certificate: x509.Certificate) -> None:
-    """Write a certificate to a new file that all users can read."""
-    _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
-
-
-def write_files(
-    stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey | None = None, *, replace: bool = False
-) -> list[Path]:
-    """Write `STEM.crt`, and `STEM.key` if a key is given, both or neither, and return their paths.
-
-    Raises PkiError if one of them exists and `replace` is false, or if the folder cannot be written.
-    """
-    paths = [Path(f"{stem}.crt")] if key is None else [Path(f"{stem}.key"), Path(f"{stem}.crt")]
-    try:
-        stem.parent.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as opened:
-            parts = [opened.enter_context(whole_file(path, replace=replace)) for path in paths]
-            if key is not None:
-                write_key(parts[0], key)
-            write_certificate(parts[-1], certificate)
-    except FileExistsError as exc:
-        reason = "it is not overwritten; move it away, or choose another folder or name"
-        raise PkiError(f"{exc.filename} exists: {reason}") from exc
-    except OSError as exc:
-        raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
-    return paths
+def write_new(path: Path, item: x509.Certificate | ec.EllipticCurvePrivateKey) -> None:
+    """Write a certificate to a new file that all users can read, or a key to one that only its owner can read."""
+    if isinstance(item, x509.Certificate):
+        content, mode = item.public_bytes(serialization.Encoding.PEM), 0o644
+    else:
+        pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        content, mode = item.private_bytes(serialization.Encoding.PEM, pkcs8, plain), 0o600
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(content)
 
 
 def load_certificate(path: Path) -> x509.Certificate:
@@ -191,6 +174,26 @@ def load_certificate(path: Path) -> x509.Certificate:
         raise PkiError(f"{path} is not a PEM certificate: move it away, or make a new one") from exc
 
 
+def _write_files(
+    stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey | None = None, *, replace: bool = False
+) -> list[Path]:
+    """Write `STEM.key`, if a key is given, and `STEM.crt`, both or neither, and return their paths."""
+    items = {Path(f"{stem}.key"): key, Path(f"{stem}.crt"): certificate}
+    written = {path: item for path, item in items.items() if item is not None}
+    try:
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as opened:
+            parts = [opened.enter_context(whole_file(path, replace=replace)) for path in written]
+            for part, item in zip(parts, written.values(), strict=True):
+                write_new(part, item)
+    except FileExistsError as exc:
+        reason = "it is not overwritten; move it away, or choose another folder or name"
+        raise PkiError(f"{exc.filename} exists: {reason}") from exc
+    except OSError as exc:
+        raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
+    return list(written)
+
+
 def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
@@ -199,27 +202,15 @@ def _read(path: Path) -> bytes:
         raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
 
 
-def _write_new(path: Path, content: bytes, mode: int) -> None:
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        file.write(content)
-
-
 def _sign(
-    name: str,
-    key: CertificatePublicKeyTypes,
-    signer: ec.EllipticCurvePrivateKey,
-    days: int,
-    extensions: Sequence[x509.ExtensionType],
-    *,
-    issuer: x509.Certificate | None = None,
-) -> x509.Certificate:
+    name: str, key: CertificatePublicKeyTypes, signer: ec.EllipticCurvePrivateKey, days: int, *,
+    issuer: x509.Certificate | None = None, hosts: Sequence[str] = (),
+) -> x509.Certificate:  # fmt: skip
     """Return the certificate of a key; without an issuer, that of a CA, signed by itself."""
-    is_authority = issuer is None
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now = clock.now()
+    now, is_authority = clock.now(), issuer is None
     until = now + dt.timedelta(days=days)
     allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
-    usage = x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES})
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -233,10 +224,14 @@ def _sign(
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
-        .add_extension(usage, critical=True)
+        .add_extension(x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES}), critical=True)
     )
-    for extension in extensions:
-        builder = builder.add_extension(extension, critical=False)
+
+    if issuer is not None:  # a router is also a client of other routers
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+        builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+    if hosts:
+        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
     return builder.sign(signer, hashes.SHA256())
 
 
@@ -245,24 +240,3 @@ def _host(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
-
-
-def _describe(path: Path, authority: x509.Certificate) -> CertificateEntry:
-    problem, certificate = _find_problem(path, authority), Certificate.read(path)
-    if path.name == "ca.crt":
-        return CertificateEntry(path, path.stem, "authority", certificate, problem)
-    use = "router" if certificate.hosts else "client"
-    return CertificateEntry(path, certificate.subject, use, certificate, problem)
-
-
-def _find_problem(path: Path, authority: x509.Certificate) -> str:
-    certificate = load_certificate(path)
-    try:
-        certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature):
-        return _FOREIGN
-    try:
-        key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
-    except (OSError, ValueError, TypeError):
-        return ""  # the key is elsewhere, or this user may not read it
-    return "" if key.public_key() == certificate.public_key() else _UNFIT

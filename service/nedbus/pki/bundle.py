@@ -12,7 +12,7 @@ from nedbus.errors import ConfigError, PkiError
 from nedbus.transport import check_endpoints
 from nedbus.whole_file import whole_file
 
-from .authority import Authority, new_key, write_certificate, write_key
+from .authority import Authority, new_key, write_new
 from .certificate import certificate_name
 
 _TARGET: Final = Path("/etc/nedbus")  # where the systemd unit and the container image look for nedbus.toml
@@ -75,12 +75,11 @@ def make_bundle(
     part = output.with_name(f".{os.getpid()}-part-{output.name}")
     try:
         with whole_file(folder / f"{name}.crt") as kept:
-            write_certificate(kept, certificate)
+            write_new(kept, certificate)
             (part / "pki").mkdir(parents=True)
             (part / "pki").chmod(0o700)
-            write_key(part / "pki" / f"{name}.key", key)
-            write_certificate(part / "pki" / f"{name}.crt", certificate)
-            write_certificate(part / "pki" / "ca.crt", authority.certificate)
+            for file, item in ((f"{name}.key", key), (f"{name}.crt", certificate), ("ca.crt", authority.certificate)):
+                write_new(part / "pki" / file, item)
             for file in ("nedbus.toml", "compose.yml", "README.txt"):
                 (part / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(facts))
             part.rename(output)

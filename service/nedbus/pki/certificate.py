@@ -10,17 +10,12 @@ from typing import Any, Final
 from nedbus.extras import needs
 from nedbus_msgs import AddressError, check_vehicle
 
-DAYS: Final = 825
-"""Days of validity of a certificate."""
-
-RENEW_WITHIN: Final = 30
-"""Days before expiry from which a certificate is due for renewal."""
-
+DAYS: Final = 825  # days of validity of a certificate
+RENEW_WITHIN: Final = 30  # days before expiry from which a certificate is due for renewal
 CERTIFICATE_PREFIX: Final = "vehicle-"
 """Prefix of the vehicle's id in the common name of its certificate, so no vehicle has the name of a reader."""
 
-MAX_NAME: Final = 64
-"""Characters of the longest common name that X.509 allows."""
+MAX_NAME: Final = 64  # characters of the longest common name that X.509 allows
 
 
 def certificate_name(vehicle: str) -> str:
@@ -79,5 +74,4 @@ class Certificate:
 
 
 def _common_name(name: Any) -> str:
-    """Return the common name of an `x509.Name`."""
     return next((str(each.value) for each in name if each.rfc4514_attribute_name == "CN"), "unnamed")

@@ -1,5 +1,7 @@
 """Detect the events of all vehicles in logs and recordings, by replaying them."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -21,9 +21,7 @@ from nedbus.events import (
     verdict_of,
 )
 
-PAST: Final = 600.0
-"""Seconds of history on a live page."""
-
+PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
 _TENTH: Final = 0.1  # s; time resolution of the page's URL
 
@@ -105,7 +103,6 @@ class Chronicle:
         return sorted(stories, key=lambda each: each[1].since)
 
     def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:
-        """Return the stories of an event, a time, or all times."""
         events, (topics, held) = self._by_vehicle.get(vehicle, []), self._known(vehicle)
         if isinstance(at, Event):
             story = story_of(at, events, held, topics=topics)

@@ -57,26 +57,21 @@ class Tracks:
     def update(self, tracks: Mapping[Address, Track]) -> None:
         """Send the new points of these tracks."""
         if tracks != self._tracks:  # for example after a seek, which creates new histories
-            self._lay_out(tracks)
+            # Choose the number of slots, and the number of points per slot.
+            self._tracks, self._seen = dict(tracks), [0] * len(tracks)
+            longest = max((history.size for history, _ in tracks.values()), default=1)
+            points = max(_MIN_TRACK_POINTS, min(longest, _MAX_POINTS // max(1, len(tracks))))
+            written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
+            self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
+            self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
+            self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
         cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
         if cells["east"]:
             self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
 
-    def _lay_out(self, tracks: Mapping[Address, Track]) -> None:
-        """Choose the number of slots and the number of points per slot."""
-        self._tracks = dict(tracks)
-        self._seen = [0] * len(tracks)
-        longest = max((history.size for history, _ in tracks.values()), default=1)
-        points = max(_MIN_TRACK_POINTS, min(longest, _MAX_POINTS // max(1, len(tracks))))
-        written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
-        self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
-        self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
-        self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
-
     def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
-        """Add the changed cells, by column and slot."""
         history, number = track
         step, ring = self._step, self._slots
         seen, end = self._seen[index], history.written  # read once: another thread adds points

@@ -5,6 +5,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import count
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -20,15 +21,14 @@ from nedbus.client import (
     stream_state,
 )
 from nedbus.events import FIXES, MODES, State, rank_vehicle
+from nedbus.monitoring import Snapshot
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.messages import VehicleStatus
 
 from .stream import LONG, Origin, PageStream, is_position
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
-MAX_STREAMS: Final = 1000
-"""Streams shown on a page, positions before others; further streams are only counted."""
-
+MAX_STREAMS: Final = 1000  # streams shown on a page, positions before others; further streams are only counted
 _SILENT: Final = 60.0  # s without a message after which a stream makes room for another
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
@@ -114,18 +114,14 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Snapshot of all vehicles, the most severe first.
-
-    `link`: the fault of the link, "" if it is up; `own`: the backlog of this page, "" while it keeps up.
-    """
+    """Snapshot of all vehicles, the most severe first; `alarms`: the faults of the link and of this page."""
 
     time: float
     rows: Sequence[Row] = ()
     reports: Sequence[RejectionReport] = ()
     rejected: int = 0
     left_out: int = 0
-    link: str = ""
-    own: str = ""
+    alarms: Sequence[str] = ()
 
     def row(self, vehicle: str | None) -> Row | None:
         """Return the row of a vehicle, None if there is none."""
@@ -144,8 +140,8 @@ class Fleet:
         self.streams: dict[Address, PageStream] = {}
         self.picture = Picture(0.0)
         self._long = long
-        self._numbers: dict[str, int] = {}  # most recently shown last
-        self._next_number = count()
+        numbers = count()
+        self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
         self._left_out: set[Address] = set()
         self._gone: list[Address] = []  # removed by the thread that adds samples
         self._rejected: Counter[Address] = Counter()
@@ -181,40 +177,32 @@ class Fleet:
             part.clear()
 
     def update(
-        self, time: float, healths: Mapping[Address, Health], states: Mapping[str, State], *,
-        alive: Counter[Address] | None = None, link: str = "", own: str = "",
-        logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
-    ) -> Picture:  # fmt: skip
-        """Take a picture at `time` [s], keep it in `picture` and return it.
-
-        `states`, `logs`: states and ULog streams by vehicle; `alive`: the number of publishers of each address, None
-        if unknown.
-        """
-        if alive is not None and not link:
-            known, silent = {*alive, *healths}, time - _SILENT
+        self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus] = MappingProxyType({})
+    ) -> None:
+        """Take a picture and keep it in `picture`; `states`, `logs`: states and ULog streams by vehicle."""
+        self.reject(now.rejected)
+        time, alive = now.time, now.alive
+        if alive is not None and not now.link:
+            known, silent = {*alive, *now.healths}, time - _SILENT
             self._gone = [key for key, stream in [*self.streams.items()] if key not in known and stream.time < silent]
             self._left_out.intersection_update(alive)
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
                 continue
-            health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
-            state = stream_state(health, publishers=None if alive is None else alive[address], connected=not link)
+            health = now.healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
+            state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
-        rows = [self._row(name, each, states.get(name, _OK), logs.get(name)) for name, each in lines.items()]
+        rows = []
+        for name, each in lines.items():
+            main = min(each, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
+            held, number = states.get(name, _OK), self._number_of(name)
+            rows.append(Row(name, held, main, tuple(each), _facts(each), number, logs.get(name)))
         rows.sort(key=lambda row: rank_vehicle(row.vehicle, row.state.severity))
+        alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
         rejected = self._rejected.total()
-        self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
-        return self.picture
-
-    def _row(self, vehicle: str, lines: Sequence[Line], state: State, log: LogStreamStatus | None) -> Row:
-        main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
-        number = self._numbers.pop(vehicle) if vehicle in self._numbers else next(self._next_number)
-        self._numbers[vehicle] = number
-        if len(self._numbers) > MAX_STREAMS:
-            del self._numbers[next(iter(self._numbers))]
-        return Row(vehicle, state, main, tuple(lines), _facts(lines), number, log)
+        self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), alarms)
 
     def _make_room(self, time: float) -> bool:
         """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""

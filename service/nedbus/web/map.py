@@ -20,9 +20,7 @@ from .stream import Place
 from .style import MARKERS, Style
 
 FOCUSES: Final = ("all", "follow", "vehicle")
-MIN_SIDE: Final = 20.0
-"""Minimum side of the map [m]; anything smaller shows the noise of a vehicle at rest."""
-
+MIN_SIDE: Final = 20.0  # minimum side of the map [m]; anything smaller shows the noise of a vehicle at rest
 _MIN_ZOOM: Final = 0.01  # m; smallest visible range taken from the browser
 _MARGIN: Final = 0.08  # margin on each side, as a fraction of the extent
 _FOLLOWED_SIDE: Final = 60.0  # m; side of the map while following a vehicle

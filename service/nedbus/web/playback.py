@@ -15,7 +15,8 @@ from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
-from nedbus.sources import KEPT_OF_FILE, Flights, SourceMessage, follow
+from nedbus.monitoring import Snapshot
+from nedbus.sources import KEPT_OF_FILE, Flights, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .chronicle import Chronicle
@@ -49,7 +50,7 @@ class Recording:
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
         self._flights = Flights(paths)
-        self._indices: dict[Address, list[int]] = {}  # indices in `entries`, by stream
+        self.indices: dict[Address, list[int]] = {}  # in `entries`, by stream
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
     @property
@@ -57,37 +58,29 @@ class Recording:
         """Duration read so far [s]."""
         return self.dues[-1] if self.dues else 0.0
 
-    def before(self, index: int) -> list[int]:
-        """Return the index of each stream's last entry before `index`, in order."""
-        found = (known[at - 1] for known in list(self._indices.values()) if (at := bisect_left(known, index)))
-        return sorted(found)
-
     def _read(self) -> None:
         flights, account = self._flights, self.chronicle.account
         try:
             self.chronicle.times = flights.times
             for message, reason, payload in follow(flights.messages(), account, ended=flights.ended):
-                self._add(message, reason, payload)
+                address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
+                kept: bytes | str | int = stamp if reason is None else reason
+                if payload is not None and (is_position(address) or address.topic in _KEPT):
+                    kept = payload
+                    if is_position(address):
+                        row = codec_of(DEFAULT).decode_row(payload)
+                        self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
+                if reason is None and address not in self.indices and is_position(address):
+                    self.chronicle.set_start(address.vehicle, stamp / 1e6, message.due)
+                self.indices.setdefault(address, []).append(len(self.entries))
+                self.entries.append((address, kept))
+                self.dues.append(message.due)
             for warning in flights.warnings:
                 _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=self.name, reason=str(exc)))
         finally:
             self.is_read = True
-
-    def _add(self, message: SourceMessage, reason: str | None, payload: bytes | None) -> None:
-        address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
-        kept: bytes | str | int = stamp if reason is None else reason
-        if payload is not None and (is_position(address) or address.topic in _KEPT):
-            kept = payload
-            if is_position(address):
-                row = codec_of(DEFAULT).decode_row(payload)
-                self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
-        if reason is None and address not in self._indices and is_position(address):
-            self.chronicle.set_start(address.vehicle, stamp / 1e6, message.due)
-        self._indices.setdefault(address, []).append(len(self.entries))
-        self.entries.append((address, kept))
-        self.dues.append(message.due)
 
 
 class Player:
@@ -104,13 +97,12 @@ class Player:
         self._monitor = Monitor()
         self._next = 0
         self._ticked = time.monotonic()
-        self._shown, self._is_dragged = 0.0, False
+        self._shown = 0.0  # as last set: the slider has another value while it is dragged
         self._play = Toggle(label="pause", active=True, width=80)
         self._speed = Select(options=_SPEEDS, value="1", width=80)
         self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
         self.controls = self._play, self._speed, self._slider
         self._play.on_change("active", lambda _, __, active: self._play.update(label="pause" if active else "play"))
-        self._slider.on_change("value", lambda _, __, value: self._drag(value))
         self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
 
     def tick(self) -> None:
@@ -120,7 +112,7 @@ class Player:
         if self._play.active:
             speed = float(self._speed.value) if self._speed.value in _SPEEDS else 1.0
             self.time = min(self.time + elapsed * speed, self.recording.length)
-        if not self._is_dragged:
+        if self._slider.value == self._shown:
             self._shown = round(self.time, 1)
             self._slider.update(end=max(1.0, self.recording.length), value=self._shown)
         self._feed()
@@ -131,11 +123,13 @@ class Player:
 
     def jump(self, seconds: float) -> None:
         """Seek to a time within the part read so far, and load the minute before it."""
-        self._is_dragged = False
+        self._shown = self._slider.value
         self.fleet.clear()
         self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.recording.length)
         self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
-        for index in self.recording.before(self._next):  # the last message of streams that are silent in this minute
+        indices = list(self.recording.indices.values())
+        silent = (known[at - 1] for known in indices if (at := bisect_left(known, self._next)))
+        for index in sorted(silent):  # the last message of streams that are silent in this minute
             self._show(index)
         for address, stream in self.fleet.streams.items():
             whole = self.recording.whole.streams.get(address)
@@ -144,17 +138,13 @@ class Player:
         self._feed()
         self.on_jump()
 
-    def _drag(self, seconds: float) -> None:
-        self._is_dragged = self._is_dragged or seconds != self._shown
-
     def _feed(self) -> None:
-        """Add the messages up to the playback position."""
         end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
             self._show(index)
         self._next = max(self._next, end)
         states = {name: state_at(spans, self.time) for name, spans in self.recording.chronicle.spans.items()}
-        self.fleet.update(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
+        self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states)
 
     def _show(self, index: int) -> None:
         due, (address, kept) = self.recording.dues[index], self.recording.entries[index]

@@ -25,7 +25,7 @@ from tornado.iostream import IOStream
 from tornado.web import HTTPError, RequestHandler
 
 from nedbus import clock
-from nedbus.client import Bus
+from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError
 from nedbus.events import ALL, Times
 from nedbus.log_event import about
@@ -42,9 +42,7 @@ from .viewer import Viewer
 
 _log = logging.getLogger(__name__)
 
-MAX_VIEWERS: Final = 32
-"""Maximum number of pages open at the same time: each has a WebSocket."""
-
+MAX_VIEWERS: Final = 32  # maximum number of pages open at the same time: each has a WebSocket
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - wildcard hosts, only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
 _MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before Host is checked
@@ -100,18 +98,12 @@ def serve_recording(
     server.run(stop)
 
 
-class LiveFleet:
-    """Subscribe to a selection, and keep its fleet and chronicle.
-
-    `run`: read until an event is set; `pages`: metrics and health, as served by `nedbus export`.
-    """
+class LiveFleet(Exporter):
+    """Exporter that also keeps the fleet and chronicle of a page."""
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
+        super().__init__(bus, selection, version=version)
         self.fleet = Fleet()
-        self._exporter = Exporter(
-            bus, selection, version=version, on_poll=self._update,
-            on_sample=lambda sample: self.fleet.add(sample, clock.steady()),
-        )  # fmt: skip
         now = clock.utc()
         remembered = [
             event
@@ -119,21 +111,22 @@ class LiveFleet:
             for event in report.events
             if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
         ]
-        self.chronicle = Chronicle(self._exporter.account, before=remembered)
-        self.run, self.pages = self._exporter.run, self._exporter.pages
+        self.chronicle = Chronicle(self.account, before=remembered)
 
-    def _update(self, snapshot: Snapshot) -> None:
-        account = self._exporter.account
+    def add(self, sample: Sample[Any]) -> None:
+        """Add a sample to the metrics and the fleet."""
+        super().add(sample)
+        self.fleet.add(sample, clock.steady())
+
+    def poll(self) -> Snapshot:
+        """Poll all vehicles, and update the fleet and the clock of the chronicle."""
+        snapshot, account = super().poll(), self.account
         ahead = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
         self.chronicle.start, self.chronicle.times = ahead, Times(is_live=True, ahead=ahead)
-        self.fleet.reject(snapshot.rejected)
         vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}
-        own = snapshot.behind.replace("this reader", "this page")
-        self.fleet.update(
-            snapshot.time, snapshot.healths, states,
-            alive=snapshot.alive, link=snapshot.link, own=own, logs=self._exporter.log_streams,
-        )  # fmt: skip
+        self.fleet.update(snapshot, states, self.log_streams)
+        return snapshot
 
 
 class WebServer:
@@ -222,25 +215,26 @@ def _log_once(text: str, *, limit: int) -> None:
 
 
 class _Names(NullAuth):
-    """Reject requests under foreign host names."""
+    """Reject requests under foreign host names, before each response; all viewers are the same user."""
 
     login_url = "/"  # required by Bokeh, never used
+    get_user_async: Any = None
 
     def __init__(self, where: Where) -> None:
-        self._where = where
-        super().__init__()
-
-    @property
-    def get_user_async(self) -> Callable[[Any], Any]:
-        """Return the check that runs before each response; all viewers are the same user."""
-
         async def check(handler: RequestHandler) -> str:
-            _require_name(handler, self._where)
-            if handler.request.path.endswith("/ws"):
-                _require_token(handler)
+            _require_name(handler, where)
+            if handler.request.path.endswith("/ws"):  # without a page's token, Bokeh would log a traceback
+                name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
+                try:
+                    is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
+                except Exception:  # noqa: BLE001 - Bokeh raises whatever its decoders raise
+                    is_valid = False
+                if not is_valid:
+                    raise HTTPError(403, reason="no valid token of a page")
             return "viewer"
 
-        return check
+        self.get_user_async = check
+        super().__init__()
 
 
 def _require_name(handler: RequestHandler, where: Where) -> None:
@@ -253,17 +247,6 @@ def _require_name(handler: RequestHandler, where: Where) -> None:
         raise HTTPError(403, reason=f"host name {name[:100]} is not allowed: add it with --origin")
     if headers.get("Sec-Fetch-Site") == "cross-site" and headers.get("Sec-Fetch-Dest") != "document":
         raise HTTPError(403, reason="part of a page of another site")
-
-
-def _require_token(handler: RequestHandler) -> None:
-    """Refuse a WebSocket without the token of a page, which Bokeh would log with a traceback."""
-    name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
-    try:
-        is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
-    except Exception:  # noqa: BLE001 - Bokeh raises whatever its decoders raise
-        is_valid = False
-    if not is_valid:
-        raise HTTPError(403, reason="no valid token of a page")
 
 
 class _Text(RequestHandler):

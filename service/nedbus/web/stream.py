@@ -14,10 +14,8 @@ from nedbus.client import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPosition
 from nedbus_msgs.frames import MapProjection, to_global
 
-POINTS: Final = 600
-"""Number of points in the history of the last minute."""
-LONG: Final = 900, 1.0
-"""Number of points in the longer history, and seconds between two points: 15 minutes."""
+POINTS: Final = 600  # number of points in the history of the last minute
+LONG: Final = 900, 1.0  # number of points in the longer history, and seconds between two points: 15 minutes
 COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
 """Columns of a history, NaN where the message was not valid.
 
@@ -119,20 +117,7 @@ class PageStream:
         elif before is not None:
             self._tracker.add(before.message)  # the tracker must see the last message before a jump
         self._state, self._sampled = state, time
-        self._add_point(sample.message, time, truth, sample.provenance.missing)
-
-    def places_at(self, times: list[float]) -> list[Place | None]:
-        """Return the last valid position at each time [s]; None before the beginning of the histories."""
-        points = np.concatenate([self.long.points(), self.minute.points()])
-        points = points[~np.isnan(points[:, 1])]
-        points = points[points[:, 0].argsort(kind="stable")]
-        numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
-        found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
-        return [None if place is None else Place(place[0], place[1], math.nan, True) for place in found]
-
-    def _add_point(
-        self, message: VehicleLocalPosition, time: float, truth: PageStream | None, missing: frozenset[str]
-    ) -> None:
+        message, missing = sample.message, sample.provenance.missing
         track, place = self._tracker.add(message), self.origin.place(message, missing)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
             gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
@@ -150,6 +135,15 @@ class PageStream:
         if time - self._sampled_long >= self.long.step:
             self._sampled_long = time
             self.long.write(point)
+
+    def places_at(self, times: list[float]) -> list[Place | None]:
+        """Return the last valid position at each time [s]; None before the beginning of the histories."""
+        points = np.concatenate([self.long.points(), self.minute.points()])
+        points = points[~np.isnan(points[:, 1])]
+        points = points[points[:, 0].argsort(kind="stable")]
+        numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
+        found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
+        return [None if place is None else Place(place[0], place[1], math.nan, True) for place in found]
 
 
 def _distance(place: Place, message: VehicleLocalPosition, truth: PageStream | None) -> float:

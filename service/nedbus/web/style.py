@@ -1,17 +1,14 @@
 """Style of the page: dark and light theme, shapes of states, and text templates."""
 
-import json
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from string import Template
 from typing import Any, Final
 
 import jinja2
-from bokeh.themes import Theme
 
 from nedbus.client import to_age
 
@@ -23,8 +20,7 @@ SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "
 """Text symbol of a grade or of an event's severity."""
 MARKERS: Final[Mapping[str, str]] = {"bad": "square", "watch": "triangle", "ok": "circle", "info": "circle"}
 """Bokeh marker of the same shape."""
-PALETTE: Final = 8
-"""Number of vehicle colours, all distinct from the colours of states."""
+PALETTE: Final = 8  # number of vehicle colours, all distinct from the colours of states
 
 
 def read_asset(name: str) -> str:
@@ -57,17 +53,6 @@ class Style:
         """Colours by their names in CSS and in the plot theme."""
         plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
         return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
-
-    @property
-    def theme(self) -> Theme:
-        """Bokeh theme of the plots."""
-        return Theme(json=json.loads(Template(read_asset("theme.json")).substitute(self.colours)))
-
-    @property
-    def page_css(self) -> str:
-        """CSS of the document, with the colours as variables."""
-        variables = " ".join(f"--{name}: {colour};" for name, colour in self.colours.items())
-        return f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"
 
     def open_panels(self, chronicle: Chronicle) -> Any:
         """Return the macros of `panels.html`, with the times of a chronicle."""

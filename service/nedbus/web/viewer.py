@@ -2,8 +2,10 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from string import Template
 from typing import Any, Final
 from urllib.parse import urlencode
 
@@ -12,6 +14,7 @@ from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, GlobalInlineStyleSheet, LayoutDOM
 from bokeh.models.widgets import Div, TextInput
+from bokeh.themes import Theme
 
 from nedbus.events import ALL, Event, state_at
 from nedbus_msgs import Address
@@ -47,7 +50,9 @@ class Viewer:
         self, document: Document, fleet: Fleet, chronicle: Chronicle, *, title: str = "nedbus",
         background: Background | None = None, player: Player | None = None,
     ) -> None:  # fmt: skip
-        query = _arguments(document)
+        request = getattr(document.session_context, "request", None)  # None without a browser
+        given = request.arguments.items() if request is not None else ()
+        query = {name: values[0].decode(errors="replace")[:_MAX_MESSAGE] for name, values in given if values}
         self.chosen: str | None = query.get("vehicle")
         self.pinned: float | None = None  # selected moment of live vehicles
         asked = query.get("time", "")
@@ -79,12 +84,13 @@ class Viewer:
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
         self._update_number.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
         self._url.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
-        self._message.on_change("value", lambda _, __, message: self._act(*_action_in(message)))
+        self._message.on_change("value", lambda _, __, message: self._act(message))
         self._search.on_change("value_input", lambda _, __, ___: self._show_now())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
         self._on_tap(self._map.events, lambda: self._map.shown_events, self._show)
         self._on_tap(self._timeline.marks, lambda: self._timeline.shown, self._show)
-        document.title, document.theme = title, self._style.theme
+        theme = Template(read_asset("theme.json")).substitute(self._style.colours)
+        document.title, document.theme = title, Theme(json=json.loads(theme))
         document.config.update(reconnect_session=False, notify_connection_status=False)
         document.js_on_event(ConnectionLost, CustomJS(code=read_asset("lost.js")))
         args = {"message": self._message, "map": self._map.figure, "search": self._search}
@@ -187,7 +193,6 @@ class Viewer:
             self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
 
     def _plot(self, picture: Picture, chosen: Row | None, now: float) -> None:
-        """Update the plots, event marks and time axes."""
         vehicle, is_long_trail = self.chosen or "", self._map.is_long
         is_long = is_long_trail or now < picture.time - _MINUTE
         main = truth = None
@@ -221,8 +226,11 @@ class Viewer:
     def _events_of_chosen(self) -> list[Event]:
         return notable(event for event in self._chronicle.events if event.vehicle == self.chosen)
 
-    def _act(self, action: str, value: str) -> None:
-        """Perform the action of a click or key; ignore unknown actions."""
+    def _act(self, message: str) -> None:
+        """Perform the action of a click or key, as sent by `actions.js`; ignore anything else."""
+        action = value = ""
+        with suppress(ValueError, TypeError):
+            action, value, _ = map(str, json.loads(message[:_MAX_MESSAGE]))
         (name, _, option), player = action.partition(":"), self._player
         match name:
             case "vehicle" if self._fleet.picture.row(value) is not None:
@@ -255,11 +263,12 @@ class Viewer:
             self._choose(names[(names.index(self.chosen) + step if self.chosen in names else 0) % len(names)])
 
     def _show_next(self, *, is_later: bool) -> None:
-        now = self._player.time if self._player else self.pinned
-        events = self._events_of_chosen()
-        later = [event for event in events if now is not None and event.time > now + 0.05]
-        earlier = [event for event in events if now is None or event.time < now - 0.05]
-        for event in later[:1] if is_later else earlier[-1:]:
+        now, events = self._player.time if self._player else self.pinned, self._events_of_chosen()
+        if is_later:
+            events = [event for event in events if now is not None and event.time > now + 0.05][:1]
+        else:
+            events = [event for event in events if now is None or event.time < now - 0.05][-1:]
+        for event in events:
             self._show(event)
 
     def _on_tap(self, source: ColumnDataSource, shown: Callable[[], list[Any]], show: Callable[[Any], object]) -> None:
@@ -284,21 +293,7 @@ class Viewer:
             marked = column(slider, text["marks"], sizing_mode="stretch_width")
             parts.insert(1, row(*controls, marked, sizing_mode="stretch_width", css_classes=["ctrl"]))
         parts += [self._update_number, self._drawn, self._message, self._url]
-        page: list[Any] = [GlobalInlineStyleSheet(css=self._style.page_css), read_asset("layout.css")]
+        variables = " ".join(f"--{name}: {colour};" for name, colour in self._style.colours.items())
+        css = f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"
+        page: list[Any] = [GlobalInlineStyleSheet(css=css), read_asset("layout.css")]
         return column(*parts, sizing_mode="stretch_width", stylesheets=page)
-
-
-def _action_in(message: str) -> tuple[str, str]:
-    """Parse the action and value sent by `actions.js`; return empty strings for anything else."""
-    try:
-        action, value, _ = json.loads(message[:_MAX_MESSAGE])
-    except (ValueError, TypeError):
-        return "", ""
-    return str(action), str(value)
-
-
-def _arguments(document: Document) -> Mapping[str, str]:
-    """Return the query arguments of the page's URL."""
-    request = getattr(document.session_context, "request", None)  # None without a browser
-    given = request.arguments if request is not None else {}
-    return {name: values[0].decode(errors="replace")[:_MAX_MESSAGE] for name, values in given.items() if values}

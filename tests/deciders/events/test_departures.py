@@ -61,7 +61,7 @@ class World:
         self.output.expire_stale()
         snapshot, account = self.reader.poll(), self.reader.account
         states = {name: account.state(name, self.now) for name in account.vehicles}
-        self.fleet.update(self.now, snapshot.healths, states, alive=snapshot.alive)
+        self.fleet.update(snapshot, states)
 
     def sizes(self) -> dict[str, int]:
         """Return the number of objects for each kind of state."""

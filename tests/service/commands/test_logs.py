@@ -18,8 +18,7 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.cli.output.log_limit import BURST, PER_MINUTE, RateLimit
-from nedbus.cli.output.logs import JournalFormatter, JsonFormatter, TextFormatter
+from nedbus.cli.output.logs import BURST, PER_MINUTE, JournalFormatter, JsonFormatter, RateLimit, TextFormatter
 from nedbus.log_event import EVENTS, about
 from nedbus.timings import Timings
 from nedbus.transport import Session

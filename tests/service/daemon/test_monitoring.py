@@ -383,13 +383,14 @@ def test_stuck_source_is_not_healthy(endpoint: str, monkeypatch: pytest.MonkeyPa
     assert pages["/healthz"]() == Page.text("a source has been blocked on one message for 20 s", status=503)
 
 
-def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus) -> None:
+def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages that stand still would look like vehicles that are silent: the error is raised instead."""
 
     def fail(_: object) -> None:
         raise ArithmeticError
 
-    exporter = Exporter(bus, nedbus.Selection(), version="0", on_sample=fail)
+    exporter = Exporter(bus, nedbus.Selection(), version="0")
+    monkeypatch.setattr(exporter, "add", fail)
     bus.publisher(VLP, vehicle="1").publish(message(1))
     with pytest.raises(ArithmeticError):
         exporter.run(threading.Event())

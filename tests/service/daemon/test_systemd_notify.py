@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from nedbus.cli.systemd import Notifier, NotifySocket, watchdog_interval
+from nedbus.cli.systemd import Notifier, notify, watchdog_interval
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
@@ -266,11 +266,11 @@ def test_client_is_started_without_its_router(systemd: Systemd) -> None:
         assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waiting for a router at tcp/")
 
 
-def test_nothing_without_notify_socket() -> None:
+@pytest.mark.parametrize("address", [{}, {"NOTIFY_SOCKET": "vsock:2:1234"}], ids=["none", "another kind"])
+def test_nothing_without_notify_socket(address: dict[str, str]) -> None:
     """Where systemd does not ask, or with an address of another kind, there is no thread, and nothing to do."""
-    assert not NotifySocket("vsock:2:1234").active
     daemon = Daemon(load_settings(source=("sim:",)), version="0")
-    with Notifier(daemon, environment={"WATCHDOG_USEC": "1"}) as notifier:
+    with Notifier(daemon, environment={"WATCHDOG_USEC": "1"} | address) as notifier:
         notifier.tick()
         with notifier.reloading():
             assert "nedbus-systemd" not in [thread.name for thread in threading.enumerate()]
@@ -279,19 +279,17 @@ def test_nothing_without_notify_socket() -> None:
 
 def test_systemd_that_does_not_listen(systemd: Systemd) -> None:
     """A notification that cannot be sent now is sent later; nothing waits for it."""
-    notify = NotifySocket(systemd.address)
-    taken = sum(1 for _ in iter(lambda: notify.send(READY=1), False))  # until the queue of the socket is full
+    taken = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))  # until it is full
     for _ in range(taken):
         systemd.receive()
-    assert notify.send(READY=1)
+    assert notify(systemd.address, READY=1)
     Path(systemd.address).unlink()
-    assert not notify.send(READY=1)
+    assert not notify(systemd.address, READY=1)
 
 
 def test_ready_is_repeated_until_it_is_taken(systemd: Systemd) -> None:
     """A READY that finds no room is sent again: systemd would wait for it in vain."""
-    full = NotifySocket(systemd.address)
-    filled = sum(1 for _ in iter(lambda: full.send(FILLED=1), False))
+    filled = sum(1 for _ in iter(lambda: notify(systemd.address, FILLED=1), False))
     with notified(systemd) as (daemon, _):
         wait_for(daemon.ready.is_set, what="the router")
         assert [systemd.receive() for _ in range(filled)] == [{"FILLED": "1"}] * filled

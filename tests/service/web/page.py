@@ -24,6 +24,7 @@ from bokeh.models.widgets import Div
 import nedbus
 from nedbus.client import LogStreamStatus, Monitor, Sample, stream_state
 from nedbus.events import Account
+from nedbus.monitoring import Snapshot
 from nedbus.recording import RecordingWriter
 from nedbus.web import Where, serve_live
 from nedbus.web.chronicle import Chronicle
@@ -98,7 +99,8 @@ class Sky:
         }
         self.account.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
-        return self.fleet.update(self.time, healths, states, alive=publishers, link=link, own=own, logs=logs)
+        self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=own), states, logs)
+        return self.fleet.picture
 
     def row(self, vehicle: str = "wing", **known: Any) -> Row:
         row = self.look(**known).row(vehicle)

@@ -135,7 +135,7 @@ def test_link_that_is_cut_blames_no_vehicle(sky: Sky) -> None:
     sky.time += 60
     row = sky.row(alive=[], link="no link to tcp/ground:7447")
     assert (row.grade, row.is_here, row.main.state.name) == ("ok", False, "disconnected")
-    assert sky.fleet.picture.link == "no link to tcp/ground:7447"
+    assert sky.fleet.picture.alarms == ["no link to tcp/ground:7447"]
 
 
 def test_worst_comes_first(sky: Sky) -> None:

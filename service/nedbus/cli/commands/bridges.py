@@ -1,17 +1,15 @@
 """Commands that serve data to browsers, Prometheus, Foxglove and ROS 2: web, export, foxglove, ros2."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from nedbus import __version__, bridges
+from nedbus import __version__, bridges, monitoring
 from nedbus import web as page
 from nedbus.bridges import FOXGLOVE_PORT
 from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicOption, VehicleOption, command
@@ -22,9 +20,6 @@ from nedbus.errors import ConfigError, ConnectError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY, RELEASES, Selection
-
-if TYPE_CHECKING:
-    from nedbus.monitoring import Page
 
 _log = logging.getLogger("nedbus")
 
@@ -81,11 +76,9 @@ def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: Htt
 
     For routers without a nedbus service; a service has its own (serve --http).
     """
-    from nedbus.monitoring import Exporter
-
     _split("--http", http)
     with open_bus() as bus:
-        exporter = Exporter(bus, selection, version=__version__)
+        exporter = monitoring.Exporter(bus, selection, version=__version__)
         with serve_pages(http, exporter.pages):
             run_until_stopped(exporter.run)
 
@@ -130,24 +123,16 @@ def ros2(
         raise NedbusError(f"no router answers at {to}: start the router of ROS 2 there, or correct --to") from exc
     with closing(session), closing(observer):
         bridge = bridges.Ros2Bridge(
-            bus,
-            session,
-            observer=observer,
-            selection=selection,
-            layout=layout,
-            domain=domain,
-            hashed=not humble,
+            bus, session, observer=observer, selection=selection, layout=layout, domain=domain, hashed=not humble,
             namespaces=namespaces,
-        )
+        )  # fmt: skip
         run_until_stopped(bridge.run)
 
 
 @contextmanager
-def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator[None]:
+def serve_pages(where: str, pages: Mapping[str, Callable[[], monitoring.Page]]) -> Iterator[None]:
     """Serve pages on HOST:PORT inside a `with` block."""
-    from nedbus.monitoring import HttpServer
-
-    with closing(HttpServer(where, pages)):
+    with closing(monitoring.HttpServer(where, pages)):
         text = "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status"
         _log.info(text, where, extra=about("http"))
         if not is_loopback(split_http(where)[0]):

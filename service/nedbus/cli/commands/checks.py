@@ -3,7 +3,7 @@
 import json
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Final
@@ -14,8 +14,8 @@ from nedbus import __version__
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, Sample, SourceStatus, to_age
-from nedbus.doctor import Finding, check_router_file, check_service, examine, worst_state
+from nedbus.client import Bus, Sample, to_age
+from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
 from nedbus.settings import Settings
@@ -93,7 +93,12 @@ class _Check:
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self.services = [each for each in bus.services() if not self._is_local or each.host == _HOST]
         self.sources = [source for service in self.services for source in service.sources]
-        self.ages = _ages(self.sources)
+        self.ages: dict[str, float] = {}  # measured by the services
+        for source in self.sources:
+            for stream in source.streams:
+                name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
+                if age is not None and stream.address in source.addresses:
+                    self.ages[name] = min(age, self.ages.get(name, age))
         self._reports = bus.accounts(within=expected.within or 0.0)
         self._known = {name for report in self._reports for name in report.vehicles}
         self._publishers = bus.publishers()
@@ -106,8 +111,9 @@ class _Check:
         if vehicle is not None:
             latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]
             self._is_refused = vehicle in self.ages and not latencies
-            age = self.ages.get(vehicle, min((max(0.0, each) for each in latencies if each is not None), default=None))
-            self.ages = {vehicle: age} if latencies and age is not None else {}
+            measured = min((max(0.0, each) for each in latencies if each is not None), default=None)
+            newest = self.ages.get(vehicle, measured)
+            self.ages = {vehicle: newest} if latencies and newest is not None else {}
 
     def service_faults(self) -> Iterator[str]:
         """Yield the first fault of the services, their sources, or the age of the newest message."""
@@ -143,7 +149,15 @@ class _Check:
         for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
             if not expected.expect or name in expected.expect:
                 yield f"vehicle {name} has several publishers: stop one, or give it another vehicle"
-        reports = [*self._reports, _report_of(others)]
+        vehicles: dict[str, VehicleReport] = {}
+        for sample in others:
+            if sample.topic == DEFAULT_TOPIC:
+                unknown = tuple(sample.missing.intersection(VALID.values()))
+                invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
+                flags = dict.fromkeys(invalid)
+                vehicles[sample.vehicle] = VehicleReport("info", "ok", flags=flags, has_position=True, unknown=unknown)
+            vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
+        reports = [*self._reports, AccountReport("", _HOST, 0.0, vehicles)]
         for fault in faults_of(reports, expected, only=_HOST if self._is_local else None):
             if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
                 yield fault
@@ -153,30 +167,6 @@ class _Check:
                 if service.service not in remembering:
                     name = to_text(service.service, 64)
                     yield f"service {name} keeps no history of its vehicles: update nedbus there"
-
-
-def _report_of(samples: Iterable[Sample[Message]]) -> AccountReport:
-    """Return the account of vehicles from their last messages alone."""
-    vehicles: dict[str, VehicleReport] = {}
-    for sample in samples:
-        if sample.topic == DEFAULT_TOPIC:
-            unknown = tuple(sample.missing.intersection(VALID.values()))
-            invalid = [flag for flag in VALID.values() if flag not in unknown and not getattr(sample.message, flag)]
-            report = VehicleReport("info", "ok", flags=dict.fromkeys(invalid), has_position=True, unknown=unknown)
-            vehicles[sample.vehicle] = report
-        vehicles.setdefault(sample.vehicle, VehicleReport("info", "ok", has_position=True))
-    return AccountReport("", _HOST, 0.0, vehicles)
-
-
-def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:
-    """Return the age of the newest message of each published vehicle, measured by its service [s]."""
-    ages: dict[str, float] = {}
-    for source in sources:
-        for stream in source.streams:
-            vehicle, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
-            if age is not None and stream.address in source.addresses:
-                ages[vehicle] = min(age, ages.get(vehicle, age))
-    return ages
 
 
 @command
@@ -203,21 +193,15 @@ def doctor(
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
     else:
-        write(_to_report(findings))
+        for each in findings:
+            name = f"{each.check} {each.subject}".rstrip(" :")
+            write(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
+            if each.advice:
+                write(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
+        counts = Counter(each.state for each in findings)
+        write(f"\n{', '.join(f'{count} {name}' for name, count in counts.items())}")
     if state == "wrong":
         raise typer.Exit(1)
-
-
-def _to_report(findings: Sequence[Finding]) -> str:
-    """Format findings as lines, followed by the number of findings in each state."""
-    lines = []
-    for each in findings:
-        name = f"{each.check} {each.subject}".rstrip(" :")
-        lines.append(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
-        if each.advice:
-            lines.append(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
-    counts = Counter(each.state for each in findings)
-    return "\n".join([*lines, "", ", ".join(f"{count} {state}" for state, count in counts.items())])
 
 
 @command

@@ -21,7 +21,7 @@ from nedbus.cli.options import (
 )
 from nedbus.cli.output.samples import CsvLines, Lines, to_fields, to_json
 from nedbus.cli.output.streams import write, write_stderr
-from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
+from nedbus.client import Bus, Mode, Sample, check_max_rate
 from nedbus_msgs import Address, Selection
 
 _EVERY: Final = "Print every message in order; a replay at speed=max waits for this terminal or pipe"
@@ -72,13 +72,8 @@ def echo(
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has got its lines
-                _write_counts(subscription, every=every, always=csv_output)
-
-
-def _write_counts(subscription: Subscription[Any], *, every: bool, always: bool) -> None:
-    counts = subscription.counts
-    if always or counts.lost or counts.dropped or counts.invalid or counts.discarded:
-        discarded = f", {counts.discarded} discarded" if counts.discarded else ""
-        unread = f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"
-        text = f"{counts.received} received, {counts.lost} lost, {unread}, {counts.invalid} invalid"
-        write_stderr(f"{text}{discarded}")
+                counts = subscription.counts
+                if csv_output or counts.lost or counts.dropped or counts.invalid or counts.discarded:
+                    unread = f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"
+                    text = f"{counts.received} received, {counts.lost} lost, {unread}, {counts.invalid} invalid"
+                    write_stderr(f"{text}, {counts.discarded} discarded" if counts.discarded else text)

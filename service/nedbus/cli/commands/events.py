@@ -70,7 +70,7 @@ def events(
         if value not in choices:
             raise ConfigError(option, f"{value!r}: expected {' or '.join(choices)}")
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
-    form = _to_json if json_output else _to_csv if csv_output else to_line
+    form = (lambda *each: json.dumps(_to_fields(*each))) if json_output else _to_csv if csv_output else to_line
 
     def begin(clocks: set[str]) -> None:
         if csv_output:
@@ -145,7 +145,10 @@ def why(
     for name in reporting if vehicle == ANY else [vehicle]:
         events = [event for event in found if event.vehicle in (name, ANY)]
         known, end = reporting[name].vehicles[name], reporting[name].now
-        moment = _find_moment(at, times, events)
+        try:
+            moment = None if at is None or not events else times.find(at, events[-1])
+        except ValueError as exc:
+            raise ConfigError("--at", f"{at!r}: {exc}: expected {_AT}") from exc
         verdict = verdict_of(
             name, events, known.held, topics=known.topics, unknown=known.unknown, times=times, end=end, at=moment
         )
@@ -161,27 +164,17 @@ def why(
         write_stderr(f"--all shows {faults} fault{'s' * (faults > 1)} in detail")
 
 
-def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float | None:
-    if at is None or not events:
-        return None
-    try:
-        return times.find(at, events[-1])
-    except ValueError as exc:
-        raise ConfigError("--at", f"{at!r}: {exc}: expected {_AT}") from exc
-
-
 def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str) -> Iterator[str]:
-    """Yield the lines that explain a fault."""
     yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {story.when(times, end)}")
-    sections = {"before it": [(each, _before(each, story.since)) for each in story.before]}
-    sections["meanwhile"] = [(each, _shown(each)) for each in story.meanwhile]
-    sections = {title: shown for title, shown in sections.items() if shown}
+    sections = {"before it": story.before, "meanwhile": story.meanwhile}
     if story.end is not None:
-        title = f"ended at {times.text(story.end)}{' with' * bool(story.after)}"
-        sections[title] = [(each, _shown(each)) for each in story.after]
+        sections[f"ended at {times.text(story.end)}{' with' * bool(story.after)}"] = story.after
     for title, shown in sections.items():
-        yield f"  {title}"
-        yield from (fold(f"    {times.text(each)}  ", text) for each, text in shown)
+        if shown or title.startswith("ended"):
+            yield f"  {title}"
+        for each in shown:
+            text = _before(each, story.since) if title == "before it" else _shown(each)
+            yield fold(f"    {times.text(each)}  ", text)
     if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before"
     if story.lacking:
@@ -238,7 +231,6 @@ def _name(files: Sequence[Path]) -> str:
 
 
 def _read(files: Sequence[Path]) -> tuple[FileAccount, list[Event]]:
-    """Read the account of files and its events in order of time; write warnings to stderr."""
     read = read_account(*files)
     found, told = read.account.events_since(0)
     for warning in read.warnings:
@@ -256,15 +248,11 @@ def _to_fields(event: Event, times: Times) -> dict[str, object]:
     utc = times.utc(event)
     time = None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
     evidence = [
-        {name: getattr(each, name) for name in ("kind", "change", "text", "topic")}
-        | {"before": round(event.time - each.time, 3)}
+        {"kind": each.kind, "change": each.change, "text": each.text, "topic": each.topic,
+         "before": round(event.time - each.time, 3)}
         for each in event.evidence
-    ]
+    ]  # fmt: skip
     return {"time": time, "clock": times.clock(event)} | asdict(event) | {"time": time, "evidence": evidence}
-
-
-def _to_json(event: Event, times: Times) -> str:
-    return json.dumps(_to_fields(event, times))
 
 
 def _to_csv(event: Event, times: Times) -> str:

@@ -21,8 +21,6 @@ _CSV_HEAD: Final = (
 )  # fmt: skip
 _FORGET_AFTER: Final = 60.0  # s until a stream that is gone is hidden
 
-Stream = tuple[Address, Health, StreamState]
-
 
 @command
 def hz(
@@ -47,20 +45,23 @@ def hz(
             write(csv_line(_CSV_HEAD))
 
         def show() -> None:
-            streams = sorted(_states(bus, monitor), key=_severity)
+            states = _states(bus, monitor)
+            streams = sorted(states, key=lambda each: (each[2].severity, describe_stream(*each[1:]) == "ok"))
             if not (json_output or csv_output):
                 show_table([_to_row(*each) for each in streams])
                 return
             for address, health, state in streams:
                 before, written[address] = written.get(address), (health.messages, state.name)
                 if before != written[address]:
-                    write((_to_csv if csv_output else json.dumps)(_to_fields(address, health, state)))
+                    fields: dict[str, Any] = {"time": clock.utc(), **asdict(address), "state": state.name}
+                    fields |= {"reason": state.reason, **asdict(health)}
+                    cells = {**fields, **(health.flags or {}), "time": f"{fields['time']:.3f}"}
+                    write(csv_line(map(cells.get, _CSV_HEAD)) if csv_output else json.dumps(fields))
 
         follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
 
 
-def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
-    """Yield all streams with their states; forget those that have been gone for more than a minute."""
+def _states(bus: Bus, monitor: Monitor) -> Iterator[tuple[Address, Health, StreamState]]:
     publishers = bus.publishers(timeout=0.5)
     for address, health in monitor.snapshot().items():
         state = stream_state(health, publishers=publishers[address], connected=bus.connected)
@@ -70,28 +71,9 @@ def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
             yield address, health, state
 
 
-def _severity(stream: Stream) -> tuple[int, bool]:
-    _, health, state = stream
-    return state.severity, describe_stream(health, state) == "ok"
-
-
 def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
-    is_live = health.rate is not None
-    return [
-        str(address),
-        "-" if health.rate is None else f"{health.rate:.1f}",
-        "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms",
-        to_age(health.latency) if is_live and health.latency is not None else "-",
-        to_age(health.latency_max) if is_live and health.latency_max is not None else "-",
-        str(health.lost),
-        describe_stream(health, state),
-    ]
-
-
-def _to_fields(address: Address, health: Health, state: StreamState) -> dict[str, Any]:
-    return {"time": clock.utc(), **asdict(address), "state": state.name, "reason": state.reason, **asdict(health)}
-
-
-def _to_csv(fields: dict[str, Any]) -> str:
-    cells = {**fields, **(fields["flags"] or {}), "time": f"{fields['time']:.3f}"}
-    return csv_line(cells.get(name) for name in _CSV_HEAD)
+    rate = "-" if health.rate is None else f"{health.rate:.1f}"
+    jitter = "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms"
+    latencies = (None if health.rate is None else each for each in (health.latency, health.latency_max))
+    ages = ("-" if each is None else to_age(each) for each in latencies)
+    return [str(address), rate, jitter, *ages, str(health.lost), describe_stream(health, state)]

@@ -1,6 +1,5 @@
 """Commands for keys and certificates of a fleet: pki ca, cert, enroll, list, renew, rules."""
 
-import datetime as dt
 import json
 import math
 import sys
@@ -84,11 +83,12 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
             "use": entry.use,
             "until": entry.certificate.ends.isoformat(),
             "days_left": math.floor(entry.certificate.days_left(now)),
-            "state": _state(entry, now, within),
+            "state": "EXPIRED" if entry.certificate.is_due(now, 0)
+            else entry.problem or ("expires soon" if entry.certificate.is_due(now, within) else "valid"),
             "hosts": entry.certificate.hosts,
         }
         for entry in certificates.list_certificates(folder)
-    ]
+    ]  # fmt: skip
     if as_json:
         write(json.dumps(rows, indent=2))
         return
@@ -159,19 +159,12 @@ def rules(
 
 
 def _read_names(source: Path) -> list[str]:
-    """Read vehicle ids from a file, from standard input, or from the certificates of a folder."""
     if source.is_dir():
         names = [entry.name for entry in certificates.list_certificates(source)]
         return [name.removeprefix(CERTIFICATE_PREFIX) for name in names if name.startswith(CERTIFICATE_PREFIX)]
     text = sys.stdin.read() if str(source) == "-" else source.read_text(encoding="utf-8")
     lines = (line.partition("#")[0].strip() for line in text.splitlines())
     return [line for line in lines if line]
-
-
-def _state(entry: certificates.CertificateEntry, now: dt.datetime, within: int) -> str:
-    if entry.certificate.is_due(now, 0):
-        return "EXPIRED"
-    return entry.problem or ("expires soon" if entry.certificate.is_due(now, within) else "valid")
 
 
 def _write_paths(paths: list[Path]) -> None:

@@ -108,7 +108,13 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     for service in services[:_MAX_ROWS]:
         name, version, role = map(to_text, (service.service, service.version, service.role))
         write(f"\nservice {name}, nedbus {version}, as {role}")
-        rows = [_source_row(source) for source in service.sources]
+        rows = [
+            [*map(to_text, (
+                each.source, each.state, each.published, each.rejected, each.lost, each.reboots, each.retries,
+                each.error or (f"{len(each.stale)} gone" if each.stale else "-"),
+            ))]
+            for each in service.sources
+        ]  # fmt: skip
         if rows:
             write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         for what, head in _ABSENT.items():
@@ -161,13 +167,6 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     near = get_close_matches(topic, [*MESSAGES, *BY_TOPIC], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
     raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
-
-
-def _source_row(source: SourceStatus) -> list[str]:
-    numbers = (source.published, source.rejected, source.lost, source.reboots, source.retries)
-    gone = len(source.stale)
-    remark = source.error or (f"{gone} gone" if gone else "-")
-    return [*map(to_text, (source.source, source.state, *numbers, remark))]
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

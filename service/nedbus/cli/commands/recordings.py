@@ -16,7 +16,6 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
-from nedbus.events import Event, Times
 from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
 from nedbus.sources import convert as convert_messages
 from nedbus.timings import TIMINGS
@@ -77,12 +76,8 @@ def convert(
         raise ConfigError(str(source), "not a file")
     run = replay.open()
     with show_progress() as show:
-        report = convert_messages(
-            run,
-            output,
-            source=spec.kind,
-            on_progress=lambda done: show(f"{output}", run.done(done), run.total),
-        )
+        on_progress = lambda done: show(f"{output}", run.done(done), run.total)  # noqa: E731
+        report = convert_messages(run, output, source=spec.kind, on_progress=on_progress)
     for warning in run.warnings:
         write_stderr(f"{source}: {warning}")
     write_stderr(f"{output}: {report}")
@@ -121,16 +116,10 @@ def plot(
         if not streams:
             raise SourceError(str(source), "nothing to plot: the selected streams have no valid message")
         target = output or source.with_suffix(".png")
-        events, times = _read_events(source)
-        draw(streams, target, title=source.name, events=events, times=times)
+        read = read_account(source)
+        known = (each for vehicle in read.account.vehicles.values() for each in vehicle.conditions.values())
+        events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.account.events_since(0)[0]]
+        draw(streams, target, title=source.name, events=events, times=read.times)
         write(str(target))
         if flight.damaged:
             raise SourceError(str(source), "the file is damaged: only the readable messages were plotted")
-
-
-def _read_events(path: Path) -> tuple[list[Event], Times]:
-    """Return the events of a file, preceded by the conditions that held throughout the file, and their times."""
-    read = read_account(path)
-    account = read.account
-    held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
-    return [*dict.fromkeys(each.begin for each in held), *account.events_since(0)[0]], read.times

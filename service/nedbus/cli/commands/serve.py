@@ -2,7 +2,6 @@
 
 import logging
 import threading
-from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -79,23 +78,16 @@ def serve(
             notifier.stopping()
             daemon.stop()
 
-        run_until_stopped(
-            lambda _: daemon.run(),
-            on_stop=stop,
-            on_tick=tick,
-            on_hangup=lambda: _reload(daemon, notifier, config, given),
-        )
+        def reload() -> None:
+            try:
+                with notifier.reloading():
+                    done = daemon.reload(load_settings(config, **given))
+            except NedbusError as exc:
+                _log.error("settings not reloaded, the old ones stay active: %s", exc, extra=about("reload"))
+            else:
+                _log.info("settings reloaded: %s", done, extra=about("reload"))
 
-
-def _reload(daemon: Daemon, notifier: Notifier, config: Path | None, given: Mapping[str, object]) -> None:
-    """Reload the settings; invalid ones change nothing."""
-    try:
-        with notifier.reloading():
-            done = daemon.reload(load_settings(config, **given))
-    except NedbusError as exc:
-        _log.error("settings not reloaded, the old ones stay active: %s", exc, extra=about("reload"))
-    else:
-        _log.info("settings reloaded: %s", done, extra=about("reload"))
+        run_until_stopped(lambda _: daemon.run(), on_stop=stop, on_tick=tick, on_hangup=reload)
 
 
 @command

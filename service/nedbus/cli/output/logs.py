@@ -1,4 +1,4 @@
-"""Logging to stderr: text for terminals, syslog priorities for the journal, or JSON."""
+"""Logging to stderr, limited against floods: text for terminals, syslog priorities for the journal, or JSON."""
 
 import atexit
 import json
@@ -6,19 +6,24 @@ import logging
 import os
 import sys
 import threading
-from dataclasses import asdict
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Final, Literal, TextIO
 
 from nedbus.errors import NedbusError
-from nedbus.log_event import about
+from nedbus.log_event import EVENTS, About, about
 
-from .log_limit import RateLimit, about_of
 from .streams import MAX_TEXT, STRUCTURED, printable, to_text
 
+BURST: Final = 50  # lines of one kind that may be logged at once
+PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a burst
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
+_MAX_KINDS: Final = 1000  # nedbus itself has about 40
 _MAX_TRACEBACK: Final = 20_000  # characters, the last ones: they name the error
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
@@ -81,6 +86,83 @@ class JournalFormatter(logging.Formatter):
         return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
 
 
+def about_of(record: logging.LogRecord) -> About | None:
+    """Return the structured fields of a log call; None for records of other packages."""
+    about = getattr(record, "about", None)
+    return about if isinstance(about, About) else None
+
+
+@dataclass(slots=True, eq=False)
+class _TokenBucket:
+    """Token bucket of one kind of line, and the number of lines suppressed since the last report."""
+
+    filled: float
+    tokens: float = BURST
+    left_out: int = 0
+    first: Mapping[str, object] = field(default_factory=dict)  # not the record itself, which may keep a traceback alive
+
+    def fill(self, now: float) -> bool:
+        """Add the tokens earned since the last call; return True if a line may be logged."""
+        self.tokens = min(BURST, self.tokens + (now - self.filled) * PER_MINUTE / 60)
+        self.filled = now
+        return self.tokens >= 1
+
+
+class RateLimit(logging.Filter):
+    """Pass a burst of each kind of record, then a few per minute.
+
+    `handle`, the method of the handler, gets a record with the number of suppressed lines once that kind may be logged
+    again. Records of unlimited events always pass.
+    """
+
+    def __init__(
+        self, handle: Callable[[logging.LogRecord], object], *, now: Callable[[], float] = time.monotonic
+    ) -> None:
+        super().__init__()
+        self._handle = handle
+        self._now = now
+        self._buckets: dict[tuple[str, str | None, str], _TokenBucket] = {}
+        self._lock = threading.RLock()  # reentrant, as in logging: garbage collection may log while it is held
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
+        now = self._now()
+        self._report(lambda bucket: bucket.fill(now))
+        about = about_of(record)
+        event = about.event if about else None
+        if event is not None and not EVENTS[event].limited:
+            return True
+        kind = record.name, event, str(record.msg)
+        with self._lock:
+            if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
+                kind = "", None, ""  # all others
+            bucket = self._buckets.setdefault(kind, _TokenBucket(now))
+            if bucket.fill(now):
+                bucket.tokens -= 1
+                return True
+            if not bucket.left_out:
+                text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
+                names = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname}
+                bucket.first = {**names, "msg": text}
+            bucket.left_out += 1
+            return False
+
+    def flush(self) -> None:
+        """Report all suppressed lines."""
+        self._report(lambda _: True)
+
+    def _report(self, is_due: Callable[[_TokenBucket], bool]) -> None:
+        reports = []
+        with self._lock:
+            for (_, event, _), bucket in self._buckets.items():
+                if bucket.left_out and is_due(bucket):
+                    about, args = About("left-out", count=bucket.left_out, of=event), (bucket.left_out,)
+                    reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
+                    bucket.left_out = 0
+        for report in reports:
+            self._handle(report)
+
+
 class _StderrHandler(logging.StreamHandler[TextIO]):
     """Write to the current `sys.stderr`: a live table replaces it, to stay below the log."""
 
@@ -91,13 +173,17 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 
 def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     """Log to stderr, one line per record, with syslog priorities if stderr is the journal."""
-    is_journal, is_json = _is_journal(), log_format == "json"
+    is_journal, is_json = False, log_format == "json"
+    with suppress(OSError, ValueError):  # stderr is closed, or not a file
+        status = os.fstat(sys.stderr.fileno())
+        is_journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"  # see systemd.exec(5)
     formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
     handler = _StderrHandler()
     handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
     if is_journal or is_json:
         handler.name = STRUCTURED
-        _log_uncaught_errors()
+        sys.excepthook = _log_uncaught
+        threading.excepthook = lambda caught: _log_uncaught(caught.exc_type, caught.exc_value, caught.exc_traceback)
     limit = RateLimit(handler.handle)
     handler.addFilter(limit)
     atexit.register(limit.flush)
@@ -107,23 +193,8 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     logging.getLogger().setLevel(max(number, logging.WARNING))
 
 
-def _is_journal() -> bool:
-    """Return True if stderr is connected to the journal; see JOURNAL_STREAM in systemd.exec(5)."""
-    try:
-        status = os.fstat(sys.stderr.fileno())
-    except (OSError, ValueError):  # closed, or not a file
-        return False
-    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
-
-
-def _log_uncaught_errors() -> None:
-    """Log uncaught errors; Python would print them as several lines."""
-
-    def log(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
-        if not issubclass(kind, SystemExit):
-            exc_info = None if error is None else (kind, error, traceback)
-            text = str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
-            _log.error("%s", text, exc_info=exc_info, extra=about("error"))
-
-    sys.excepthook = log
-    threading.excepthook = lambda caught: log(caught.exc_type, caught.exc_value, caught.exc_traceback)
+def _log_uncaught(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
+    if not issubclass(kind, SystemExit):
+        exc_info = None if error is None else (kind, error, traceback)
+        text = str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
+        _log.error("%s", text, exc_info=exc_info, extra=about("error"))

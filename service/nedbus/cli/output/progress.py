@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from nedbus.client import SourceStatus
 from nedbus.daemon import Daemon
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
@@ -57,15 +56,13 @@ class ProgressLog:
             self._counts[status.source] = status.published
             if status.state == "running":
                 name = status.source.rstrip(":")
-                _log.info("%s: %s", name, _numbers(status, count / elapsed), extra=about("progress", source=name))
-
-
-def _numbers(status: SourceStatus, rate: float) -> str:
-    part = f" ({status.done / status.total:.0%})" if status.total else ""
-    rejected = f", {status.rejected} rejected" if status.rejected else ""
-    lost = f", {status.lost} lost" if status.lost else ""
-    gone = f", gone: {', '.join(status.stale)}" if status.stale else ""
-    return f"{status.published} messages{part}, {rate:.0f}/s{rejected}{lost}{gone}"
+                text = f"{status.published} messages"
+                text += f" ({status.done / status.total:.0%})" if status.total else ""
+                text += f", {count / elapsed:.0f}/s"
+                text += f", {status.rejected} rejected" if status.rejected else ""
+                text += f", {status.lost} lost" if status.lost else ""
+                text += f", gone: {', '.join(status.stale)}" if status.stale else ""
+                _log.info("%s: %s", name, text, extra=about("progress", source=name))
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38)
     start = f"{sample.address!s:<{width}} {message.timestamp / 1e6:12.3f} s"
     if fields:
         return "  ".join([start, *(f"{name} {_to_value(sample, name)}" for name in fields)]) + _notes(sample)
-    if not _is_position(message):
+    if message.DEFINITION is not DEFAULT:
         return f"{start}{_notes(sample)}  {_to_summary(message)}"  # a terminal cuts the end of the line
     position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
     velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
@@ -57,14 +57,21 @@ class Lines:
 
     def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
         """Return the line of a sample, preceded by a heading if one is due."""
-        width = terminal_width()
+        width, message = terminal_width(), sample.message
         if width is None:
             return to_line(sample, fields)
         self._left -= 1
-        if not fields and not _is_position(sample.message):  # no columns: as much as fits into a line
+        if not fields and message.DEFINITION is not DEFAULT:  # no columns: as much as fits into a line
             line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
             return line if len(line) <= width else f"{line[: width - 1]}…"
-        cells = {_ADDRESS: str(sample.address), **_cells(sample, fields), _STATE: _to_state(sample)}
+        cells = {_ADDRESS: str(sample.address), "TIME s": f"{message.timestamp / 1e6:8.2f}"}
+        if fields:
+            cells |= {name: _to_value(sample, name).rjust(_FIELD_WIDTH) for name in fields}
+        else:
+            cells[_POSITION] = " ".join(f"{value:7.2f}" for value in (message.x, message.y, message.z))
+            cells[_VELOCITY] = " ".join(f"{value:6.2f}" for value in (message.vx, message.vy, message.vz))
+            cells |= {_HEADING: f"{math.degrees(message.heading):.1f}", _EPH: f"{message.eph:.2f}"}
+        cells[_STATE] = _to_state(sample)
         self._widths = {name: max(len(name), len(cell), self._widths.get(name, 0)) for name, cell in cells.items()}
         shown = fit_columns(self._widths, _OPTIONAL, width)
         head, line = self._join({name: name for name in shown}), self._join({name: cells[name] for name in shown})
@@ -75,35 +82,15 @@ class Lines:
         return f"{head}\n{line}"
 
     def _join(self, cells: dict[str, str]) -> str:
-        """Join cells to a line; numbers are right-aligned, and the state at the end is not padded."""
         address, *numbers, state = cells.items()
         padded = [cell.rjust(self._widths[name]) for name, cell in numbers]
         return COLUMN_GAP.join([address[1].ljust(self._widths[_ADDRESS]), *padded, state[1]])
 
 
-def _cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
-    """Return the cells by heading: time, then these fields, or position, velocity, heading and eph; NED, degrees."""
-    message = sample.message
-    time = {"TIME s": f"{message.timestamp / 1e6:8.2f}"}
-    if fields:
-        return time | {name: _to_value(sample, name).rjust(_FIELD_WIDTH) for name in fields}
-    return time | {
-        _POSITION: " ".join(f"{value:7.2f}" for value in (message.x, message.y, message.z)),
-        _VELOCITY: " ".join(f"{value:6.2f}" for value in (message.vx, message.vy, message.vz)),
-        _HEADING: f"{math.degrees(message.heading):.1f}",
-        _EPH: f"{message.eph:.2f}",
-    }
-
-
 def _to_state(sample: Sample[Any]) -> str:
     """Return the doubts about a sample, or "ok"; then its age if it is old, and the number lost before it."""
-    is_position = _is_position(sample.message)
+    is_position = sample.message.DEFINITION is DEFAULT
     return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(sample)
-
-
-def _is_position(message: Message) -> bool:
-    """Return True for the message with columns for position, flags and doubts."""
-    return message.DEFINITION is DEFAULT
 
 
 def _to_summary(message: Message) -> str:
@@ -174,11 +161,7 @@ class CsvLines:
 
 
 def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
-    """Return names and cells of a CSV row: address, time of sending (UTC, and [ns]), PX4's time [us], these fields.
-
-    An array has one cell per element; the cell of a field that this message does not have is empty.
-    A position ends with its state, "ok" or the doubts about it.
-    """
+    """Return names and cells of a CSV row; an array has one cell per element, an absent field an empty cell."""
     address, message = sample.address, sample.message
     row: list[tuple[str, object]] = [
         *asdict(address).items(),
@@ -195,11 +178,10 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
             row += [(f"{name}[{index}]", _to_number(each, digits)) for index, each in enumerate(value)]
         else:
             row.append((name, _to_number(value, digits)))
-    return [*row, ("state", message_doubts(message, sample.missing))] if _is_position(message) else row
+    return [*row, ("state", message_doubts(message, sample.missing))] if message.DEFINITION is DEFAULT else row
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
-    """Return the value of a field as text, "-" if the message has no such field."""
     kind = sample.message.DEFINITION.types.get(name)
     return "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
 

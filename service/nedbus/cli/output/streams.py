@@ -13,12 +13,8 @@ from typing import Final
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 
-MAX_TEXT: Final = 1000
-"""Maximum number of characters of an error or log line."""
-
-STRUCTURED: Final = "structured"
-"""Name of the log handler if the log is read by a program: JSON, or the journal."""
-
+MAX_TEXT: Final = 1000  # maximum number of characters of an error or log line
+STRUCTURED: Final = "structured"  # name of the log handler if the log is read by a program: JSON, or the journal
 _MAX_CELL: Final = 120  # characters of a value from a peer
 _log = logging.getLogger("nedbus")
 
