@@ -84,6 +84,7 @@ def serve(
             on_stop=stop,
             on_tick=tick,
             on_hangup=lambda: _reload(daemon, notifier, config, given),
+            closing=daemon.closing,
         )
 
 
@@ -118,7 +119,7 @@ def router(
     """
     settings = load_settings(config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key)
     endpoints, routers = settings.listen, tuple(connect or ())
-    tls = settings.tls if routers else None
+    tls, closing = settings.tls if routers else None, threading.Event()
 
     def run(stop: threading.Event) -> None:
         where = router_endpoints(endpoints, config_file)
@@ -130,6 +131,7 @@ def router(
         uplinks = Uplinks(session, routers, tls=tls)
         while not stop.wait(1.0 if routers else None):
             uplinks.check()
+        closing.set()
         session.close()
 
-    run_until_stopped(run)
+    run_until_stopped(run, closing=closing)
