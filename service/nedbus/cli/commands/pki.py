@@ -168,7 +168,7 @@ def _read_names(source: Path) -> list[str]:
     return [line for line in lines if line]
 
 
-def _state(entry: certificates.CertificateEntry, now: dt.datetime, within: int) -> str:
+def _state(entry: "certificates.CertificateEntry", now: dt.datetime, within: int) -> str:
     if entry.certificate.is_due(now, 0):
         return "EXPIRED"
     return entry.problem or ("expires soon" if entry.certificate.is_due(now, within) else "valid")
