@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
 ARGS = --source sim: --http 127.0.0.1:9464
+unexport PYTHONDONTWRITEBYTECODE  # of some images: each worker of pytest would compile all tests again, for eight seconds
 
 .PHONY: run check generated docs quick test behaviour slow test-all measured compose-test wheel bench clean
 

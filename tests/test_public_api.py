@@ -16,11 +16,10 @@ from nedbus_msgs import MESSAGES
 
 ROOT = Path(__file__).parents[1]
 OURS = {
-    node.name
+    name
     for folder in ("service", "schemas")
     for path in ROOT.glob(f"{folder}/**/*.py")
-    for node in ast.walk(ast.parse(path.read_text()))
-    if isinstance(node, ast.ClassDef)
+    for name in re.findall(r"^ *class (\w+)", path.read_text(), re.MULTILINE)  # a hundredth of the time of ast
 }
 # Generic over all messages, or parts of the file of a message, which no script imports.
 ALLOWED = {"Definition", "FieldType", "Layout", "Older", "Rule"}

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.mutants import read_table
+
 ROOT = Path(__file__).parents[1]
 PRODUCT = sorted([*ROOT.glob("service/**/*.py"), *ROOT.glob("schemas/**/*.py")])
 ALL = sorted([*PRODUCT, *(path for top in ("tests", "benchmarks", "examples") for path in ROOT.glob(f"{top}/**/*.py"))])
@@ -71,3 +73,11 @@ def test_settable_clock_has_one_reader() -> None:
     for path in PRODUCT:
         found = re.search(r"\btime\.time(_ns)?\(|datetime\.(now|utcnow|today)\(|date\.today\(", path.read_text())
         assert not found or path.name == "clock.py", f"{path}: use nedbus.clock"
+
+
+def test_faults_and_their_tests_exist() -> None:
+    """Each fault of mutants.toml can be put into its file, and every file of tests that it names is there."""
+    faults = read_table()
+    assert [problem for fault in faults for problem in fault.problems(ROOT)] == []
+    names = {name for fault in faults for name in fault.tests.partition(" -k ")[0].split()}
+    assert [name for name in sorted(names) if not (ROOT / "tests" / name).is_file()] == []

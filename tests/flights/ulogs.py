@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
+from nedbus.sources import FileAccount, read_account
 from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.first_message import FIELD_TYPES, LAYOUTS, downgrade
@@ -18,6 +20,12 @@ _CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": 
 
 def _type(name: str, field_types: Mapping[str, str]) -> str:
     return field_types.get(name, "float32").removesuffix("[2]")
+
+
+@cache
+def account_of(log: Path) -> FileAccount:
+    """Return the account of a real log, read once for all tests of a worker: a large one takes more than a second."""
+    return read_account(log)
 
 
 def said_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:

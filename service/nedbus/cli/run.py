@@ -18,7 +18,8 @@ from nedbus.log_event import about
 
 _log = logging.getLogger("nedbus")
 
-_END_TIMEOUT: Final = 1.6  # s between a signal and a forced exit
+_END_TIMEOUT: Final = 8.0  # s between a signal and a forced exit; systemd and Docker kill after 10 s
+_CLOSE_TIMEOUT: Final = 1.6  # s for Zenoh to close a session: it waits 10 s for a reader that takes nothing
 _TICK: Final = 0.5  # s between two calls of `on_tick`
 _HANGUP_PAUSE: Final = 0.2  # s; some shells pass the signal on before their terminal is gone
 
@@ -29,16 +30,18 @@ def run_until_stopped(
     on_stop: Callable[[], object] = lambda: None,
     on_tick: Callable[[], object] = lambda: None,
     on_hangup: Callable[[], object] | None = None,
+    closing: threading.Event | None = None,
 ) -> None:
     """Run `body` in a thread until it returns; Ctrl-C, SIGTERM or SIGHUP set its stop event.
 
     `on_stop` is called from the signal handler, `on_tick` twice a second from the main thread, and `on_hangup`
     after a SIGHUP that does not come from a closed terminal, in place of the end. `nohup` keeps SIGHUP ignored.
+    `body` sets `closing` when it has only its session left to close, which must not take long.
     The main thread does nothing else, and so handles signals at once, even while Zenoh blocks.
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
-    stop = threading.Event()
+    stop, closing = threading.Event(), closing or threading.Event()
     outcome: Future[object] = Future()
     signals: list[int] = []
     hangups: list[int] = []
@@ -49,6 +52,7 @@ def run_until_stopped(
             outcome.set_result(body(stop))
         except BaseException as exc:  # noqa: BLE001 - raised again below, in the main thread
             outcome.set_exception(exc)
+        closing.set()
         changed.put(None)
 
     def end(number: int) -> None:
@@ -83,15 +87,24 @@ def run_until_stopped(
             changed.get(timeout=_TICK)
     if signals:
         _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("ending"))
-    thread.join(_END_TIMEOUT)
-    if thread.is_alive():
-        text = "shutdown took more than %g s, maybe because of a blocked reader: unsent messages are lost"
-        _log.error(text, _END_TIMEOUT, extra=about("ending"))
-        sys.stderr.flush()
-        os._exit(1)
+    _await_end(thread, closing, signals)
     failed, interrupted = outcome.result() is False, signals[:1] == [signal.SIGINT]
     if failed or interrupted:
         raise typer.Exit(130 if interrupted else 1)
+
+
+def _await_end(thread: threading.Thread, closing: threading.Event, signals: list[int]) -> None:
+    """Wait for the end of the body's work, then of its session; exit with the reason if either takes too long."""
+    if closing.wait(_END_TIMEOUT):
+        thread.join(_CLOSE_TIMEOUT)
+        if not thread.is_alive():
+            return
+        reason = f"links not closed within {_CLOSE_TIMEOUT:g} s: messages not yet sent on them are lost"
+    else:
+        reason = f"still at work {_END_TIMEOUT:g} s after the signal: what is unfinished is lost"
+    _log.error(reason, extra=about("ending"))
+    sys.stderr.flush()
+    os._exit(130 if signals[0] == signal.SIGINT else 1)
 
 
 def _has_terminal() -> bool:

@@ -89,7 +89,7 @@ class Daemon:
         # Random, because services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.max_sessions: int | None = None  # of the embedded router, once it is open
-        self.ready = threading.Event()
+        self.ready, self.closing = threading.Event(), threading.Event()  # closing: only the session is left
         self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
         self._plan = self._make_plan(settings)
@@ -207,6 +207,7 @@ class Daemon:
         finally:
             self._stop.set()
             stop_workers(self._workers, _GRACE)
+            self.closing.set()
             queries.close()
             registry.heartbeats.close()
             session.close()

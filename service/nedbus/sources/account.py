@@ -78,7 +78,7 @@ class Flights:
         return Times(offsets={name: utc.offset_us / 1e6 for name, utc in self._utc.items()})
 
     @cached_property
-    def _utc(self) -> dict[str, recording.UtcOffset]:
+    def _utc(self) -> dict[str, recording.UtcOffset]:  # which would load NumPy
         names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
         found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
         return {name: utc for name, utc in found if utc is not None}

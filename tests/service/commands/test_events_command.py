@@ -19,10 +19,10 @@ import pytest
 import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
-from nedbus.sources import source_text_of_file
+from nedbus.sources import read_account, source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
-from tests.flights.ulogs import LOGS, UlogWriter
+from tests.flights.ulogs import LOGS, UlogWriter, account_of
 from tests.peers.command_line import Ended, run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
@@ -71,6 +71,13 @@ def write_flight(path: Path, *, fault: bool = True) -> Path:
 def log(tmp_path: Path) -> Path:
     """Write a log with a fault."""
     return write_flight(tmp_path / "flight.ulg")
+
+
+@pytest.fixture
+def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have all commands read the real log once: what they say of it is what is tested."""
+    where = "nedbus.cli.commands.events.read_account"
+    monkeypatch.setattr(where, lambda path: (account_of if path == REAL else read_account)(path))
 
 
 def lines_of(shown: Ended) -> list[tuple[str, str, str]]:
@@ -132,6 +139,8 @@ def test_events_of_a_recording_are_those_of_its_log(log: Path, tmp_path: Path) -
 
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} is not there")
+@pytest.mark.slow
+@pytest.mark.usefixtures("read_once")
 def test_events_of_a_real_flight() -> None:
     """A log of PX4 1.17 with twelve messages, and the MCAP that was converted from it."""
     assert run_command("convert", str(REAL), "flight.mcap", "--topics", "*").exit_code == 0
@@ -184,6 +193,7 @@ def test_why_of_a_moment(log: Path) -> None:
 
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} is not there")
+@pytest.mark.usefixtures("read_once")
 def test_why_of_a_moment_in_both_clocks() -> None:
     """UTC, as the real log's messages tell it, and seconds since boot are the same moment."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out

@@ -456,6 +456,66 @@ def test_second_signal_ends_at_once(start: Start, number: signal.Signals, exit_c
     assert stuck.wait() == exit_code
 
 
+SLOW = """
+import sys, time
+from nedbus.cli.app import app
+from nedbus.daemon import daemon
+
+def open_slowly(**settings):
+    print("opening", flush=True)
+    time.sleep(2.0)
+    return open_router(**settings)
+
+open_router, daemon.open_router = daemon.open_router, open_slowly
+app(["serve", "-s", "sim:", "-l", sys.argv[1]])
+"""
+
+
+def test_signal_during_a_slow_start_is_no_failure(start: Start) -> None:
+    """Where opening a router takes longer than closing a session may, Ctrl-C ends as ever, and nothing is lost."""
+    service = start("-c", SLOW, free_endpoint(), measured=False)
+    wait_for(lambda: "opening" in service.out, what="the service to open its router")
+    service.signal(signal.SIGINT)
+    assert service.wait() == 130
+    assert "lost" not in service.err
+
+
+ENDLESS = """
+import threading, time
+from nedbus.cli import run
+
+def work(stop):
+    print("started", flush=True)
+    stop.wait()
+    if "LIMIT" == "_CLOSE_TIMEOUT":
+        closing.set()
+    time.sleep(100)
+
+closing = threading.Event()
+run.LIMIT = 0.1
+run.run_until_stopped(work, closing=closing)
+"""
+
+
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
+@pytest.mark.parametrize(
+    ("limit", "reason"),
+    [
+        ("_END_TIMEOUT", "still at work 0.1 s after the signal"),
+        ("_CLOSE_TIMEOUT", "links not closed within 0.1 s"),
+    ],
+)
+def test_what_does_not_end_is_ended_by_force(
+    start: Start, number: signal.Signals, exit_code: int, limit: str, reason: str
+) -> None:
+    """Work has longer to end than a session to be closed; each says that it was cut short."""
+    endless = start("-c", ENDLESS.replace("LIMIT", limit), measured=False)
+    wait_for(lambda: "started" in endless.out, what="the start")
+    endless.signal(number)
+    assert endless.wait() == exit_code
+    assert reason in endless.err
+
+
 def test_hangup_ends_a_router(run_nedbus: Start) -> None:
     """SIGHUP ends a command that has nothing to reload; the signal is logged, with the date."""
     where = free_endpoint()

@@ -11,7 +11,6 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -19,8 +18,8 @@ import pytest
 from pyulog import ULog
 
 from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
-from nedbus.sources import read_account
-from nedbus.sources.account import FileAccount
+from nedbus.sources import FileAccount
+from tests.flights import ulogs
 from tests.flights.ulogs import LOGS
 from tests.service.recording.events_table import Row
 
@@ -43,9 +42,8 @@ def path_of(name: str) -> Path:
     return next(LOGS.parent.rglob(f"{name}.ulg"))
 
 
-@cache
 def account_of(name: str) -> FileAccount:
-    return read_account(path_of(name))
+    return ulogs.account_of(path_of(name))
 
 
 def told_in(name: str) -> list[Event]:
@@ -312,7 +310,7 @@ def test_texts_are_those_of_px4(name: str) -> None:
 
 def verdict(path: Path) -> Verdict:
     """Return the verdict on the vehicle of a log."""
-    read = account_of(path.stem) if path.stem in NAMES else read_account(path)
+    read = ulogs.account_of(path)
     events, (followed,) = read.account.events_since(0)[0], read.account.vehicles.values()
     held = [each for each in followed.conditions.values() if each.severity != "info"]
     return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)

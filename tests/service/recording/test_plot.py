@@ -13,15 +13,16 @@ import pytest
 
 import nedbus
 from nedbus.events import KINDS, Event, Times
-from nedbus.sources import read_account
 from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
-from tests.flights.ulogs import LOGS
+from tests.flights.ulogs import LOGS, account_of
 from tests.peers.command_line import run_command
 
 REAL = sorted(LOGS.parent.glob("*/*.ulg"))
+LARGE = [pytest.param(path, marks=pytest.mark.slow) for path in REAL if path.stat().st_size > 2_600_000]
+SMALL = [path for path in REAL if path.stat().st_size <= 2_600_000]
 
 
 def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, MessageArray]:
@@ -52,7 +53,7 @@ def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) 
 
 def told_by(path: Path) -> list[Event]:
     """Return the events of a log, and the begin of what held all the time."""
-    account = read_account(path).account
+    account = account_of(path).account
     held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
     return [*held, *account.events_since(0)[0]]
 
@@ -218,7 +219,7 @@ def test_events_of_several_vehicles_have_their_own_rows() -> None:
 def test_command_marks_events(tmp_path: Path) -> None:
     """`nedbus plot` marks what happens in the loss of GPS of a simulated flight, recorded; no file but that."""
     flight = tmp_path / "flight.mcap"
-    convert_replay("sim:?duration=80", flight)
+    convert_replay("sim:?duration=80&topics=VehicleLocalPosition,SensorGps,VehicleStatus,EstimatorStatusFlags", flight)
     with pytest.importorskip("matplotlib").rc_context({"svg.fonttype": "none"}):
         plot = run_command("plot", str(flight), "-o", str(tmp_path / "a.svg"))
     assert plot.exit_code == 0, plot.err
@@ -228,7 +229,7 @@ def test_command_marks_events(tmp_path: Path) -> None:
 
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL, reason="no real logs")
-@pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*SMALL, *LARGE], ids=lambda path: path.stem)
 def test_texts_of_real_flights_do_not_overlap(path: Path) -> None:
     """In each row of events, texts and marks are beside each other, within the plot. Real: the logs of PX4."""
     streams = [(Address("1", VLP), nedbus.read(path))]

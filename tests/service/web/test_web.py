@@ -684,22 +684,22 @@ def test_address_shows_the_same_to_somebody_else(flown: Sky, event: str | None) 
     assert other.marks["wing"]["colour"] in LIGHT.vehicles
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        "vehicle=&view=&time=&theme=", "time=nan", "time=inf", "time=-1e300", "time=99:99:99", "time=25:61",
-        "time=1e18", "vehicle=nobody&view=__class__&time=0", f"vehicle={'x' * 5000}&time={'9' * 5000}",
-        "time=%00&vehicle=%FF%00",
-    ],
+ASKED = (
+    "vehicle=&view=&time=&theme=", "time=nan", "time=inf", "time=-1e300", "time=99:99:99", "time=25:61",
+    "time=1e18", "vehicle=nobody&view=__class__&time=0", f"vehicle={'x' * 5000}&time={'9' * 5000}",
+    "time=%00&vehicle=%FF%00",
 )  # fmt: skip
-def test_any_address_is_survived(flown: Sky, asked: str) -> None:
+
+
+def test_any_address_is_survived(flown: Sky) -> None:
     """Nonsense in an address is left out; where it names an unknown vehicle, another can be chosen."""
-    page = Page(flown, asked=asked)
-    page.update()
-    assert page.vehicles == ["wing", "quad"]
-    page.say("vehicle", "quad")
-    page.say("now")
-    assert page.address == "?vehicle=quad"
+    for asked in ASKED:
+        page = Page(flown, asked=asked)
+        page.update()
+        assert page.vehicles == ["wing", "quad"], asked
+        page.say("vehicle", "quad")
+        page.say("now")
+        assert page.address == "?vehicle=quad", asked
 
 
 SAID = (

@@ -87,7 +87,7 @@ def serve(
             else:
                 _log.info("settings reloaded: %s", done, extra=about("reload"))
 
-        run_until_stopped(lambda _: daemon.run(), on_stop=stop, on_tick=tick, on_hangup=reload)
+        run_until_stopped(lambda _: daemon.run(), on_stop=stop, on_tick=tick, on_hangup=reload, closing=daemon.closing)
 
 
 @command
@@ -110,7 +110,7 @@ def router(
     """
     settings = load_settings(config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key)
     endpoints, routers = settings.listen, tuple(connect or ())
-    tls = settings.tls if routers else None
+    tls, closing = settings.tls if routers else None, threading.Event()
 
     def run(stop: threading.Event) -> None:
         where = router_endpoints(endpoints, config_file)
@@ -122,6 +122,7 @@ def router(
         uplinks = Uplinks(session, routers, tls=tls)
         while not stop.wait(1.0 if routers else None):
             uplinks.check()
+        closing.set()
         session.close()
 
-    run_until_stopped(run)
+    run_until_stopped(run, closing=closing)
