@@ -13,8 +13,8 @@ from unittest import mock
 from nedbus import Counts, Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, pending_queue
 from nedbus.client.receiving.writer_proxy import WriterProxy
-from nedbus.timings import TIMINGS
 from nedbus.transport import RawSample
+from tests.waits import changing_timings
 
 from .raw_samples import INVALID, name_of, raw
 
@@ -70,7 +70,6 @@ class QueueAccount(PendingQueue):
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # steps take no time
         self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
-        self._patience = mock.patch.object(TIMINGS, "retransmit_timeout", 1e6)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         with self._capacity:
@@ -86,7 +85,8 @@ class QueueAccount(PendingQueue):
             self._since_link += 60.0
 
     def requests(self) -> list[Request]:
-        with self._patience:
+        with changing_timings() as timings:
+            timings.retransmit_timeout = 1e6
             self._now += 1.0
             for writer in list(self.account.requesting):
                 self.next_request(writer, self._now)

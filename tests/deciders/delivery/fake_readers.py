@@ -18,7 +18,7 @@ from nedbus.client.protocol import CLOSED
 from nedbus.client.publishing import flow_control as module
 from nedbus.client.publishing.flow_control import FlowControl, SharedWindow
 from nedbus.client.publishing.writer import Writer
-from nedbus.timings import TIMINGS
+from nedbus.timings import TIMINGS, Timings
 
 from .raw_samples import Payload
 
@@ -84,9 +84,11 @@ class World:
     closed: bool = False
     dropping: bool = False  # a full queue drops all requests
 
-    def flow_control(self, monkeypatch: pytest.MonkeyPatch, *, needs_router: bool = True) -> FlowControl:
+    def flow_control(
+        self, monkeypatch: pytest.MonkeyPatch, timings: Timings, *, needs_router: bool = True
+    ) -> FlowControl:
         """Return a flow control in this world."""
-        monkeypatch.setattr(TIMINGS, "credit_polls", (0.0005, _TICK))
+        timings.credit_polls = 0.0005, _TICK
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
         return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)

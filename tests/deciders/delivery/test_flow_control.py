@@ -12,7 +12,7 @@ from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, Sh
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
-from nedbus.timings import TIMINGS
+from nedbus.timings import TIMINGS, Timings
 
 from .fake_readers import END, Reader, Stuck, World
 
@@ -26,8 +26,8 @@ def world() -> World:
 
 
 @pytest.fixture
-def control(world: World, monkeypatch: pytest.MonkeyPatch) -> FlowControl:
-    return world.flow_control(monkeypatch)
+def control(world: World, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> FlowControl:
+    return world.flow_control(monkeypatch, timings)
 
 
 def test_limits_fit_into_each_other() -> None:
@@ -37,10 +37,12 @@ def test_limits_fit_into_each_other() -> None:
 
 
 @pytest.mark.parametrize("routers", [["r1"], []])
-def test_without_readers_it_never_waits(world: World, monkeypatch: pytest.MonkeyPatch, routers: list[str]) -> None:
+def test_without_readers_it_never_waits(
+    world: World, monkeypatch: pytest.MonkeyPatch, timings: Timings, routers: list[str]
+) -> None:
     """Without readers there is no wait; a router does not need another router for that."""
     world.routers = routers
-    world.publish(world.flow_control(monkeypatch, needs_router=bool(routers)), 10_000)
+    world.publish(world.flow_control(monkeypatch, timings, needs_router=bool(routers)), 10_000)
     assert world.now == pytest.approx(1.0)
 
 

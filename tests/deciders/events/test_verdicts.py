@@ -183,7 +183,7 @@ def test_verdict_of_what_holds_from_begin_to_end() -> None:
             [lambda f: f.send(xy_valid=False), lambda f: f.status(ARMED, failsafe=True), lambda f: f.send()],
             "failsafe",
         ),
-        ([lambda f: f.send(xy_valid=False), lambda f: f.look("gone")], "gone: no publisher of "),
+        ([lambda f: f.send(xy_valid=False)] * 2 + [lambda f: f.look("gone")], "gone: no publisher of "),
         ([lambda f: f.look("gone"), lambda f: f.look("ok"), lambda f: f.send(z_valid=False)], "z not valid"),
         ([lambda f: f.send(dead_reckoning=True), lambda f: f.battery(2)], "battery "),
     ],
