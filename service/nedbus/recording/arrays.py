@@ -58,6 +58,7 @@ class Flight(ExitStack):
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
     `start`: when recording began, on the clock of the messages' timestamps [us]; of a recording, once it is read.
+    `boot_utc`: Unix time of the boot, as the file has it besides its messages [us]; 0 if unknown.
 
     Raises SourceError if the file cannot be read.
     """
@@ -85,12 +86,7 @@ class Flight(ExitStack):
                 self._payloads[stream] += payload
             self.start = log.start
             self.definitions = {address: stream.definition for address, stream in log.streams.items()}
-        self.addresses = sorted(self.definitions)
-
-    @property
-    def boot_utc(self) -> int:
-        """Unix time of the boot, as the file has it besides its messages [us]; 0 if unknown."""
-        return int(self._file.boot_utc)
+        self.addresses, self.boot_utc = sorted(self.definitions), int(self._file.boot_utc)
 
     @property
     def warnings(self) -> list[str]:

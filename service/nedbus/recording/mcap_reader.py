@@ -2,10 +2,10 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
@@ -59,7 +59,7 @@ class RecordedMessage(NamedTuple):
         return self.stream.address
 
 
-class RecordingReader:
+class RecordingReader(ExitStack):
     """An MCAP file, or a folder with the files of one bag, open for reading, one chunk at a time; a context manager.
 
     `vehicle`: the vehicle of channels that name none; `counts`: the number of messages per stream.
@@ -69,11 +69,14 @@ class RecordingReader:
     """
 
     def __init__(self, path: str | Path, *, vehicle: str) -> None:
+        super().__init__()
         paths, lacking = recording_files(Path(path).expanduser())
         self._lacking = [f"{name} of this bag is not there" for name in lacking]
         self._files: list[_RecordedFile] = []
         try:
-            self._files += (_RecordedFile(each, vehicle) for each in paths)
+            for each in paths:
+                self._files.append(_RecordedFile(each, vehicle))
+                self.callback(self._files[-1].chunks.close)
             if not self.counts:
                 reasons = [*self.warnings[:3]] or ["nothing in it is of px4_msgs"]
                 problem = "no message can be read" if self.damaged else "this recording has no messages of PX4 topics"
@@ -113,17 +116,6 @@ class RecordingReader:
         """Yield the messages in file order; `only`: those of these addresses."""
         for file in self._files:
             yield from file.messages(only)
-
-    def close(self) -> None:
-        """Close the files."""
-        for file in self._files:
-            file.chunks.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
 
 class _RecordedFile:
