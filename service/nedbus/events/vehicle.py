@@ -274,10 +274,7 @@ class Vehicle:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
-        """Yield the EKF whose estimates equal those of the vehicle, if those of the one in use do not.
-
-        For the EKF in use where no selector names it.
-        """
+        """Yield this EKF if its estimates equal the vehicle's and those in use do not; where no selector names one."""
         vehicle = _read_sample(None if self._position is None else self._position.last)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
@@ -318,9 +315,9 @@ class Vehicle:
             self.emit(Finding("reboot", "once", text, numbers={"before": before / 1e6}), "", time)
 
     def _report(self, event: Event) -> None:
-        recent, conditions = list(self.recent), list(self.conditions.values())
-        if self._common is not None:
-            recent, conditions = [*self._common.recent, *recent], [*conditions, *self._common.conditions.values()]
+        common = () if self._common is None else (self._common,)
+        recent = [earlier for each in (*common, self) for earlier in each.recent]
+        conditions = [known for each in (self, *common) for known in each.conditions.values()]
         self.recent.append(event)
         held = [each for each in conditions if each.begin is not event]
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
