@@ -17,21 +17,12 @@ from nedbus.transport import Session, Tls, open_client, query, require_unforked
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
 from .closing import Finalizer
-from .discovery import (
-    Publishers,
-    Rejections,
-    ServiceStatus,
-    VehicleDirectory,
-    Vehicles,
-    find_accounts,
-    find_schemas,
-    find_services,
-)
+from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_accounts, find_services
 from .protocol import LIVE
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
+from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver, find_schemas
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 

@@ -1,4 +1,4 @@
-"""Discovery of vehicles, services, accounts, layouts and rejected messages; peers are not trusted."""
+"""Discovery of vehicles, services, accounts and rejected messages; peers are not trusted."""
 
 from __future__ import annotations
 
@@ -7,57 +7,38 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from typing import Annotated, Final
+from typing import Final
 
 import zenoh
-from pydantic import Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
+from pydantic import TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
 from pydantic_core import PydanticUseDefault, to_json
 
 from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health.stream_health import Health
-from nedbus.client.receiving.layout_lookup import Schemas, Wanted
+from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
-from nedbus.transport import (
-    MAX_ANSWERS,
-    MAX_REPLY_BYTES,
-    AliveTokens,
-    RawSample,
-    Session,
-    ask,
-    query,
-    wait_for_answers,
-    while_open,
-)
+from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, while_open
 from nedbus_msgs import (
     ANY,
-    MESSAGES,
     Address,
-    AddressError,
     Selection,
     address_of_alive_key,
     address_of_rejected_key,
-    field_type,
     rejected_key_expr,
-    schema_key,
-    short_hash,
     status_key,
 )
 
 _log = logging.getLogger(__name__)
 
-_MAX_FIELDS: Final = 256  # per layout
-_MAX_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
-_SCHEMA_TIMEOUT: Final = 3.0  # s for a busy publisher to reply, as long as readers wait for it
 _POLL: Final = 0.002  # s between polls for tokens
 
 
@@ -257,25 +238,10 @@ class ServiceStatus(_FromPeer):
 _STATUS: Final = TypeAdapter(ServiceStatus)
 
 
-@dataclass(slots=True)
-class _Field:
-    name: str
-    type: str
-
-
-@dataclass(slots=True)
-class _Layout:
-    wire: int
-    fields: Annotated[list[_Field], Field(max_length=_MAX_FIELDS)]
-
-
-_LAYOUT: Final = TypeAdapter(_Layout)
-
-
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
     """Query the status of all nedbus services; replies that are too large are ignored."""
     found: dict[str, ServiceStatus] = {}
-    for key, content in _parse(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
+    for key, content in parse_replies(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
         if isinstance(content, dict):
             part = replace(_STATUS.validate_python(content), service=key.split("/")[-2])
             found[key] = replace(part, sources=(*found[key].sources, *part.sources)) if key in found else part
@@ -286,7 +252,7 @@ def find_accounts(session: Session, *, prefix: str, within: float, timeout: floa
     """Query the accounts of all services for the last `within` seconds; invalid and too large replies are ignored."""
     selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[str, list[AccountReport]] = {}
-    for key, content in _parse(query(session, selector, timeout=timeout)):
+    for key, content in parse_replies(query(session, selector, timeout=timeout)):
         if (part := from_json(content)) is not None:
             found.setdefault(key, []).append(part)
     return list(map(joined, found.values()))
@@ -303,34 +269,6 @@ def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
     else:
         reason = "left out %d bytes of a reply, as readers accept at most %d in one part: use fewer or shorter names"
         _log.warning(reason, len(text), MAX_REPLY_BYTES, extra=about("incomplete"))
-
-
-def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
-    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
-
-    Returns once all are found: a publisher that is stopped, or behind a bad link, does not delay it.
-    """
-    found: dict[Wanted, dict[str, str]] = {}
-    keys = {
-        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
-    }
-    queries = [ask(session, key, timeout=_SCHEMA_TIMEOUT) for key in keys]
-    replies = islice(wait_for_answers(queries), MAX_ANSWERS)
-    for key, content in _parse(reply.ok for reply in replies if reply.ok is not None):
-        name = key.rpartition("/")[2]
-        layouts = content.get("layouts") if isinstance(content, dict) else None
-        for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
-            with suppress(ValueError):
-                parsed = _LAYOUT.validate_python(layout)
-                fields = {field.name: field.type for field in parsed.fields}
-                # The hash of what the peer describes, not what it claims.
-                types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
-                which = short_hash(name, types) if types else parsed.wire
-                if len(fields) == len(parsed.fields) and (name, which) in wanted:
-                    found.setdefault((name, which), fields)
-        if len(found) == len(wanted):
-            break
-    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,7 +319,7 @@ class Rejections:
         return RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()) if reason else None
 
 
-def _parse(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
+def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     """Yield key and content of JSON replies within the memory limit; log all others in one line per reason."""
     room, too_large, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:

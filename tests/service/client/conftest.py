@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import pytest
 
-from nedbus.client import discovery
 from nedbus.client.receiving import layout_lookup
 from tests.waits import DEADLINE
 
@@ -15,6 +14,6 @@ from tests.waits import DEADLINE
 def patient_lookups() -> Iterator[None]:
     """Let readers wait for definitions until the deadline: a message whose lookup takes too long is invalid."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(discovery, "_SCHEMA_TIMEOUT", 2 * DEADLINE)
+        patch.setattr(layout_lookup, "_TIMEOUT", 2 * DEADLINE)
         patch.setattr(layout_lookup, "_PATIENCE", DEADLINE)
         yield
