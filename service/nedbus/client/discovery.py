@@ -23,15 +23,7 @@ from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
 from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, while_open
-from nedbus_msgs import (
-    ANY,
-    Address,
-    Selection,
-    address_of_alive_key,
-    address_of_rejected_key,
-    rejected_key_expr,
-    status_key,
-)
+from nedbus_msgs import ANY, Address, address_of_alive_key, address_of_rejected_key, rejected_key_expr, status_key
 
 _log = logging.getLogger(__name__)
 
@@ -58,10 +50,10 @@ class Vehicles(dict[str, list[Address]]):
 
 
 class VehicleDirectory:
-    """The addresses and their publishers, by the liveliness tokens that it subscribes to at the first call."""
+    """The addresses and their publishers, by the liveliness tokens on a key expression, from the first call on."""
 
-    def __init__(self, selection: Selection, *, prefix: str) -> None:
-        self._prefix, self._selection = prefix, selection
+    def __init__(self, key_expr: str, *, prefix: str) -> None:
+        self._prefix, self._key_expr = prefix, key_expr
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: AliveTokens | None = None
@@ -72,7 +64,7 @@ class VehicleDirectory:
         end = time.monotonic() + timeout
         with self._lock:
             if self._tokens is None:
-                self._tokens = AliveTokens(session, self._selection.alive_key_expr(prefix=self._prefix))
+                self._tokens = AliveTokens(session, self._key_expr)
             while True:
                 for key, alive in self._tokens.take():
                     if not alive:

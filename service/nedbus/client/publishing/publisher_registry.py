@@ -78,12 +78,12 @@ class PublisherRegistry:
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
-            vehicle = address.vehicle
+            vehicle, prefix = address.vehicle, self.prefix
             if vehicle not in self._matched:
                 selection = Selection(vehicle=vehicle)
-                self._directories[vehicle] = VehicleDirectory(selection, prefix=self.prefix)
-                key_expr = selection.rate_key_expr(ANY, prefix=self.prefix)
-                self._matched[vehicle] = MatchingListener(self._session, key_expr)
+                tokens, rates = selection.alive_key_expr(prefix=prefix), selection.rate_key_expr(ANY, prefix=prefix)
+                self._directories[vehicle] = VehicleDirectory(tokens, prefix=prefix)
+                self._matched[vehicle] = MatchingListener(self._session, rates)
             matched = self._matched[vehicle]
             publisher = self._publishers[address] = Publisher(
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
