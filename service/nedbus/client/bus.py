@@ -212,7 +212,7 @@ class Bus(AbstractContextManager["Bus"]):
         """
         try:
             if not self.closed and timeout > 0:
-                lossless = [each for each in self._publishers.publishers if each.lossless]
+                lossless = [each for each in tuple(self._publishers.publishers.values()) if each.lossless]
                 with suppress(NedbusError):
                     self._publishers.flush(lossless, timeout=timeout)
         finally:
