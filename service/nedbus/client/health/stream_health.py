@@ -162,9 +162,14 @@ class StreamHealth:
             missing = DOUBT_FLAGS - message.keys() if self._is_position else ()
         else:
             timestamp, *seen = (getattr(message, name) for name in names)
-        if received - self._window.start >= _WINDOW:
-            self._end_window(received)
         window = self._window
+        if received - window.start >= _WINDOW:
+            if window.messages:
+                self._last_window = window
+            if (mean := window.mean) > 0:  # capped against bursts, such as recovered messages
+                usual = self._usual_rate or 1 / mean
+                self._usual_rate = usual + _SMOOTHING * (min(1 / mean, 2 * usual) - usual)
+            window = self._window = _Window(received)
         self._messages += 1
         self._lost += lost
         window.messages += 1
@@ -210,16 +215,6 @@ class StreamHealth:
             resets=dict(self._resets),
             on_change=self._topic.on_change,
         )
-
-    def _end_window(self, received: int) -> None:
-        """Start the next window; the usual rate is capped against bursts, such as recovered messages."""
-        window, self._window = self._window, _Window(received)
-        if window.messages:
-            self._last_window = window
-        if (mean := window.mean) > 0:
-            rate = 1 / mean
-            usual = self._usual_rate or rate
-            self._usual_rate = usual + _SMOOTHING * (min(rate, 2 * usual) - usual)
 
     def _add_time(self, timestamp: int) -> bool:
         """Track PX4's time; return True if it is the first one or stepped back in a reboot."""
