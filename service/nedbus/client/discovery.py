@@ -295,20 +295,20 @@ class Rejections:
         """Return the reports received since the last call, at most 1000, without waiting."""
         with while_open():
             samples = list(iter(self._handler.try_recv, None))
-        return [report for report in map(self._read, samples) if report is not None]
+        reports: list[RejectionReport] = []
+        for sample in samples:
+            try:
+                address = address_of_rejected_key(str(sample.key_expr), prefix=self._prefix)
+                content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT_BYTES else None
+            except (AddressError, ValueError, RecursionError):
+                continue
+            if isinstance(content, dict) and (reason := content.get("reason")):
+                reports.append(RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()))
+        return reports
 
     def close(self) -> None:
         """End the subscription. Idempotent."""
         self._finalizer.close_now()
-
-    def _read(self, sample: zenoh.Sample) -> RejectionReport | None:
-        try:
-            address = address_of_rejected_key(str(sample.key_expr), prefix=self._prefix)
-            content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT_BYTES else None
-        except (AddressError, ValueError, RecursionError):
-            return None
-        reason = content.get("reason") if isinstance(content, dict) else None
-        return RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()) if reason else None
 
 
 def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
