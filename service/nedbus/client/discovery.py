@@ -18,7 +18,7 @@ from pydantic_core import PydanticUseDefault, to_json
 
 from nedbus import clock
 from nedbus.client.closing import Finalizer
-from nedbus.client.health.stream_health import Health
+from nedbus.client.health import Health
 from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about

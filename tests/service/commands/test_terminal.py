@@ -317,11 +317,9 @@ def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bu
 def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
-    hz = start_hasty(
-        start, {"nedbus.client.health.stream_health._STALE": 0.5}, "hz", "-c", endpoint, "--json", "-t", VLP
-    )
+    hz = start_hasty(start, {"nedbus.client.health._STALE": 0.5}, "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
-    monkeypatch.setattr("nedbus.client.health.stream_health._STALE", 0.5)
+    monkeypatch.setattr("nedbus.client.health._STALE", 0.5)
     listed = run_command("list", "-c", endpoint)
     assert [line.split()[3] for line in listed.out.splitlines()[1:]] == ["stale:"] * 5
     assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5
