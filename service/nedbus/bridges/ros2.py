@@ -25,7 +25,6 @@ from nedbus.transport import (
     alive_keys,
     gid_of_token,
     node_token,
-    publisher_token,
     px4_publishers_key_expr,
     while_open,
 )
@@ -214,7 +213,7 @@ class Ros2Bridge:
     def _open(self, address: Address) -> None:
         key = self._key(address)
         self._entities += 1
-        token, drop = publisher_token(key, self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
+        token, drop = key.token("MP", self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
         with while_open():
             publisher = self._session.declare_publisher(str(key), encoding=BRIDGED_ENCODING, congestion_control=drop)
             declared = self._session.liveliness().declare_token(token)

@@ -28,7 +28,6 @@ from nedbus.transport import (
     TopicKey,
     node_token,
     px4_publishers_key_expr,
-    subscription_token,
     while_open,
 )
 from nedbus_msgs import Address, decode_with
@@ -171,7 +170,7 @@ class Px4ZenohNode:
         if key.domain not in self._nodes:
             self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
         self._entities += 1
-        self._subscriptions[key] = self._declare(subscription_token(key, self._zid, self._node, self._entities))
+        self._subscriptions[key] = self._declare(key.token("MS", self._zid, self._node, self._entities))
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
         with while_open():
