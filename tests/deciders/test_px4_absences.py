@@ -7,14 +7,14 @@ import pytest
 from nedbus.sources import Absence
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import StreamRegistry
-from nedbus.transport import PublisherToken, TopicKey, publisher_token
+from nedbus.transport import PublisherToken, TopicKey
 
 
 def token(topic: str, message: str = "Any", *, session: str = "a") -> PublisherToken:
     """Return the liveliness token of a PX4 publisher; for a known topic its message type does not matter."""
     domain = 0 if session == "a" else 2
     key = TopicKey(domain, f"fmu/out/{topic}", f"px4_msgs::msg::dds_::{message}_", "hash")
-    return PublisherToken.parse(publisher_token(key, session, "px4_aabbcc00000000000000000000000000", 1))
+    return PublisherToken.parse(key.token("MP", session, "px4_aabbcc00000000000000000000000000", 1))
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import NotAcceptedError, Px4Stream, StreamRegistry
-from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
+from nedbus.transport import Attachment, PublisherToken, TopicKey
 from nedbus_msgs import DecodeError, dds_type
 from tests.flights.first_message import ROS2_TYPE, type_hash
 from tests.flights.messages import VLP
@@ -31,7 +31,7 @@ def px4(session: str, topic: str = VLP) -> PublisherToken:
 
 def node(session: str, name: str = "talker") -> PublisherToken:
     """Return the token of a ROS 2 node, which does not contain its gid."""
-    return PublisherToken.parse(publisher_token(key(), session, name, 1))
+    return PublisherToken.parse(key().token("MP", session, name, 1))
 
 
 def send(streams: StreamRegistry, stream: Px4Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:

@@ -51,7 +51,7 @@ class FakeRegistry:
     """A registry without a session, with one publisher per address; payloads are validated and recorded."""
 
     clock: StandingClock
-    open: dict[Address, SimpleNamespace] = field(default_factory=dict)
+    publishers: dict[Address, SimpleNamespace] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)
     published: dict[Address, list[tuple[float, VehicleLocalPosition]]] = field(default_factory=dict)
     rejected: list[tuple[Address, Mapping[str, object]]] = field(default_factory=list)
@@ -60,24 +60,21 @@ class FakeRegistry:
     def publisher(
         self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool, source: str
     ) -> SimpleNamespace:
-        if address in self.open:
+        if address in self.publishers:
             raise AddressInUseError(address)
 
         def publish(fields: Mapping[str, object]) -> None:
             self.published.setdefault(address, []).append((self.clock.seconds, decode(encode_fields(fields))))
 
         def close() -> None:
-            del self.open[address]
+            del self.publishers[address]
             self.log.append(f"{self.clock.seconds:g} -{address.vehicle}")
 
         self.log.append(f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}")
-        self.open[address] = SimpleNamespace(
+        self.publishers[address] = SimpleNamespace(
             publish=publish, close=close, relabel=lambda _: None, definition=definition or DEFAULT
         )
-        return self.open[address]
-
-    def is_published(self, address: Address) -> bool:
-        return address in self.open
+        return self.publishers[address]
 
     def is_read(self, _: object) -> bool:
         return self.clock.seconds >= self.readers_at
@@ -266,7 +263,7 @@ def test_error_while_a_failure_is_handled_ends_the_source() -> None:
 
     def break_() -> Iterator[SourceMessage]:
         yield at(0.0)
-        ran.registry.open[ONE].close = panic
+        ran.registry.publishers[ONE].close = panic
         raise ZeroDivisionError
 
     ran = Ran(FakeReplay([at(0.0)], run=break_), StandingClock())

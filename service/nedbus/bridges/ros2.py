@@ -192,8 +192,8 @@ class Ros2Bridge:
     def _open(self, address: Address) -> None:
         key = self._key(address)
         self._entities += 1
-        token = transport.publisher_token(key, self._zid, self._node, self._entities)
-        encoding, drop = transport.BRIDGED_ENCODING, zenoh.CongestionControl.DROP
+        token, drop = key.token("MP", self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
+        encoding = transport.BRIDGED_ENCODING
         with transport.while_open():
             publisher = self._session.declare_publisher(str(key), encoding=encoding, congestion_control=drop)
             declared = self._session.liveliness().declare_token(token)

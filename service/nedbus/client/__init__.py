@@ -20,8 +20,7 @@ from .discovery import (
     find_services,
     reply_parts,
 )
-from .health.stream_health import Health, Histogram, Monitor, StreamHealth
-from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
+from .health import Health, Histogram, Monitor, StreamHealth, StreamState, describe_stream, health_of_last, stream_state
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer

@@ -157,7 +157,7 @@ class AsyncBus:
 
 
 def _stop_waiting(bus: Bus) -> None:
-    for publisher in bus._publishers.publishers:
+    for publisher in tuple(bus._publishers.publishers.values()):
         publisher._flow_control.cancelled.set()
 
 

@@ -17,21 +17,12 @@ from nedbus.transport import Session, Tls, open_client, query, require_unforked
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
 from .closing import Finalizer
-from .discovery import (
-    Publishers,
-    Rejections,
-    ServiceStatus,
-    VehicleDirectory,
-    Vehicles,
-    find_accounts,
-    find_schemas,
-    find_services,
-)
+from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_accounts, find_services
 from .protocol import LIVE
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
+from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver, find_schemas
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
 
@@ -57,7 +48,7 @@ class Bus(AbstractContextManager["Bus"]):
         self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
-        self._directory = VehicleDirectory(Selection(), prefix=prefix)
+        self._directory = VehicleDirectory(Selection().alive_key_expr(prefix=prefix), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         closing = ExitStack()  # in reverse order; closing the session ends an open query for layouts
@@ -221,7 +212,7 @@ class Bus(AbstractContextManager["Bus"]):
         """
         try:
             if not self.closed and timeout > 0:
-                lossless = [each for each in self._publishers.publishers if each.lossless]
+                lossless = [each for each in tuple(self._publishers.publishers.values()) if each.lossless]
                 with suppress(NedbusError):
                     self._publishers.flush(lossless, timeout=timeout)
         finally:

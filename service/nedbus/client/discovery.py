@@ -1,4 +1,4 @@
-"""Discovery of vehicles, services, accounts, layouts and rejected messages; peers are not trusted."""
+"""Discovery of vehicles, services, accounts and rejected messages; peers are not trusted."""
 
 from __future__ import annotations
 
@@ -7,52 +7,26 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from typing import Annotated, Final
+from typing import Final
 
 import zenoh
-from pydantic import Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
+from pydantic import TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
 from pydantic_core import PydanticUseDefault, to_json
 
 from nedbus import clock
 from nedbus.client.closing import Finalizer
-from nedbus.client.health.stream_health import Health
-from nedbus.client.receiving.layout_lookup import Schemas, Wanted
+from nedbus.client.health import Health
+from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
-from nedbus.timings import TIMINGS
-from nedbus.transport import (
-    MAX_ANSWERS,
-    MAX_REPLY_BYTES,
-    AliveTokens,
-    RawSample,
-    Session,
-    ask,
-    query,
-    wait_for_answers,
-    while_open,
-)
-from nedbus_msgs import (
-    ANY,
-    MESSAGES,
-    REJECTED,
-    Address,
-    AddressError,
-    Selection,
-    address_of_alive_key,
-    field_type,
-    schema_key,
-    short_hash,
-    status_key,
-)
+from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, while_open
+from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
 
 _log = logging.getLogger(__name__)
 
-_MAX_FIELDS: Final = 256  # per layout
-_MAX_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
@@ -76,10 +50,10 @@ class Vehicles(dict[str, list[Address]]):
 
 
 class VehicleDirectory:
-    """The addresses and their publishers, by the liveliness tokens that it subscribes to at the first call."""
+    """The addresses and their publishers, by the liveliness tokens on a key expression, from the first call on."""
 
-    def __init__(self, selection: Selection, *, prefix: str) -> None:
-        self._prefix, self._selection = prefix, selection
+    def __init__(self, key_expr: str, *, prefix: str) -> None:
+        self._prefix, self._key_expr = prefix, key_expr
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: AliveTokens | None = None
@@ -90,7 +64,7 @@ class VehicleDirectory:
         end = time.monotonic() + timeout
         with self._lock:
             if self._tokens is None:
-                self._tokens = AliveTokens(session, self._selection.alive_key_expr(prefix=self._prefix))
+                self._tokens = AliveTokens(session, self._key_expr)
             while True:
                 for key, alive in self._tokens.take():
                     if not alive:
@@ -256,25 +230,10 @@ class ServiceStatus(_FromPeer):
 _STATUS: Final = TypeAdapter(ServiceStatus)
 
 
-@dataclass(slots=True)
-class _Field:
-    name: str
-    type: str
-
-
-@dataclass(slots=True)
-class _Layout:
-    wire: int
-    fields: Annotated[list[_Field], Field(max_length=_MAX_FIELDS)]
-
-
-_LAYOUT: Final = TypeAdapter(_Layout)
-
-
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
     """Query the status of all nedbus services; replies that are too large are ignored."""
     found: dict[str, ServiceStatus] = {}
-    for key, content in _parse(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
+    for key, content in parse_replies(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
         if isinstance(content, dict):
             part = replace(_STATUS.validate_python(content), service=key.split("/")[-2])
             found[key] = replace(part, sources=(*found[key].sources, *part.sources)) if key in found else part
@@ -285,7 +244,7 @@ def find_accounts(session: Session, *, prefix: str, within: float, timeout: floa
     """Query the accounts of all services for the last `within` seconds; invalid and too large replies are ignored."""
     selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[str, list[AccountReport]] = {}
-    for key, content in _parse(query(session, selector, timeout=timeout)):
+    for key, content in parse_replies(query(session, selector, timeout=timeout)):
         if (part := from_json(content)) is not None:
             found.setdefault(key, []).append(part)
     return list(map(joined, found.values()))
@@ -302,34 +261,6 @@ def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
     else:
         reason = "left out %d bytes of a reply, as readers accept at most %d in one part: use fewer or shorter names"
         _log.warning(reason, len(text), MAX_REPLY_BYTES, extra=about("incomplete"))
-
-
-def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
-    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
-
-    Returns once all are found: a publisher that is stopped, or behind a bad link, does not delay it.
-    """
-    found: dict[Wanted, dict[str, str]] = {}
-    keys = {
-        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
-    }
-    queries = [ask(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
-    replies = islice(wait_for_answers(queries), MAX_ANSWERS)
-    for key, content in _parse(reply.ok for reply in replies if reply.ok is not None):
-        name = key.rpartition("/")[2]
-        layouts = content.get("layouts") if isinstance(content, dict) else None
-        for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
-            with suppress(ValueError):
-                parsed = _LAYOUT.validate_python(layout)
-                fields = {field.name: field.type for field in parsed.fields}
-                # The hash of what the peer describes, not what it claims.
-                types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
-                which = short_hash(name, types) if types else parsed.wire
-                if len(fields) == len(parsed.fields) and (name, which) in wanted:
-                    found.setdefault((name, which), fields)
-        if len(found) == len(wanted):
-            break
-    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,23 +295,23 @@ class Rejections:
         """Return the reports received since the last call, at most 1000, without waiting."""
         with while_open():
             samples = list(iter(self._handler.try_recv, None))
-        return [report for report in map(self._read, samples) if report is not None]
+        reports: list[RejectionReport] = []
+        for sample in samples:
+            try:
+                address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
+                content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT_BYTES else None
+            except (AddressError, ValueError, RecursionError):
+                continue
+            if isinstance(content, dict) and (reason := content.get("reason")):
+                reports.append(RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()))
+        return reports
 
     def close(self) -> None:
         """End the subscription. Idempotent."""
         self._finalizer.close_now()
 
-    def _read(self, sample: zenoh.Sample) -> RejectionReport | None:
-        try:
-            address = Address.from_key(str(sample.key_expr), prefix=self._prefix + REJECTED)
-            content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT_BYTES else None
-        except (AddressError, ValueError, RecursionError):
-            return None
-        reason = content.get("reason") if isinstance(content, dict) else None
-        return RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()) if reason else None
 
-
-def _parse(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
+def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     """Yield key and content of JSON replies within the memory limit; log all others in one line per reason."""
     room, too_large, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:

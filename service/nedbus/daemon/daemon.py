@@ -146,7 +146,7 @@ class Daemon:
             measured |= source.states
         mains = [vehicle.main for vehicle in list(self.account.vehicles.values()) if vehicle.main is not None]
         shared = set() if self._registry is None else self._registry.shared_vehicles()
-        present = set() if self._registry is None else {each.address.vehicle for each in self._registry.publishers}
+        present = set() if self._registry is None else {each.vehicle for each in tuple(self._registry.publishers)}
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         states |= {main: "duplicate" for main in states if main.vehicle in shared}
         is_cut = self.role == "client" and self._session is not None and not self.sessions
@@ -279,11 +279,9 @@ class Daemon:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status().ended for worker in finite):
                     # Heartbeats tell readers of the last message, in case they missed it.
-                    is_paced = any(
-                        isinstance(each.source, ReplaySource) and each.source.options.speed for each in finite
-                    )
-                    self._stop.wait(2 * HEARTBEAT if is_paced else 0.0)
-                    registry.flush(registry.publishers, stop=self._stop)
+                    speeds = [each.source.options.speed for each in finite if isinstance(each.source, ReplaySource)]
+                    self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
+                    registry.flush(tuple(registry.publishers.values()), stop=self._stop)
                     return
             self._changed.wait(_POLL)
             self._changed.clear()

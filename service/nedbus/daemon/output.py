@@ -91,7 +91,7 @@ class SourceOutput:
         Raises AddressInUseError if another source of this service publishes one of them.
         """
         for address in run.addresses.keys() - set(self.addresses):
-            if self._registry.is_published(address):
+            if address in self._registry.publishers:
                 raise AddressInUseError(address)
         for address, definition in run.addresses.items():
             self.claim(address, definition, lossless=lossless)

@@ -34,7 +34,7 @@ def watch_permission(session: Session, settings: Settings, registry: PublisherRe
         return None
 
     def vehicles() -> set[str]:
-        return {publisher.address.vehicle for publisher in registry.publishers}
+        return {address.vehicle for address in tuple(registry.publishers)}
 
     permission = WritePermission(session, endpoints, tls=settings.tls, prefix=settings.prefix, vehicles=vehicles)
     permission.start()

@@ -13,9 +13,7 @@ from .rmw_zenoh import (
     TopicKey,
     gid_of_token,
     node_token,
-    publisher_token,
     px4_publishers_key_expr,
-    subscription_token,
 )
 from .router import RouterState, ask_routers, open_router, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals

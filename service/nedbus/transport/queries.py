@@ -8,7 +8,7 @@ thread needs that lock.
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 
@@ -48,30 +48,16 @@ class Answers:
         return taken
 
 
-def ask(
-    session: Session,
-    selector: str,
-    *,
-    timeout: float,
-    room: int = _MAX_WAITING,
-    accept_replies: zenoh.ReplyKeyExpr | None = None,
-    priority: zenoh.Priority | None = None,
-    congestion_control: zenoh.CongestionControl | None = None,
-) -> Answers:
-    """Query all matching queryables and return at once; the session blocks while `room` answers wait."""
+def ask(session: Session, selector: str, *, timeout: float, room: int = _MAX_WAITING, **options: Any) -> Answers:
+    """Query all matching queryables and return at once; the session blocks while `room` answers wait.
+
+    `options`: further arguments of `zenoh.Session.get`, such as `priority`.
+    """
     timeout = zenoh_timeout(timeout)
+    options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
     with while_open():
-        handler = session.get(
-            selector,
-            zenoh.handlers.FifoChannel(room),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=accept_replies,
-            timeout=timeout,
-            priority=priority,
-            congestion_control=congestion_control,
-        )
-    return Answers(handler, timeout=timeout)
+        answers = session.get(selector, zenoh.handlers.FifoChannel(room), timeout=timeout, **options)
+    return Answers(answers, timeout=timeout)
 
 
 def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]:

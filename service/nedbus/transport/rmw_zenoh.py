@@ -11,8 +11,7 @@ Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatib
 import re
 import struct
 from dataclasses import dataclass
-from functools import partial
-from typing import Final, Self
+from typing import Final, Literal, Self
 
 import xxhash
 
@@ -46,6 +45,11 @@ class TopicKey:
         if found is None:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
         return cls(int(found[1]), found[2], found[3], found[4])
+
+    def token(self, kind: Literal["MP", "MS"], session: str, node: str, entity: int) -> str:
+        """Return the liveliness token of a node's publisher (MP), which ROS 2 lists, or of its subscription (MS)."""
+        topic, end = self.topic.replace("/", "%"), f"{self.dds_type}/{self.type_hash}/{_QOS}"
+        return f"@ros2_lv/{self.domain}/{session}/0/{entity}/{kind}/%/%/{node}/%{topic}/{end}"
 
     def __str__(self) -> str:
         return f"{self.domain}/{self.topic}/{self.dds_type}/{self.type_hash}"
@@ -116,15 +120,6 @@ def gid_of_token(token: str) -> bytes:
 def node_token(domain: int, session: str, node: str) -> str:
     """Return the liveliness token of a node without a namespace, for ROS 2 to list."""
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{node}"
-
-
-def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:
-    topic = "%" + key.topic.replace("/", "%")
-    return f"@ros2_lv/{key.domain}/{session}/0/{entity}/{kind}/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
-
-
-publisher_token: Final = partial(_endpoint_token, "MP")  # of a node, for ROS 2 to list its topic
-subscription_token: Final = partial(_endpoint_token, "MS")  # of a node, for publishers in ROS 2 to match
 
 
 def px4_publishers_key_expr(domain: int | None) -> str:

@@ -70,7 +70,13 @@ def open_router(
         }
     else:
         config = _read_config(config_file)
-        _check_files(config_file, config)
+        if plugins := _get(config, "plugins"):
+            text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
+            _log.warning(text, config_file, _names(plugins), extra=about("router"))
+        for name, file in _tls_files(config).items():  # Zenoh would not name it
+            if not os.access(file, os.R_OK):
+                reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
+                raise ConfigError.in_file(config_file, reason)
         given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
         settings = {name: endpoints for name, endpoints in given.items() if endpoints}
     insert_settings(config, settings, where="listen")
@@ -156,17 +162,6 @@ def _read_config(path: Path) -> zenoh.Config:
         reason = f"it requires {_names(required)}, but this router loads no plugins: run it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
-
-
-def _check_files(path: Path, config: zenoh.Config) -> None:
-    """Log the plugins of a file; raise ConfigError for an unreadable TLS file, as Zenoh would not name it."""
-    if plugins := _get(config, "plugins"):
-        text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
-        _log.warning(text, path, _names(plugins), extra=about("router"))
-    for name, file in _tls_files(config).items():
-        if not os.access(file, os.R_OK):
-            reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
-            raise ConfigError.in_file(path, reason)
 
 
 def _names(plugins: Iterable[str]) -> str:

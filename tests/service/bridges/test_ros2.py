@@ -21,7 +21,7 @@ import nedbus
 from nedbus.bridges import Ros2Bridge
 from nedbus.errors import NedbusError
 from nedbus.timings import Timings
-from nedbus.transport import Attachment, Session, TopicKey, gid_of_token, open_client, open_router, publisher_token
+from nedbus.transport import Attachment, Session, TopicKey, gid_of_token, open_client, open_router
 from nedbus_msgs import (
     ANY,
     BY_TOPIC,
@@ -329,7 +329,7 @@ def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path
 def test_gid_is_that_of_rmw_zenoh(type_hash: str, gid: str) -> None:
     """These were computed by rmw_zenoh's own code (simplified_xxhash3.cpp), for both of its paths."""
     key = TopicKey(0, f"fmu/out/{VLP}", "px4_msgs::msg::dds_::VehicleLocalPosition_", type_hash)
-    token = publisher_token(key, "0123456789abcdef" * 2, "nedbus_4711", 1)
+    token = key.token("MP", "0123456789abcdef" * 2, "nedbus_4711", 1)
     assert gid_of_token(token).hex() == gid
 
 
@@ -343,7 +343,7 @@ def test_topic_of_another_node_is_left_to_it(
     """A topic that a PX4 publishes itself is not published twice; the same one in another layout is a translation."""
     timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
-    token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
+    token = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
     left, published = f"left to node px4_0001, which already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
     run_bridge(layout="1.14")
@@ -353,7 +353,7 @@ def test_topic_of_another_node_is_left_to_it(
     wait_for(lambda: published in caplog.text, what="the translation")
     token.undeclare()
     wait_for(lambda: caplog.text.count(published) == 2, what="the topic to be taken over")
-    back = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
+    back = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     wait_for(lambda: caplog.text.count(left) == 2, what="the topic to be released")
     back.undeclare()
 

@@ -12,7 +12,7 @@ import pytest
 
 from nedbus import Sample
 from nedbus.client import describe_stream, stream_state
-from nedbus.client.health.stream_health import _Window
+from nedbus.client.health import _Window
 from nedbus.health import Health, Monitor, StreamHealth
 from nedbus_msgs import DOUBT_FLAGS, Address
 from tests.flights.messages import VALID, VLP, message

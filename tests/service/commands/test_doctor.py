@@ -27,7 +27,7 @@ from nedbus.doctor import Finding, State, examine
 from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
-from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router, publisher_token
+from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router
 from nedbus_msgs import dds_type, status_key
 from tests.flights.first_message import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
@@ -318,7 +318,7 @@ def test_status_that_makes_no_sense(raw: Session, endpoint: str, now: object) ->
 def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
     """Another prefix is found by its tokens or by its messages, a PX4's own keys by its tokens, unless bridged."""
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), NO_HASH)
-    token = raw.liveliness().declare_token(publisher_token(key, "abc", "px4", 1))
+    token = raw.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
     with nedbus.connect(endpoint, prefix="other/fleet") as other, flying(other):
         payload = encode(message(1))
         with repeating(lambda: raw.put(f"third/1/{VLP}", payload)):

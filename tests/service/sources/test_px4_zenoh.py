@@ -18,7 +18,7 @@ from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 import nedbus
 from nedbus.errors import ConfigError
 from nedbus.sources import SourceMessage, parse_source
-from nedbus.transport import NO_HASH, Attachment, Session, TopicKey, publisher_token
+from nedbus.transport import NO_HASH, Attachment, Session, TopicKey
 from nedbus_msgs import ANY, VehicleLocalPosition, dds_type, define_msg, encode_with, hash_of, ros2_type
 from tests.flights.first_message import (
     LAYOUTS,
@@ -231,7 +231,7 @@ def test_message_without_a_file_is_read_by_its_definition(
     key = f"0/fmu/out/wheel_encoders/{dds_type(name)}/{hash_of(definition.current, name)}"
     service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
     wait_for_reader(raw, key)
-    token = raw.liveliness().declare_token(publisher_token(TopicKey.parse(key), "px4", "px4", 1))
+    token = raw.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
     raw.put(key, b"")
     wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the list")
     assert status_of_source(bus).rejected == 0

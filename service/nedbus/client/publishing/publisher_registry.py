@@ -43,18 +43,13 @@ class PublisherRegistry:
         self.prefix, self.is_client = prefix, is_client
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
-        self._publishers: dict[Address, Publisher] = {}
+        self.publishers: dict[Address, Publisher] = {}  # the open ones
         self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
         self._schema_key = partial(schema_key, session=str(session.zid()), prefix=prefix)
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
         self._shared: set[str] = set()
         self._lock = threading.Lock()
-
-    @property
-    def publishers(self) -> list[Publisher]:
-        """All open publishers."""
-        return list(self._publishers.values())
 
     def publisher(
         self,
@@ -76,30 +71,26 @@ class PublisherRegistry:
             expected = f"a definition from nedbus.define_msg, or one of {', '.join(BY_TOPIC)}"
             raise AddressError("topic", address.topic, expected)
         with self._lock:
-            if address in self._publishers:
+            if address in self.publishers:
                 raise AddressInUseError(address)
-            vehicle = address.vehicle
+            vehicle, prefix = address.vehicle, self.prefix
             if vehicle not in self._matched:
                 selection = Selection(vehicle=vehicle)
-                self._directories[vehicle] = VehicleDirectory(selection, prefix=self.prefix)
-                key_expr = selection.rate_key_expr(ANY, prefix=self.prefix)
-                self._matched[vehicle] = MatchingListener(self._session, key_expr)
+                tokens, rates = selection.alive_key_expr(prefix=prefix), selection.rate_key_expr(ANY, prefix=prefix)
+                self._directories[vehicle] = VehicleDirectory(tokens, prefix=prefix)
+                self._matched[vehicle] = MatchingListener(self._session, rates)
             matched = self._matched[vehicle]
-            publisher = self._publishers[address] = Publisher(
+            publisher = self.publishers[address] = Publisher(
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
             self._queries.answer(f"{self.prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
             # A key of its own: routers take quadratic time for one that all sessions declare.
             self._queries.answer(self._schema_key(ANY), partial(_reply_schemas, self._schema_key, self._definitions))
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
-            if len(self._definitions) > len(self._publishers) + _MAX_UNUSED:
-                used = {each.definition for each in self._publishers.values()}
+            if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
+                used = {each.definition for each in self.publishers.values()}
                 del self._definitions[next(key for key, each in self._definitions.items() if each not in used)]
         return publisher
-
-    def is_published(self, address: Address) -> bool:
-        """Return True if this registry has a publisher for an address."""
-        return address in self._publishers
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
         """Publish a rejection report for an address; values that JSON cannot represent become text."""
@@ -158,8 +149,8 @@ class PublisherRegistry:
     def forget(self, address: Address) -> None:
         """Free the address of a closed publisher."""
         with self._lock:
-            self._publishers.pop(address, None)
-            if not any(each.vehicle == address.vehicle for each in self._publishers):
+            self.publishers.pop(address, None)
+            if not any(each.vehicle == address.vehicle for each in self.publishers):
                 self._queries.end(f"{self.prefix}/{address.vehicle}/**")
                 self._matched.pop(address.vehicle).close()
                 del self._directories[address.vehicle]
@@ -167,7 +158,7 @@ class PublisherRegistry:
 
 def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:
     """Reply with the last messages of a vehicle; the registry would else stay alive, and its bus."""
-    for publisher in found.publishers if (found := registry()) is not None else ():
+    for publisher in tuple(found.publishers.values()) if (found := registry()) is not None else ():
         matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
         if matches and publisher.last is not None:
             payload, stamp, encoding = publisher.last

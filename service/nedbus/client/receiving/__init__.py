@@ -1,7 +1,7 @@
 """Receiving: from Zenoh's ring to the application, with every message accounted for."""
 
 from .decoder import Decoder
-from .layout_lookup import LayoutLookup
+from .layout_lookup import LayoutLookup, find_schemas
 from .max_rate import MaxRateQueue, MaxRateReceiver
 from .pending_queue import PendingQueue
 from .receiver import Receiver

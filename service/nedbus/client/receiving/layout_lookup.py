@@ -5,15 +5,20 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+from pydantic import Field, TypeAdapter
 
 from nedbus.client.closing import join_thread
-from nedbus.errors import NedbusError
+from nedbus.client.discovery import parse_replies
+from nedbus.errors import NedbusError, UnknownLayoutError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus_msgs import MESSAGES, Codec, Definition, UnknownLayoutError, codec_of, define, field_type
+from nedbus.transport import MAX_ANSWERS, Session, ask, wait_for_answers
+from nedbus_msgs import MESSAGES, Codec, Definition, codec_of, define, field_type, schema_key, short_hash
 
 _log = logging.getLogger(__name__)
 
@@ -25,14 +30,14 @@ _MAX_UNKNOWN: Final = 64  # messages and layouts per query, and those that wait 
 _MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the first one may be asked for again
 _PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s until the same is asked for again, by failed queries
 _PACE: Final = 0.2  # s between a query without a result and the next one
+_MAX_REPLY_FIELDS: Final = 256  # per layout
+_MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
 _RECOVERY: Final = 0.1  # of the time since then becomes patience again, so that no peer can keep readers waiting
 
+# A message, and the number of a newer layout or, for a message without a file, the hash of its definition.
 Wanted = tuple[str, int | str]
-"""A message, and the number of a newer layout or, for a message without a file, the hash of its definition."""
-
-Schemas = Mapping[Wanted, Mapping[str, str]]
-"""Descriptions by publishers: field name to type."""
+Schemas = Mapping[Wanted, Mapping[str, str]]  # descriptions by publishers: field name to type
 
 
 class LayoutLookup:
@@ -193,3 +198,46 @@ class LayoutLookup:
         extra = about("newer-layout")
         _log.warning("layout %d of %s is newer than this reader; not read: %s", number, name, ignored, extra=extra)
         return True
+
+
+@dataclass(slots=True)
+class _Field:
+    name: str
+    type: str
+
+
+@dataclass(slots=True)
+class _Layout:
+    wire: int
+    fields: Annotated[list[_Field], Field(max_length=_MAX_REPLY_FIELDS)]
+
+
+_LAYOUT: Final = TypeAdapter(_Layout)
+
+
+def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
+    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
+
+    Returns once all are found: a publisher that is stopped, or behind a bad link, does not delay it.
+    """
+    found: dict[Wanted, dict[str, str]] = {}
+    keys = {
+        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
+    }
+    queries = [ask(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
+    replies = islice(wait_for_answers(queries), MAX_ANSWERS)
+    for key, content in parse_replies(reply.ok for reply in replies if reply.ok is not None):
+        name = key.rpartition("/")[2]
+        layouts = content.get("layouts") if isinstance(content, dict) else None
+        for layout in layouts[:_MAX_REPLY_LAYOUTS] if isinstance(layouts, list) else ():
+            with suppress(ValueError):
+                parsed = _LAYOUT.validate_python(layout)
+                fields = {field.name: field.type for field in parsed.fields}
+                # The hash of what the peer describes, not what it claims.
+                types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
+                which = short_hash(name, types) if types else parsed.wire
+                if len(fields) == len(parsed.fields) and (name, which) in wanted:
+                    found.setdefault((name, which), fields)
+        if len(found) == len(wanted):
+            break
+    return found

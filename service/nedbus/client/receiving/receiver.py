@@ -200,18 +200,16 @@ class Receiver:
             while self._take_link() is not None:
                 self._queue.on_link()
             while (query := self._take_query()) is not None:
-                self._take_request(query)
+                self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
+                key, get = str(query.key_expr), query.parameters.get
+                publisher, number = get("publisher"), get("number") or ""
+                if not (publisher and number.isdecimal() and len(number) <= _MAX_DIGITS):
+                    continue  # dropping the query ends it
+                reply, stream_key = partial(_reply, query, key, self._queue), key.removesuffix(ack_key(""))
+                request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
+                self._queue.acknowledge(request, drained=self._idle)
         except zenoh.ZError:  # undeclared
             pass
-
-    def _take_request(self, query: zenoh.Query) -> None:
-        self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
-        key, get = str(query.key_expr), query.parameters.get
-        publisher, number = get("publisher"), get("number") or ""
-        if publisher and number.isdecimal() and len(number) <= _MAX_DIGITS:  # otherwise dropping the query ends it
-            reply, stream_key = partial(_reply, query, key, self._queue), key.removesuffix(ack_key(""))
-            request = AckRequest(stream_key, publisher, int(number), get("read") == "1", reply)
-            self._queue.acknowledge(request, drained=self._idle)
 
 
 def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:

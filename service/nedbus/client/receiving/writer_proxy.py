@@ -136,14 +136,15 @@ class WriterProxy:
             self._release()
             if over:
                 self.unresponsive = request.first_available is None
-                self._give_up(last)
+                self.give_up(last)
             request.last_answered = False
             request.due = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
 
-    def give_up(self) -> None:
-        """Count all gaps as lost and deliver the messages that were held back."""
-        if self.request is not None:
-            self._give_up(self.request.stop)
+    def give_up(self, last: int = NUMBERS) -> None:
+        """Count gaps up to number `last` as lost, and deliver the messages held back behind them."""
+        while self.request is not None and self.expected <= last:
+            self._count_gap(min(self.held, default=self.request.stop))
+            self._release()
 
     def has(self, number: int) -> bool:
         """Return True if this message has arrived or counts as lost."""
@@ -158,7 +159,7 @@ class WriterProxy:
             request.probe = request.candidate = lowest
         else:
             request.probe = None
-            self._give_up(lowest - 1)
+            self.give_up(lowest - 1)
 
     def _hold(self, number: int, arrival: Arrival) -> None:
         if number in self.held:
@@ -183,11 +184,6 @@ class WriterProxy:
             self.account.lost += lost
             self.stream.gap += lost
         self.expected = number
-
-    def _give_up(self, last: int) -> None:
-        while self.request is not None and self.expected <= last:
-            self._count_gap(min(self.held, default=self.request.stop))
-            self._release()
 
     def _deliver(self, arrival: Arrival) -> None:
         self.expected = (self.expected + 1) % NUMBERS

@@ -32,7 +32,6 @@ from nedbus.transport import (
     node_token,
     open_client,
     px4_publishers_key_expr,
-    subscription_token,
     while_open,
 )
 from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
@@ -194,7 +193,7 @@ class Px4ZenohNode:
             if key.domain not in self._nodes:
                 self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
             self._entities += 1
-            self._subscriptions[key] = self._declare(subscription_token(key, self._zid, self._node, self._entities))
+            self._subscriptions[key] = self._declare(key.token("MS", self._zid, self._node, self._entities))
         elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
             with suppress(zenoh.ZError):  # the session may be closed already
                 self._subscriptions.pop(token.key).undeclare()

@@ -1,4 +1,4 @@
-"""Stream health: rate, jitter, latency, age, gaps, order, reboots, resets and flags; no I/O.
+"""Stream health: rate, jitter, latency, age, gaps, order, reboots, resets and flags, and the stream's state; no I/O.
 
 Used by `nedbus hz`, the status of services and scripts.
 Rates and ages use a monotonic clock, as the wall clock may be set at any time.
@@ -12,12 +12,17 @@ from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Final, cast
+from typing import Final, Literal, cast, get_args
 
-from nedbus.client.sample import Sample
+from nedbus import clock
+from nedbus.events import to_age
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
+from nedbus_msgs import DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, describe_flags, get_topic
+
+from .sample import Sample
+
+StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"]  # worst first
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +36,9 @@ _SELDOM: Final = 1.0  # Hz; a topic without a file that comes less often may be 
 _COUNTER_MODULUS: Final = 256  # modulus of reset counters
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
 _MAX_STREAMS: Final = 4096  # per monitor
+_LATE: Final = 1.0  # s; a higher latency makes a stream slow
+_SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
+_ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token is gone
 _FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
 
 
@@ -133,7 +141,7 @@ class StreamHealth:
 
     def __init__(self, topic: str) -> None:
         self._topic = get_topic(topic)
-        self._is_position = BY_TOPIC.get(topic) is DEFAULT  # the message that has flags and reset counters
+        self._is_position = topic in DEFAULT.topics  # the message that has flags and reset counters
         self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
@@ -162,9 +170,14 @@ class StreamHealth:
             missing = DOUBT_FLAGS - message.keys() if self._is_position else ()
         else:
             timestamp, *seen = (getattr(message, name) for name in names)
-        if received - self._window.start >= _WINDOW:
-            self._end_window(received)
         window = self._window
+        if received - window.start >= _WINDOW:
+            if window.messages:
+                self._last_window = window
+            if (mean := window.mean) > 0:  # capped against bursts, such as recovered messages
+                usual = self._usual_rate or 1 / mean
+                self._usual_rate = usual + _SMOOTHING * (min(1 / mean, 2 * usual) - usual)
+            window = self._window = _Window(received)
         self._messages += 1
         self._lost += lost
         window.messages += 1
@@ -210,16 +223,6 @@ class StreamHealth:
             resets=dict(self._resets),
             on_change=self._topic.on_change,
         )
-
-    def _end_window(self, received: int) -> None:
-        """Start the next window; the usual rate is capped against bursts, such as recovered messages."""
-        window, self._window = self._window, _Window(received)
-        if window.messages:
-            self._last_window = window
-        if (mean := window.mean) > 0:
-            rate = 1 / mean
-            usual = self._usual_rate or rate
-            self._usual_rate = usual + _SMOOTHING * (min(rate, 2 * usual) - usual)
 
     def _add_time(self, timestamp: int) -> bool:
         """Track PX4's time; return True if it is the first one or stepped back in a reboot."""
@@ -281,3 +284,58 @@ class Monitor:
     def forget(self, address: Address) -> None:
         """Remove a stream; it starts over if it comes back."""
         self._streams.pop(address, None)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamState:
+    """Current state of a stream, with a reason unless it is ok."""
+
+    name: StateName
+    reason: str = ""
+
+    @property
+    def severity(self) -> int:
+        """Index among the states; 0 is the worst."""
+        return get_args(StateName).index(self.name)
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}" if self.reason else self.name
+
+
+def stream_state(health: Health, *, publishers: int | None = None, connected: bool = True) -> StreamState:
+    """Return the state of a stream with the given health.
+
+    `publishers`: the number of publishers with a liveliness token; None if unknown.
+    `connected`: True if there is a link to the router.
+    """
+    if not connected:
+        return StreamState("disconnected", "no link")
+    age = health.age
+    if age is not None and age > _ABSENT and publishers == 0:
+        return StreamState("gone", f"last message {to_age(age)} ago")
+    if age is not None and age > health.stale_after:
+        return StreamState("stale", f"nothing for {to_age(age)}")
+    if publishers is not None and publishers > 1:
+        return StreamState("duplicate", f"{publishers} publishers: stop one, or give it another vehicle")
+    reasons = []
+    usual = None if health.on_change else health.usual_rate
+    if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
+        reasons.append(f"{health.rate:.1f} Hz, usually {usual:.0f}")
+    if health.latency is not None and health.latency > _LATE:
+        reasons.append(f"{to_age(health.latency)} late, or clocks differ")
+    return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")
+
+
+def describe_stream(health: Health, state: StreamState) -> str:
+    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
+    doubts = "ok" if health.flags is None else describe_flags(health.flags)
+    counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
+    events = [f"{count} {name}" for count, name in counts if count and state.name != "duplicate"]
+    return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
+
+
+def health_of_last(sample: Sample[Message]) -> Health:
+    """Return the health of a stream with only its last message known; the age is by the wall clock."""
+    stream = StreamHealth(sample.topic)
+    stream.add(sample.message, received=0, missing=sample.missing)
+    return stream.snapshot(0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent))

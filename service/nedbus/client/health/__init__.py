@@ -1,1 +1,0 @@
-"""Stream health, computed from samples: rates, gaps, flags and ages."""
