@@ -57,7 +57,7 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
 
 
 def _check_reading(seen: Observation) -> Finding:
-    if seen.flowing or seen.ages:
+    if seen.delays or seen.ages:
         return Finding("read", "", "ok", "this client may read: it receives messages")
     published = _published(seen)
     if not published:
@@ -136,7 +136,7 @@ def _check_log_stream(name: str, log: LogStreamStatus) -> Iterator[Finding]:
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
     """Yield the findings on the addresses of all vehicles, or of one."""
     vehicle = seen.vehicle
-    arrived = seen.flowing
+    arrived = seen.delays.keys()
     known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
@@ -170,8 +170,7 @@ def _check_states(seen: Observation) -> Iterator[Finding]:
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
-    name, key = str(address), address.key(prefix=seen.prefix)
-    stream = seen.streams.get(key)
+    name = str(address)
     age, rate = seen.ages.get(address), get_topic(address.topic).rate
     if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
         last = "no message yet" if address not in seen.ages else "its last message has no timestamp"
@@ -180,9 +179,9 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
         advice = "its publisher is running: check its input, the source of a service or the loop of a script"
         state: State = "wrong" if address in seen.ages else "warning"  # topics of a replay may begin later
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
-    if stream is not None and stream.error:
+    if error := seen.errors.get(address):
         advice = "check that the publisher of this key is nedbus; a newer layout needs a newer nedbus here"
-        yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {stream.error[:_MAX_TEXT]}", advice)
+        yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {error[:_MAX_TEXT]}", advice)
     if (publishers := seen.alive[address]) > 1:
         advice = "readers receive a mixture of both: give one of them another --vehicle, or stop it"
         yield Finding("vehicle", name, "wrong", f"{publishers} publishers of this address", advice)
@@ -195,10 +194,10 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         for each in seen.services
         if each.now is not None and abs(each.now) < _MAX_TIME  # NaN is not
     }
-    for stream in seen.streams.values():
-        if stream.address is not None and stream.delay is not None:
-            error = 0.0 if stream.delay < 0 else _CLOCK_WARNING  # a positive delay includes that of the network
-            clocks[f"publisher of {stream.address}"] = (-stream.delay, error)
+    for address, delay in seen.delays.items():
+        if delay is not None:
+            error = 0.0 if delay < 0 else _CLOCK_WARNING  # a positive delay includes that of the network
+            clocks[f"publisher of {address}"] = (-delay, error)
     off = {name: offset for name, (offset, error) in clocks.items() if abs(offset) > _CLOCK_WARNING + error}
     if len(off) > 1 and len(off) == len(clocks) and max(off.values()) - min(off.values()) < _CLOCK_WARNING:
         middle = sorted(off.values())[len(off) // 2]
