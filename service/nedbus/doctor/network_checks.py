@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import LogStreamStatus, SourceStatus
+from nedbus.client import SourceStatus
 from nedbus.events import by_vehicle, since_text, to_age
 from nedbus_msgs import Address, get_topic
 
@@ -112,7 +112,14 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         seen = f"published by vehicles, but not carried: {list_names(source.not_carried, 20)}"
         yield Finding("source", name, "ok", seen, advice)
     for log in source.log_streams:
-        yield from _check_log_stream(f"{name} vehicle {brief(log.vehicle)}", log)
+        stream = f"{name} vehicle {brief(log.vehicle)}"
+        if log.reason:
+            seen = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
+            yield Finding("source", stream, "warning", seen, "see 'The ULog stream' in docs/live.md")
+        if log.gaps:
+            seen = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages in {log.gaps} gaps"
+            advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
+            yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
         advice = "check that the vehicle is on and its link is up; they recover by themselves"
         seen = f"no more messages of {list_names(stale)}"
@@ -123,16 +130,6 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         yield Finding("source", name, "warning", f"{source.rejected} messages rejected{why}", advice)
 
 
-def _check_log_stream(name: str, log: LogStreamStatus) -> Iterator[Finding]:
-    if log.reason:
-        text = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
-        yield Finding("source", name, "warning", text, "see 'The ULog stream' in docs/live.md")
-    if log.gaps:
-        text = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages in {log.gaps} gaps"
-        advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
-        yield Finding("source", name, "warning", text, advice)
-
-
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
     """Yield the findings on the addresses of all vehicles, or of one."""
     vehicle = seen.vehicle
@@ -140,7 +137,13 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
-    yield from _check_states(seen)
+    for name, report in sorted(by_vehicle(seen.accounts).items()):
+        now, told = report.now, report.vehicles[name]
+        if vehicle in (None, name) and told.severity != "info" and not told.is_forgotten(now):
+            severity: State = "wrong" if told.severity == "bad" else "warning"
+            advice = f"see the events before it with 'nedbus why --vehicle {name}'"
+            text = f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}"
+            yield Finding("vehicle", name, severity, text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # else this client may read nothing at all
@@ -156,17 +159,6 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
         text = f"{'no vehicle' if vehicle is None else 'not'} seen under {seen.prefix}/"
         state: State = "warning" if vehicle is None else "wrong"
         yield Finding("vehicle", vehicle or "", state, text, advice)
-
-
-def _check_states(seen: Observation) -> Iterator[Finding]:
-    """Yield the vehicles that services report with severity bad or watch."""
-    for name, report in sorted(by_vehicle(seen.accounts).items()):
-        now, told = report.now, report.vehicles[name]
-        if seen.vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
-            continue
-        state: State = "wrong" if told.severity == "bad" else "warning"
-        advice = f"see the events before it with 'nedbus why --vehicle {name}'"
-        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}", advice)
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
