@@ -212,25 +212,20 @@ def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: s
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
     """Yield other prefixes and topics of ROS 2, which readers of this prefix do not receive."""
-    prefixes = sorted({prefix for key in seen.elsewhere if (prefix := _prefix_of(key))})
-    for prefix in prefixes[:5]:
-        advice = (
-            f"to read them, use --prefix {prefix} or NEDBUS_PREFIX={prefix}, or correct the prefix of the publisher"
-        )
+    prefixes = set()
+    for key in seen.elsewhere:
+        vehicle, alive, _ = key.partition("/@alive/")
+        before = vehicle.split("/")[: -1 if alive else -2]  # vehicle and topic
+        if before and not before[0].isdecimal():  # `<domain>/fmu/out/vehicle_local_position` belongs to ROS 2
+            prefixes.add("/".join(before))
+    for prefix in sorted(prefixes - {""})[:5]:
+        advice = f"use --prefix {prefix} or NEDBUS_PREFIX={prefix} to read them, or correct the publisher's prefix"
         text = f"messages are published under {prefix}/, but the prefix here is {seen.prefix}/"
         yield Finding("prefix", prefix, "warning", text, advice)
     if seen.ros2 and not any(each.source.startswith("px4-zenoh:") for each in seen.sources):
         topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
         advice = "'nedbus serve --source px4-zenoh:' bridges them"
         yield Finding("ros2", "", "warning", f"ROS 2 or PX4 publishes {topics}, but no service bridges it", advice)
-
-
-def _prefix_of(key: str) -> str:
-    """Return the prefix of a nedbus key: the chunks before vehicle and topic."""
-    vehicle, alive, _ = key.partition("/@alive/")
-    before = vehicle.split("/")[: -1 if alive else -2]
-    # Keys such as `<domain>/fmu/out/vehicle_local_position` belong to ROS 2.
-    return "" if not before or before[0].isdecimal() else "/".join(before)
 
 
 NETWORK_CHECKS: Final = (
