@@ -15,9 +15,6 @@ from .model.message import Message
 from .model.px4_types import FieldType, Timestamp
 from .model.rules import Rule
 
-PX4: Final = "PX4"
-"""Name of the only layout of a message without a file."""
-
 _NAME = re.compile(r"[A-Z][A-Za-z0-9]{0,63}")
 _FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _MOST: Final = 256  # fields per message; PX4's largest has a third of that
@@ -72,6 +69,6 @@ def define(
         for name, kind in types.items()
     }
     model = create_model(name, __base__=Message, __doc__="A message of PX4 that has no file in nedbus.", **annotated)
-    model.LAYOUTS, model.RULES = (Layout(PX4, "*"),), rules
+    model.LAYOUTS, model.RULES = (Layout("PX4", "*"),), rules
     model.DEFINITION = Definition(model)
     return model.DEFINITION

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from pydantic import ValidationError
 
-from nedbus_msgs import DEFAULT, VehicleLocalPosition, field_type
+from nedbus_msgs import VehicleLocalPosition, field_type
 from tests.flights.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
 
 from .strategies import DATA, bits, messages
@@ -45,7 +45,7 @@ def test_table_has_px4s_layouts() -> None:
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
         ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),
     ]  # fmt: skip
-    assert {number: layout.name for number, layout in DEFAULT.wire_layouts.items()} == {0: "V0", 1: "1.16"}
+    assert {layout.name: layout.wire for layout in LAYOUTS.values() if layout.wire is not None} == {"V0": 0, "1.16": 1}
     assert [row["name"] for row in table] == list(LAYOUTS)
     assert CURRENT.fields == tuple(FIELD_TYPES)
     assert all(len(set(layout.fields)) == len(layout.fields) for layout in LAYOUTS.values())

@@ -202,8 +202,8 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
         raise reject("not an array that starts with the number of its layout")
     layout, *values = array
-    known = definition.wire_layouts
-    names = known[layout].fields if layout in known else newer.get(layout)
+    known = {each.wire: each.fields for each in definition.layouts.values() if each.wire is not None}
+    names = {**newer, **known}.get(layout)
     if names is None:
         raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
     if len(values) != len(names):

@@ -100,11 +100,6 @@ class Definition(Generic[M_co]):
         return found
 
     @cached_property
-    def wire_layouts(self) -> Mapping[int, Layout]:
-        """The layouts that payloads may have, by number on the wire."""
-        return {layout.wire: layout for layout in self.layouts.values() if layout.wire is not None}
-
-    @cached_property
     def current(self) -> Layout:
         """The layout with all fields of the model."""
         return list(self.layouts.values())[-1]
@@ -172,7 +167,18 @@ class Definition(Generic[M_co]):
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
         """Convert to an older layout, in its field order; fields that the model lacks are "not provided"."""
-        return {name: self._down(name, kind, values) for name, kind in layout.types.items()}
+        found: dict[str, object] = {}
+        for name, kind in layout.types.items():
+            value, old = values.get(name, kind.absent), self.older.get(name)
+            if old:
+                base, index = old.places[0]
+                value = values[base] if index is None else values[base][index]
+                value = old.down(value) if old.down else value
+            if self.types.get(name) != kind and not (kind.length or kind.is_float):
+                least, greatest = kind.limits
+                value = value if least <= value <= greatest else kind.absent
+            found[name] = value
+        return found
 
     def meaning(self, name: str) -> str:
         """Return unit and meaning of a field in any layout."""
@@ -237,17 +243,6 @@ class Definition(Generic[M_co]):
         old = self.older[name]
         base, index = old.places[0]
         return name, field_type(old.type or (str(self.types[base]) if index is None else self.types[base].base))
-
-    def _down(self, name: str, kind: FieldType, values: Mapping[str, Any]) -> object:
-        if self.types.get(name) is kind:
-            return values[name]
-        value = values.get(name, kind.absent)
-        if old := self.older.get(name):
-            base, index = old.places[0]
-            value = values[base] if index is None else values[base][index]
-            value = old.down(value) if old.down else value
-        least, greatest = kind.limits
-        return value if kind.length or kind.is_float or least <= value <= greatest else kind.absent
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:

@@ -45,8 +45,13 @@ class Message(BaseModel):
 
         def __init__(self, /, **fields: object) -> None:
             definition = self.DEFINITION
+            validation = definition.validation
             # A subclass may have its own validators, which only Pydantic runs.
-            values = definition.validation.validate_fields(fields) if type(self) is definition.model else None
+            row = validation.row_of(fields) if type(self) is definition.model else None
+            try:
+                values = None if row is None else validation.name_rounded(row)
+            except OverflowError:
+                values = None
             if values is None:
                 super().__init__(**fields)
             else:

@@ -15,8 +15,7 @@ _T = TypeVar("_T")
 NAN: Final = math.nan
 YEAR_2000: Final = 946_684_800_000_000  # us; an earlier time is since boot
 _YEAR_2100: Final = 4_102_444_800_000_000
-LONGEST_ARRAY: Final = 1024
-"""Elements of the longest array allowed; PX4's longest has 512."""
+_LONGEST_ARRAY: Final = 1024  # elements; PX4's longest has 512
 
 
 class Base(NamedTuple):
@@ -154,8 +153,8 @@ def field_type(text: str) -> FieldType:
         base = ALIASES.get(base, base)
     if base not in BASES:
         raise ValueError(f"{base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
-    if length and not 0 < int(length) <= LONGEST_ARRAY:
-        raise ValueError(f"an array of {int(length)}: expected 1 to {LONGEST_ARRAY} elements")
+    if length and not 0 < int(length) <= _LONGEST_ARRAY:
+        raise ValueError(f"an array of {int(length)}: expected 1 to {_LONGEST_ARRAY} elements")
     return FieldType(f"{base}[{int(length)}]" if length else base)
 
 

@@ -69,14 +69,6 @@ class Validation:
         except KeyError:  # an unknown field in place of a missing one
             return None
 
-    def validate_fields(self, fields: Mapping[str, object]) -> dict[str, object] | None:
-        """Return all fields in order, validated and rounded to float32; None if the model has to decide."""
-        row = self.row_of(fields)
-        try:
-            return None if row is None else self.name_rounded(row)
-        except OverflowError:
-            return None
-
     def name(self, row: Values) -> dict[str, object]:
         """Return the values of all fields by name."""
         values = self.template.copy()

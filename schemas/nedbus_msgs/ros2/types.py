@@ -33,10 +33,12 @@ def dds_type(name: str) -> str:
 @cache
 def ros2_types() -> Mapping[str, Definition[Any]]:
     """Return the definition for each ROS 2 type of a known message, including those of PX4's translation node."""
-    types = {ros2_type(definition): definition for definition in MESSAGES.values()}
-    for definition in MESSAGES.values():
-        types |= {alias: definition for layout in definition.layouts.values() for alias in layout.aliases}
-    return types
+    return {
+        name: definition
+        for definition in MESSAGES.values()
+        for layout in definition.layouts.values()
+        for name in (ros2_type(definition), *layout.aliases)
+    }
 
 
 def hash_of(layout: Layout, ros2_type: str) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import LogStreamStatus, SourceStatus
+from nedbus.client import SourceStatus
 from nedbus.events import by_vehicle, since_text, to_age
 from nedbus_msgs import Address, get_topic
 
@@ -57,7 +57,7 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
 
 
 def _check_reading(seen: Observation) -> Finding:
-    if seen.flowing or seen.ages:
+    if seen.delays or seen.ages:
         return Finding("read", "", "ok", "this client may read: it receives messages")
     published = _published(seen)
     if not published:
@@ -112,7 +112,14 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         seen = f"published by vehicles, but not carried: {list_names(source.not_carried, 20)}"
         yield Finding("source", name, "ok", seen, advice)
     for log in source.log_streams:
-        yield from _check_log_stream(f"{name} vehicle {brief(log.vehicle)}", log)
+        stream = f"{name} vehicle {brief(log.vehicle)}"
+        if log.reason:
+            seen = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
+            yield Finding("source", stream, "warning", seen, "see 'The ULog stream' in docs/live.md")
+        if log.gaps:
+            seen = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages in {log.gaps} gaps"
+            advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
+            yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
         advice = "check that the vehicle is on and its link is up; they recover by themselves"
         seen = f"no more messages of {list_names(stale)}"
@@ -123,24 +130,20 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         yield Finding("source", name, "warning", f"{source.rejected} messages rejected{why}", advice)
 
 
-def _check_log_stream(name: str, log: LogStreamStatus) -> Iterator[Finding]:
-    if log.reason:
-        text = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
-        yield Finding("source", name, "warning", text, "see 'The ULog stream' in docs/live.md")
-    if log.gaps:
-        text = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages in {log.gaps} gaps"
-        advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
-        yield Finding("source", name, "warning", text, advice)
-
-
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
     """Yield the findings on the addresses of all vehicles, or of one."""
     vehicle = seen.vehicle
-    arrived = seen.flowing
+    arrived = seen.delays.keys()
     known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
-    yield from _check_states(seen)
+    for name, report in by_vehicle(seen.accounts).items():
+        now, told = report.now, report.vehicles[name]
+        if vehicle in (None, name) and told.severity != "info" and not told.is_forgotten(now):
+            severity: State = "wrong" if told.severity == "bad" else "warning"
+            advice = f"see the events before it with 'nedbus why --vehicle {name}'"
+            text = f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}"
+            yield Finding("vehicle", name, severity, text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # else this client may read nothing at all
@@ -158,20 +161,8 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
         yield Finding("vehicle", vehicle or "", state, text, advice)
 
 
-def _check_states(seen: Observation) -> Iterator[Finding]:
-    """Yield the vehicles that services report with severity bad or watch."""
-    for name, report in by_vehicle(seen.accounts).items():
-        now, told = report.now, report.vehicles[name]
-        if seen.vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
-            continue
-        state: State = "wrong" if told.severity == "bad" else "warning"
-        advice = f"see the events before it with 'nedbus why --vehicle {name}'"
-        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}", advice)
-
-
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
-    name, key = str(address), address.key(prefix=seen.prefix)
-    stream = seen.streams.get(key)
+    name = str(address)
     age, rate = seen.ages.get(address), get_topic(address.topic).rate
     if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
         last = "no message yet" if address not in seen.ages else "its last message has no timestamp"
@@ -180,9 +171,9 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
         advice = "its publisher is running: check its input, the source of a service or the loop of a script"
         state: State = "wrong" if address in seen.ages else "warning"  # topics of a replay may begin later
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
-    if stream is not None and stream.error:
+    if error := seen.errors.get(address):
         advice = "check that the publisher of this key is nedbus; a newer layout needs a newer nedbus here"
-        yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {stream.error[:_MAX_TEXT]}", advice)
+        yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {error[:_MAX_TEXT]}", advice)
     if (publishers := seen.alive[address]) > 1:
         advice = "readers receive a mixture of both: give one of them another --vehicle, or stop it"
         yield Finding("vehicle", name, "wrong", f"{publishers} publishers of this address", advice)
@@ -195,10 +186,10 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         for each in seen.services
         if each.now is not None and abs(each.now) < _MAX_TIME  # NaN is not
     }
-    for stream in seen.streams.values():
-        if stream.address is not None and stream.delay is not None:
-            error = 0.0 if stream.delay < 0 else _CLOCK_WARNING  # a positive delay includes that of the network
-            clocks[f"publisher of {stream.address}"] = (-stream.delay, error)
+    for address, delay in seen.delays.items():
+        if delay is not None:
+            error = 0.0 if delay < 0 else _CLOCK_WARNING  # a positive delay includes that of the network
+            clocks[f"publisher of {address}"] = (-delay, error)
     off = {name: offset for name, (offset, error) in clocks.items() if abs(offset) > _CLOCK_WARNING + error}
     if len(off) > 1 and len(off) == len(clocks) and max(off.values()) - min(off.values()) < _CLOCK_WARNING:
         middle = sorted(off.values())[len(off) // 2]
@@ -221,25 +212,20 @@ def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: s
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
     """Yield other prefixes and topics of ROS 2, which readers of this prefix do not receive."""
-    prefixes = sorted({prefix for key in seen.elsewhere if (prefix := _prefix_of(key))})
-    for prefix in prefixes[:5]:
-        advice = (
-            f"to read them, use --prefix {prefix} or NEDBUS_PREFIX={prefix}, or correct the prefix of the publisher"
-        )
+    prefixes = set()
+    for key in seen.elsewhere:
+        vehicle, alive, _ = key.partition("/@alive/")
+        before = vehicle.split("/")[: -1 if alive else -2]  # vehicle and topic
+        if before and not before[0].isdecimal():  # `<domain>/fmu/out/vehicle_local_position` belongs to ROS 2
+            prefixes.add("/".join(before))
+    for prefix in sorted(prefixes - {""})[:5]:
+        advice = f"use --prefix {prefix} or NEDBUS_PREFIX={prefix} to read them, or correct the publisher's prefix"
         text = f"messages are published under {prefix}/, but the prefix here is {seen.prefix}/"
         yield Finding("prefix", prefix, "warning", text, advice)
     if seen.ros2 and not any(each.source.startswith("px4-zenoh:") for each in seen.sources):
         topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
         advice = "'nedbus serve --source px4-zenoh:' bridges them"
         yield Finding("ros2", "", "warning", f"ROS 2 or PX4 publishes {topics}, but no service bridges it", advice)
-
-
-def _prefix_of(key: str) -> str:
-    """Return the prefix of a nedbus key: the chunks before vehicle and topic."""
-    vehicle, alive, _ = key.partition("/@alive/")
-    before = vehicle.split("/")[: -1 if alive else -2]
-    # Keys such as `<domain>/fmu/out/vehicle_local_position` belong to ROS 2.
-    return "" if not before or before[0].isdecimal() else "/".join(before)
 
 
 NETWORK_CHECKS: Final = (

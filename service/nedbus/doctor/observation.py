@@ -40,19 +40,6 @@ _RING: Final = 16_384  # samples buffered per subscription
 
 
 @dataclass(slots=True)
-class Stream:
-    """Messages on one key; `address` is None for a key that is not a nedbus key.
-
-    `delay`: minimum time from sent to received, by the clocks of both hosts [s]; None without timestamps.
-    `error`: the last decoding error.
-    """
-
-    address: Address | None
-    delay: float | None = None
-    error: str = ""
-
-
-@dataclass(slots=True)
 class Observation:
     """A network as seen by this client, and the scope of the examination.
 
@@ -60,7 +47,8 @@ class Observation:
     `services`: their statuses, with the clocks as at `asked` +- `error` by ours [s since the epoch].
     `alive`: number of publishers of each address, by tokens.
     `ages`: age of the last message of each, at the end [s]; None without a timestamp.
-    `streams`: messages by key; `listened`: duration of the observation [s].
+    `delays`: minimum time from sent to received of each with a message, by the clocks of both hosts [s]; None without
+    timestamps. `errors`: the last decoding error of each. `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes; `ros2`: publishers of ROS 2 topics.
     `routers`: routers that disclose their sessions; `accounts`: histories of vehicles kept by services.
     """
@@ -75,7 +63,8 @@ class Observation:
     accounts: list[AccountReport] = field(default_factory=list)
     alive: Counter[Address] = field(default_factory=Counter)
     ages: dict[Address, float | None] = field(default_factory=dict)
-    streams: dict[str, Stream] = field(default_factory=dict)
+    delays: dict[Address, float | None] = field(default_factory=dict)
+    errors: dict[Address, str] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
     ros2: list[PublisherToken] = field(default_factory=list)
     routers: list[RouterState] = field(default_factory=list)
@@ -85,11 +74,6 @@ class Observation:
     def sources(self) -> list[SourceStatus]:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
-
-    @property
-    def flowing(self) -> set[Address]:
-        """Addresses with at least one received message."""
-        return {each.address for each in self.streams.values() if each.address is not None}
 
     def observe(self, session: Session) -> None:
         """Query, and listen for little more than 3 s."""
@@ -108,14 +92,13 @@ class Observation:
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             if (address := self._address_of(str(sample.key_expr))) is not None:
-                ages = _age_of(sample), self.ages.get(address)  # several publishers or a storage may answer
-                self.ages[address] = min((age for age in ages if age is not None), default=None)
+                # Several publishers or a storage may answer.
+                self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
         tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add(take_messages())
-        for stream in self.streams.values():
-            stream.delay = None  # these messages waited during the queries, and appear delayed
+        self.delays = dict.fromkeys(self.delays)  # these messages waited during the queries, and appear delayed
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)
@@ -127,22 +110,18 @@ class Observation:
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
     def _add(self, samples: Iterable[RawSample]) -> None:
-        """Add received messages, but for those on keys beyond the limits."""
+        """Add received messages, but for those of addresses beyond the limit."""
         for sample in samples:
-            key = str(sample.key_expr)
-            if key not in self.streams:
-                if len(self.streams) >= _MAX_KEYS or len(key) > _MAX_KEY_LENGTH:
-                    continue
-                self.streams[key] = Stream(self._address_of(key))
-            stream, age = self.streams[key], _age_of(sample)
-            if age is not None:
-                stream.delay = age if stream.delay is None else min(age, stream.delay)
-            definition = BY_TOPIC.get(stream.address.topic) if stream.address is not None else None
+            address = self._address_of(str(sample.key_expr))
+            if address is None or (address not in self.delays and len(self.delays) >= _MAX_KEYS):
+                continue
+            self.delays[address] = _least(_age_of(sample), self.delays.get(address))
+            definition = BY_TOPIC.get(address.topic)
             if definition is not None and sample.kind == zenoh.SampleKind.PUT:
                 try:
                     codec_of(definition).decode(sample.payload.to_bytes())
                 except DecodeError as exc:
-                    stream.error = str(exc)
+                    self.errors[address] = str(exc)
 
     def _address_of(self, key: str) -> Address | None:
         return next(iter(_parse_each(partial(Address.from_key, prefix=self.prefix), [key])), None)
@@ -160,6 +139,10 @@ def _age_of(sample: RawSample) -> float | None:
     """Return the age of a sample by its publisher's clock [s]; None without a timestamp."""
     stamp = sample.timestamp
     return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9
+
+
+def _least(*ages: float | None) -> float | None:
+    return min((age for age in ages if age is not None), default=None)
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
