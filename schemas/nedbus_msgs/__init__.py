@@ -13,8 +13,7 @@ from .errors import (
     NedbusError,
     UnknownLayoutError,
 )
-from .flags import DOUBT_FLAGS, describe_flags, message_doubts
-from .messages.vehicle_local_position import VehicleLocalPosition
+from .messages.vehicle_local_position import DOUBT_FLAGS, VehicleLocalPosition, describe_flags, message_doubts
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
 from .model.message import Message

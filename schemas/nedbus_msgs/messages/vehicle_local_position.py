@@ -3,11 +3,17 @@
 Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition.msg` (1.16 to main).
 """
 
-from typing import ClassVar
+from collections.abc import Collection, Mapping
+from typing import ClassVar, Final
 
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.model import FLOAT32_PI, FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Uint8, Uint64, field, while_valid
+
+_VALID: Final = {"xy_valid": "xy", "z_valid": "z", "v_xy_valid": "vxy", "v_z_valid": "vz"}
+_WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # bad if set
+DOUBT_FLAGS: Final = (*_VALID, *_WARNINGS)
+"""The flags that can cast doubt on a position."""
 
 
 class VehicleLocalPosition(Message):
@@ -146,3 +152,30 @@ class VehicleLocalPosition(Message):
     def global_position(self) -> GlobalPosition | None:
         """Position as latitude, longitude [deg] [WGS84] and altitude [m]; None without position and origin."""
         return to_global(self) if self.position and self.origin else None
+
+
+def describe_flags(shares: Mapping[str, float]) -> str:
+    """Describe the flags that cast doubt on messages, given each flag's share of messages with it set (0 to 1).
+
+    "xy z invalid, dead reckoning" applies to all messages, "xy invalid 20 %" to some of them; "ok" if there is none.
+    The validity of a quantity without a share is unknown: "vz unknown", or "validity unknown" if no flag has one.
+    """
+    bad = {name: 1.0 - shares[name] for name in _VALID if name in shares}
+    bad |= {name: shares[name] for name in _WARNINGS if name in shares}
+    invalid = [label for name, label in _VALID.items() if bad.get(name, 0.0) >= 1.0]
+    unknown = [label for name, label in _VALID.items() if name not in shares]
+    texts = [f"{' '.join(invalid)} invalid"] if invalid else []
+    if unknown:
+        texts.append(f"{'validity' if len(unknown) == len(_VALID) else ' '.join(unknown)} unknown")
+    for name, share in bad.items():
+        text = _WARNINGS.get(name) or f"{_VALID[name]} invalid"
+        if 0.0 < share < 1.0:
+            texts.append(f"{text} {min(99, max(1, round(100 * share)))} %")
+        elif share >= 1.0 and name in _WARNINGS:
+            texts.append(text)
+    return ", ".join(texts) or "ok"
+
+
+def message_doubts(message: VehicleLocalPosition, missing: Collection[str] = ()) -> str:
+    """Describe the flags that cast doubt on one message, which lacks the `missing` fields; "ok" if there is none."""
+    return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS if name not in missing})

@@ -6,7 +6,7 @@ A layout is identified by its field names or its name, never by MESSAGE_VERSION,
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import cached_property
 from operator import attrgetter, itemgetter
@@ -48,18 +48,13 @@ class Row(tuple[Any, ...]):
 class Plan(NamedTuple):
     """Mapping from the fields of a layout to those of the model.
 
-    All keys are fields of the model. `names`: the field with the same value. `converted`: the field, and a function to
-    convert its value. `parts`: the fields with the elements of an array, None for an element without a field.
+    All keys are fields of the model, those of `provided`. `names`: the field with the same value.
+    `converted`: the fields, None for an element of an array without one, and a function of their values.
     """
 
+    provided: frozenset[str]
     names: Mapping[str, str]
-    converted: Mapping[str, tuple[str, Callable[[Any], Any]]]
-    parts: Mapping[str, tuple[str | None, ...]]
-
-    @property
-    def provided(self) -> frozenset[str]:
-        """The fields of the model that receive a value."""
-        return frozenset({*self.names, *self.converted, *self.parts})
+    converted: Mapping[str, tuple[Sequence[str | None], Callable[..., Any]]]
 
 
 class Definition(Generic[M_co]):
@@ -142,28 +137,23 @@ class Definition(Generic[M_co]):
 
         This is the current layout; if no PX4 layout has all fields, it is the PX4 layout with exactly these, if any.
         """
-        if self.current.name != ALL:
-            return self.current
-        return next((layout for layout in self.layouts.values() if layout.types.keys() == provided), self.current)
+        return self.current if self.current.name != ALL else self.find_layout(provided) or self.current
 
     @kept  # all messages of a stream have the same names
     def plan(self, names: tuple[str, ...]) -> Plan:
         """Return the mapping from these fields, of any PX4 release, to the model; unknown names are ignored."""
         direct: dict[str, str] = {name: name for name in names if name in self.types}
-        converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
-        parts: dict[str, list[str | None]] = {}
+        converted: dict[str, tuple[list[str | None], Callable[..., Any]]] = {}
         for old in (self.older[name] for name in names if name in self.older):
             for base, index in old.places:
-                if base in direct or base in converted:
-                    continue
-                if index is not None:
-                    parts.setdefault(base, [None] * self.types[base].values)[index] = old.name
-                elif old.up:
-                    converted[base] = old.name, old.up
-                else:
-                    direct[base] = old.name
+                if index is not None and base not in direct:
+                    converted.setdefault(base, ([None] * self.types[base].values, _elements))[0][index] = old.name
+                elif old.up and base not in direct:
+                    converted.setdefault(base, ([old.name], old.up))
+                elif base not in converted:
+                    direct.setdefault(base, old.name)
         in_order = {name: direct[name] for name in self.types if name in direct}
-        return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
+        return Plan(frozenset({*direct, *converted}), in_order, converted)
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
         """Convert to an older layout, in its field order; fields that the model lacks are "not provided"."""
@@ -260,19 +250,17 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
     """Convert the fields of any PX4 release to those of the model, as `upgrade_with` does, without validation."""
     plan = definition.plan(tuple(fields))
     upgraded = {name: fields[old] for name, old in plan.names.items()}
-    if plan.converted or plan.parts:
-        upgraded |= {name: _converted(convert, fields[old]) for name, (old, convert) in plan.converted.items()}
-        for name, olds in plan.parts.items():
-            upgraded[name] = tuple(NAN if old is None else fields[old] for old in olds)
+    for name, (olds, convert) in plan.converted.items():
+        values = [NAN if old is None else fields[old] for old in olds]
+        try:
+            upgraded[name] = convert(*values)
+        except (TypeError, OverflowError):  # not a number, which the model rejects
+            (upgraded[name],) = values
     return upgraded
 
 
-def _converted(convert: Callable[[Any], Any], value: object) -> object:
-    """Convert a value; leave anything but a number for the model to reject."""
-    try:
-        return convert(value)
-    except (TypeError, OverflowError):
-        return value
+def _elements(*values: object) -> tuple[object, ...]:
+    return values
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:

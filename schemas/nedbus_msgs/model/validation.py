@@ -98,12 +98,11 @@ def _flat_forms(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values],
     for position, kind in enumerate(kinds):
         if kind.length is not None:
             start = place + position - index
-            array, text = f"row[{start}:{start + kind.values}]", f"decode_text(row[{start}])"
-            flat += [
-                f"*row[{index}:{position}]",
-                f"encode_text(row[{position}])" if kind.is_text else f"*row[{position}]",
-            ]
-            nested += [f"*row[{place}:{start}]", text if kind.is_text else array]
+            one, back = f"*row[{position}]", f"row[{start}:{start + kind.values}]"
+            if kind.is_text:
+                one, back = f"encode_text(row[{position}])", f"decode_text(row[{start}])"
+            flat += [f"*row[{index}:{position}]", one]
+            nested += [f"*row[{place}:{start}]", back]
             index, place = position + 1, start + kind.values
     if not flat:
         return tuple, tuple

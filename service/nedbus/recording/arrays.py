@@ -176,11 +176,9 @@ def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
             decoded.absent[name] = [name not in row for row in rows]
     for name, old in plan.names.items():
         messages[name] = columns[old]
-    for name, (old, convert) in plan.converted.items():
-        messages[name] = [convert(value) for value in columns[old].tolist()]
-    for name, olds in plan.parts.items():
-        for index, part in enumerate(olds):
-            messages[name][:, index] = np.nan if part is None else columns[part]
+    for name, (olds, convert) in plan.converted.items():
+        parts = [np.full(len(table), np.nan) if old is None else columns[old] for old in olds]
+        messages[name] = [convert(*values) for values in zip(*(part.tolist() for part in parts), strict=True)]
     decoded.valid[:] = arrays_of(definition).valid_mask(messages)
     for name, column in columns.items():
         if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
