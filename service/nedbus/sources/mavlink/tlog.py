@@ -33,7 +33,7 @@ class TlogReader:
         self._path, self._options, self._vehicle = path, MavlinkOptions(topics=tuple(topics or ())), vehicle
         self.definitions: dict[Address, Definition[Any] | None] = {}  # of each address so far
         self._boots: set[int] = set()  # Unix times [us]
-        self._damaged_bytes = self.position = 0
+        self.damaged = self.position = 0  # bytes
 
     @property
     def boot_utc(self) -> int:
@@ -41,14 +41,9 @@ class TlogReader:
         return next(iter(self._boots)) if len(self._boots) == 1 else 0
 
     @property
-    def damaged(self) -> bool:
-        """True if damage may have cost messages so far."""
-        return self._damaged_bytes > 0
-
-    @property
     def warnings(self) -> list[str]:
         """Damage so far."""
-        return [f"damaged: {self._damaged_bytes} bytes that are not MAVLink"] if self.damaged else []
+        return [f"damaged: {self.damaged} bytes that are not MAVLink"] if self.damaged else []
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages, once; raise SourceError if there are none."""
@@ -58,7 +53,7 @@ class TlogReader:
             due, last = due + (stamp - last if last and 0 < stamp - last <= _MAX_GAP else 0), stamp
             for item in parse(parser, frame, str(self._path), None, due / 1e6):
                 if isinstance(item, Rejection):
-                    self._damaged_bytes += len(frame) if item.where == str(self._path) else 0
+                    self.damaged += len(frame) if item.where == str(self._path) else 0
                     continue
                 if item.system not in vehicles:
                     vehicles[item.system] = Vehicle(self._vehicle or str(item.system), self._options)
@@ -85,7 +80,7 @@ class TlogReader:
                 length = _length(data)
                 is_found = bool(length) and (is_found or len(data) == length or _length(data[length:]) > 0)
                 if not is_found or length > len(data):
-                    self._damaged_bytes += 1
+                    self.damaged += 1
                     self.position, data = self.position + 1, data[1:]
                     continue
                 yield _HEAD.unpack_from(data)[0], data[8:length]
