@@ -80,14 +80,14 @@ def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.Monk
     """After hundreds of vehicles, eight at a time, the state is that of the last fifty and the last minute."""
     world = World(monkeypatch)
     sizes = []
-    for number in range(400):
+    for number in range(240):
         world.now += 2.0
         there = [Address(f"v{each}", VLP) for each in range(max(0, number - AT_A_TIME + 1), number + 1)]
         for address in there:
             world.hear(address)
         world.look(*there)
         sizes.append(world.sizes())
-    assert sizes[200:400:20] == [sizes[-1]] * 10
+    assert sizes[140:240:10] == [sizes[-1]] * 10
     most = AT_A_TIME + MAX_GONE + 31
     assert all(number <= most for name, number in sizes[-1].items() if name != "counts")
     assert sizes[-1]["counts"] <= 3 * most

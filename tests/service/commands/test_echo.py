@@ -37,7 +37,8 @@ __all__ = ["flying"]  # a fixture
 
 pytestmark = pytest.mark.process
 
-REPLAY = "sim:?duration=40&speed=max"  # 4,000 messages: more than a lossless publisher is ahead of a paused reader
+# 4,000 messages: more than a lossless publisher is ahead of a paused reader
+REPLAY = f"sim:?duration=40&speed=max&topics={VLP}"
 LINE = 1000  # bytes that a line of JSON has at least
 
 
@@ -193,7 +194,7 @@ def test_paused_echo_does_not_hold_up_a_replay(
 def test_echo_every_skips_nothing(run_nedbus: Start, endpoint: str) -> None:
     """--every prints each message of a replay, in order, however fast it comes; its help warns that a replay waits."""
     assert "a replay at speed=max waits" in run_command("echo", "--help", COLUMNS="300").out
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:?duration=10&speed=max&wait=1")
+    run_nedbus("serve", "--connect", endpoint, "-s", f"sim:?duration=10&speed=max&wait=1&topics={VLP}")
     lines = echo(endpoint, "--json", "--every", "-n", "1000").out.splitlines()
     timestamps = [json.loads(line)["message"]["timestamp"] for line in lines]
     assert len(timestamps) == 1000
