@@ -41,7 +41,7 @@ from tests.flights.ulogs import LOGS
 from tests.peers.listening import Listener
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
 
 PEER = str(Path(__file__).with_name("ros2_peer.py"))
 KEY = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
@@ -247,7 +247,7 @@ def test_vehicle_that_is_back_brings_nothing_late(
     run_bridge: RunBridge, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """After a router's restart a vehicle may be gone for a moment: what is recovered then is no current estimate."""
-    timings.lateness = 0.1
+    timings.lateness = 0.2
     address = Address("1", VLP)
     subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
 
@@ -268,9 +268,10 @@ def test_vehicle_that_is_back_brings_nothing_late(
     late = first + dt.timedelta(milliseconds=1)
     wait_for(lambda: raw.new_timestamp().get_time() - late > dt.timedelta(seconds=0.2), what="it to be late")
     put(2, late)
-    put(3, raw.new_timestamp().get_time())
-    assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] == 3
     wait_for(lambda: "1 old message held back, up to" in caplog.text, what="the report")
+    current = count(3)
+    with repeating(lambda: put(next(current), raw.new_timestamp().get_time())):  # a busy machine may hold some back
+        assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] >= 3
     token.undeclare()
 
 
