@@ -10,6 +10,7 @@ from .layout import Formats
 from .records import (  # fmt: skip
     EXACT_SIZES,
     READERS,
+    SYNC,
     Damage,
     Data,
     Format,
@@ -136,10 +137,11 @@ class UlogParser:
         buffer, known, records = self._buffer, self._known, self._records
         make = tuple.__new__  # half the time of calling a NamedTuple
         found = known.get(buffer[at : at + _DATA_HEADER])
+        mark = buffer.find(SYNC, at) if found else -1
         while found is not None:
             subscription, length, used = found
             stop = at + length
-            found = known.get(buffer[stop : stop + _DATA_HEADER])
+            found = None if at < mark < stop else known.get(buffer[stop : stop + _DATA_HEADER])
             if found is not None:
                 records.append(make(Data, (subscription, buffer[at + _DATA_HEADER : at + used])))
                 at = stop
@@ -228,8 +230,8 @@ class UlogParser:
             return _Seen(_Judgement.NONE, stop)
         if stop > len(buffer) or not kind:
             return _Seen(_Judgement.PARTIAL, stop)
-        if known is not None:
-            return _Seen(_Judgement.SOUND, stop)
+        if known is not None:  # a sync in the message replaces bytes that were cut out
+            return _Seen(_Judgement.OPAQUE if self._verify and SYNC in buffer[at:stop] else _Judgement.SOUND, stop)
         try:
             record = READERS[kind[0]](buffer[content:stop])
         except (ValueError, LookupError, struct.error):

@@ -10,7 +10,7 @@ from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, FieldType, define
 
 from .layout import BASIC_TYPES, FIELD, PayloadLayout
 
-_SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
+SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 _MAX_TEXT: Final = 1024  # bytes of a logged text; PX4 logs at most 127
 _FORMAT = re.compile(rf"([A-Za-z][\w/-]*):((?:{FIELD.pattern})*)", re.ASCII)
 _NAME = re.compile(r"[A-Za-z][\w/-]{0,254}", re.ASCII)
@@ -168,7 +168,7 @@ def _subscription(content: bytes) -> Subscription:
 
 
 def _sync(content: bytes) -> Sync:
-    if not content.startswith(_SYNC):
+    if not content.startswith(SYNC):
         raise ValueError
     return Sync()
 
@@ -190,7 +190,7 @@ READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
 
 A subscription is returned without its layout.
 """
-EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(_SYNC)}
+EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC)}
 """Sizes of records that are recognized by their size; longer ones are read, too."""
 
 
