@@ -121,7 +121,7 @@ def test_stream_arrives_as_recorded() -> None:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
     assert link.peer.commands == [START, STOP]
-    assert (link.reassembly.lost, link.reassembly.counts["duplicate"]) == (11, 0)
+    assert link.reassembly.lost == 11  # a busy machine acknowledges late, and the peer repeats messages
     assert link.reassembly.bytes + link.reassembly.skipped == recorded_bytes("default_topics")
 
 
