@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -114,15 +115,21 @@ def test_list_that_has_not_arrived_is_no_empty_list(
 def test_hz_measures(run_nedbus: Start, flying: str) -> None:
     """Rate, jitter, latency and loss of each stream, as a table, JSON or CSV; that of the estimate is near 100 Hz."""
     table, csv_form = (run_nedbus("hz", "-c", flying, "-t", VLP, *form, measured=False) for form in ([], ["--csv"]))
-    json_form = run_command("hz", "-c", flying, "-d", "2.1", "--json", "-t", VLP)
-    assert json_form.exit_code == 0, json_form.err
-    rows = [json.loads(line) for line in json_form.out.splitlines()]
-    assert {row["topic"] for row in rows} == {VLP}
+    measured: list[dict[str, Any]] = []
+
+    def is_near() -> bool:
+        """Measure; return whether a rate is near that of the estimate, as it is unless the machine is too busy."""
+        shown = run_command("hz", "-c", flying, "-d", "2.1", "--json", "-t", VLP)
+        assert shown.exit_code == 0, shown.err
+        measured[:] = [json.loads(line) for line in shown.out.splitlines()]
+        return any(row["rate"] is not None and 20 < row["rate"] < 500 for row in measured)
+
+    wait_for(is_near, what="a rate near 100 Hz")
+    assert {row["topic"] for row in measured} == {VLP}
     assert all(
-        set(row) >= {"rate", "jitter", "latency", "latency_max", "lost", "flags", "gaps", "reboots"} for row in rows
+        set(row) >= {"rate", "jitter", "latency", "latency_max", "lost", "flags", "gaps", "reboots"} for row in measured
     )
-    assert any(row["rate"] is not None and 20 < row["rate"] < 500 for row in rows)
-    assert rows[-1]["lost"] == 0
+    assert measured[-1]["lost"] == 0
     for form in (table, csv_form):
         wait_for(lambda form=form: form.out.count("1/" if form is table else ",1,") >= 2, what="two seconds")  # type: ignore[misc]
         form.kill()
