@@ -23,7 +23,9 @@ from .tls import Tls
 Session = zenoh.Session
 RawSample = zenoh.Sample
 
-LEASE: Final = 5.0  # s of silence after which a link is closed, as with a frozen host or a cut cable
+LEASE: Final = 5.0
+"""Seconds of silence after which a link is closed, as with a frozen host or a cut cable."""
+
 # Shared memory limits a router to 351 fewer sessions, and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
 # Queues are longer than Zenoh's default, whose two batches are too few for the bursts of a fleet.
@@ -37,7 +39,9 @@ COMMON_SETTINGS: Final = {
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
 }
-MAX_REPLY_BYTES: Final = 2**18  # payload of a reply to a query: services split what is longer, readers refuse it
+MAX_REPLY_BYTES: Final = 2**18
+"""Largest payload of a reply to a query: services split what is longer, readers refuse it."""
+
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 

@@ -26,7 +26,9 @@ from .receiver import Receiver
 
 _log = logging.getLogger(__name__)
 
-DOWNSAMPLED_TIMEOUT: Final = 10.0  # s from a liveliness token to the warning that no downsampled message arrived
+DOWNSAMPLED_TIMEOUT: Final = 10.0
+"""Seconds from a stream's liveliness token to the warning that no downsampled message has arrived."""
+
 _TIMEOUT: Final = 2.0  # s for the queries of last messages and liveliness tokens
 _LAST_POLL: Final = 0.02  # s between polls for last messages
 _OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
