@@ -19,7 +19,9 @@ from nedbus.log_event import about
 
 _log = logging.getLogger(__name__)
 
-TICK: Final = 0.06  # s; pauses of this length and longer end at common multiples of it, less than one tick earlier
+TICK: Final = 0.06
+"""Pauses of this length and longer [s] end at common multiples of it, less than one tick earlier."""
+
 _MIN_PAUSE: Final = 0.002  # s between two calls of a job
 _RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
 

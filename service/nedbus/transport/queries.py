@@ -18,8 +18,12 @@ from .session import RawSample, Session, while_open
 
 _log = logging.getLogger(__name__)
 
-MAX_ANSWERS: Final = 10_000  # accepted per query; honest peers send fewer
-MAX_ANSWER_BYTES: Final = 2**26  # payloads and keys accepted per query
+MAX_ANSWERS: Final = 10_000
+"""Answers accepted per query; honest peers send fewer."""
+
+MAX_ANSWER_BYTES: Final = 2**26
+"""Bytes of payloads and keys accepted per query."""
+
 _MAX_WAITING: Final = 1024  # answers in the channel
 _GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
 _PAUSES: Final = (0.0005, 0.01)  # s between polls for answers: the first pause, and the longest

@@ -33,12 +33,24 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-CAPACITY: Final = 65_536  # samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped
-MAX_KEYS: Final = 10_000  # that a reader follows; beyond, those silent longest are forgotten, and counted
-MAX_SILENCE: Final = 600.0  # s without a message or heartbeat until a key is forgotten where there are many
-KEPT_KEYS: Final = 1_000  # that are remembered however long they are silent: losses of a long outage are counted
-MAX_HELD: Final = 131_072  # messages held back behind gaps, about 90 MB; beyond, gaps are given up
-MAX_ACK_REQUESTS: Final = 1000  # that are pending; a well-behaved publisher has one per key
+CAPACITY: Final = 65_536
+"""Samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped."""
+
+MAX_KEYS: Final = 10_000
+"""Keys that a reader follows, a bound on memory; beyond, those silent longest are forgotten, and counted."""
+
+MAX_SILENCE: Final = 600.0
+"""Seconds without a message or heartbeat after which the state of a key is freed where there are many keys."""
+
+KEPT_KEYS: Final = 1_000
+"""Keys that are remembered however long they are silent, so that the losses of a long outage are counted."""
+
+MAX_HELD: Final = 131_072
+"""Messages held back behind gaps, about 90 MB; beyond, gaps are given up."""
+
+MAX_ACK_REQUESTS: Final = 1000
+"""Pending acknowledgement requests; a well-behaved publisher has one per key."""
+
 _MAX_BATCH: Final = 4096  # messages per batch
 _MAX_FRESH: Final = 1024  # samples queued along with Zenoh's receive buffer; later ones are detached from it
 _MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
