@@ -36,7 +36,7 @@ def define(
     name: str,
     fields: Iterable[tuple[str, FieldType]],
     *,
-    meanings: Mapping[str, str] | None = None,
+    meanings: Mapping[str, str] = {},
     rules: Sequence[Rule] = (),
 ) -> Definition[Message]:
     """Define a message without a file, from a log, a .msg file or a publisher; `fields`: in the order of its CDR.
@@ -63,9 +63,8 @@ def define(
     size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
     if size > PAYLOAD_LIMIT:
         raise ValueError(f"{size} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
-    described = meanings or {}
     annotated: dict[str, Any] = {
-        name: (Timestamp if name == "timestamp" else kind.annotation, Field(description=described.get(name)))
+        name: (Timestamp if name == "timestamp" else kind.annotation, Field(description=meanings.get(name)))
         for name, kind in types.items()
     }
     model = create_model(name, __base__=Message, __doc__="A message of PX4 that has no file in nedbus.", **annotated)

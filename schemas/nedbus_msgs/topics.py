@@ -23,6 +23,7 @@ REJECTED: Final = "/@rejected"
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TOPIC_LENGTH: Final = 64
 _SIMILAR: Final = 0.9  # similarity from which a name counts as a misspelling of another
+_STREAM = re.compile(r"/([^/]*)/([^/]*)(?:/(0|[1-9][0-9]{0,2}))?")
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
@@ -54,14 +55,10 @@ class Address:
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
         """Parse a key; raise AddressError if it is not the key of an address, as with wildcards."""
-        chunks = key.removeprefix(prefix + "/").split("/")
-        if not key.startswith(prefix + "/") or len(chunks) not in (2, 3):
+        found = _STREAM.fullmatch(key.removeprefix(prefix)) if key.startswith(prefix) else None
+        if found is None:
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
-        vehicle, topic, *instances = chunks
-        for instance in instances:
-            if not re.fullmatch(r"0|[1-9][0-9]{0,2}", instance):
-                raise AddressError("instance", instance, f"0 to {_INSTANCES - 1}")
-        return cls(vehicle, topic, *map(int, instances))
+        return cls(found[1], found[2], None if found[3] is None else int(found[3]))
 
     def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression of this address."""
@@ -227,12 +224,11 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 
     Raises AddressError for a topic of another message, and for a class that declares no topics.
     """
-    if isinstance(message, str):
-        topics = [message]
-    elif not (topics := [each.name for each in vars(message).get("TOPICS", ())]):
-        raise AddressError("message", message.__name__, "a class that declares TOPICS, or the name of a topic")
+    name = message if isinstance(message, str) else message.__name__
+    topics = [name] if isinstance(message, str) else [each.name for each in vars(message).get("TOPICS", ())]
+    if not topics:
+        raise AddressError("message", name, "a class that declares TOPICS, or the name of a topic")
     if topic not in (None, *topics):
-        name = message if isinstance(message, str) else message.__name__
         raise AddressError("topic", topic, f"one of {name}: {', '.join(topics)}")
     return topic or topics[0]
 

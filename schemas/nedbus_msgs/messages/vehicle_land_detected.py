@@ -13,10 +13,7 @@ class VehicleLandDetected(Message):
     """
 
     TOPICS = (Topic("vehicle_land_detected", 1.0, "the land detector", on_change=True),)
-    LAYOUTS = (
-        Layout("1.13", "1.14, without rotational_movement"),
-        Layout("1.14", "*"),
-    )
+    LAYOUTS = (Layout("1.13", "1.14, without rotational_movement"), Layout("1.14", "*"))
 
     freefall: Bool = field("The vehicle falls freely")
 

@@ -9,7 +9,6 @@ from typing import Any, Final, Literal, TypeVar, cast
 from .px4_types import FieldType
 
 DEFAULT_TOPIC: Final = "vehicle_local_position"
-"""The default topic."""
 RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 """The PX4 releases with known layouts, oldest first."""
 ALL: Final = "all"
