@@ -7,45 +7,23 @@ values. Source: real logs, in one of which `delta_z` is -179.5 m and z moved by 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import add, sub
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from .frames import MapProjection, wrap
 from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
 Quantity = Literal["xy", "z", "vxy", "vz", "heading", "dist_bottom"]
 
-
 Point = tuple[float, ...]
 
-
-class _Fields(NamedTuple):
-    """The fields of one quantity: values, delta, reset counter, and rates of the values."""
-
-    values: tuple[str, ...]
-    delta: str
-    counter: str
-    rates: tuple[str, ...] = ()
-
-    @property
-    def zero(self) -> Point:
-        return (0.0,) * len(self.values)
-
-    def of(self, message: Message) -> Point:
-        return tuple(getattr(message, name) for name in self.values)
-
-
-_QUANTITIES: Final[Mapping[Quantity, _Fields]] = {
-    "xy": _Fields(("x", "y"), "delta_xy", "xy_reset_counter", ("vx", "vy")),
-    "z": _Fields(("z",), "delta_z", "z_reset_counter", ("vz",)),
-    "vxy": _Fields(("vx", "vy"), "delta_vxy", "vxy_reset_counter", ("ax", "ay")),
-    "vz": _Fields(("vz",), "delta_vz", "vz_reset_counter", ("az",)),
-    "heading": _Fields(("heading",), "delta_heading", "heading_reset_counter"),
-    "dist_bottom": _Fields(("dist_bottom",), "delta_dist_bottom", "dist_bottom_reset_counter"),
-}
-RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: fields.counter for name, fields in _QUANTITIES.items()}
+_VALUES: Final[Mapping[Quantity, tuple[str, ...]]] = {
+    "xy": ("x", "y"), "z": ("z",), "vxy": ("vx", "vy"), "vz": ("vz",), "heading": ("heading",),
+    "dist_bottom": ("dist_bottom",),
+}  # fmt: skip
+RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" for name in _VALUES}
 """The field that counts the resets of each quantity, modulo 256."""
 
 _TOLERANCE: Final = 2.0  # m between an observed jump at a new origin and a candidate that explains it
@@ -84,8 +62,8 @@ class ResetTracker:
 
     def __init__(self) -> None:
         self._last: Message | None = None
-        self._jumps: dict[Quantity, Point] = {name: fields.zero for name, fields in _QUANTITIES.items()}
-        self._resets: dict[Quantity, int] = dict.fromkeys(_QUANTITIES, 0)
+        self._jumps: dict[Quantity, Point] = {name: (0.0,) * len(values) for name, values in _VALUES.items()}
+        self._resets: dict[Quantity, int] = dict.fromkeys(_VALUES, 0)
 
     def add(self, message: Message) -> Continuous:
         """Add the next message of the stream and return its values without jumps.
@@ -98,23 +76,25 @@ class ResetTracker:
         origin_changed = last is not None and _origin(last) != _origin(message)
         rebooted = last is not None and message.timestamp < last.timestamp
         values: dict[str, float] = {}
-        for name, fields in _QUANTITIES.items():
-            count, jump = 0, None if rebooted else fields.zero
+        for name, fields in _VALUES.items():
+            zero: Point = (0.0,) * len(fields)
+            count, jump = 0, None if rebooted else zero
             if last is not None and not rebooted:
-                count = (getattr(message, fields.counter) - getattr(last, fields.counter)) % 256
+                counter = RESET_COUNTERS[name]
+                count = (getattr(message, counter) - getattr(last, counter)) % 256
                 if origin_changed and name in ("xy", "z"):
                     jump = _jump_of_new_origin(name, last, message, count)
                 elif count:
-                    jump = _delta(fields, message, count)
+                    jump = _delta(name, message, count)
             if count:
                 reset.add(name)
                 self._resets[name] += count
             if jump is None:
                 discontinued.add(name)
-                self._jumps[name] = fields.zero
+                self._jumps[name] = zero
             elif any(jump):
                 self._jumps[name] = tuple(map(add, self._jumps[name], jump))
-            values |= zip(fields.values, map(sub, fields.of(message), self._jumps[name]), strict=True)
+            values |= zip(fields, map(sub, _point(message, fields), self._jumps[name]), strict=True)
         values["heading"] = wrap(values["heading"])
         return Continuous(
             **values,
@@ -125,27 +105,32 @@ class ResetTracker:
         )
 
 
-def _delta(fields: _Fields, message: Message, count: int) -> Point | None:
+def _point(message: Message, fields: Iterable[str]) -> Point:
+    return tuple(getattr(message, name) for name in fields)
+
+
+def _delta(name: Quantity, message: Message, count: int) -> Point | None:
     """Return the delta of a single reset; None if there were several, or the delta is not provided."""
-    delta = getattr(message, fields.delta)
+    delta = getattr(message, f"delta_{name}")
     jump: Point = delta if isinstance(delta, tuple) else (delta,)
     return jump if count == 1 and all(map(math.isfinite, jump)) else None
 
 
 def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: int) -> Point | None:
     """Return the jump at a new origin: zero, the delta or the shift of the origin, if one fits the values."""
-    fields = _QUANTITIES[name]
-    candidates = [fields.zero, _delta(fields, message, count)]
+    fields = _VALUES[name]
+    candidates = [(0.0,) * len(fields), _delta(name, message, count)]
     step = message.ref_alt - last.ref_alt
     if name == "z" and math.isfinite(step):
         candidates.append((step,))
     elif name == "xy" and last.xy_global and message.xy_global:
         candidates.append(MapProjection(message.ref_lat, message.ref_lon).project(last.ref_lat, last.ref_lon))
     seconds = (message.timestamp - last.timestamp) / 1e6
-    rates = [getattr(last, rate) for rate in fields.rates]
+    rates = _point(last, (f"v{each}" for each in fields))
     motion = [rate * seconds if math.isfinite(rate) else 0.0 for rate in rates]
     observed = [
-        now - before - moved for now, before, moved in zip(fields.of(message), fields.of(last), motion, strict=True)
+        now - before - moved
+        for now, before, moved in zip(_point(message, fields), _point(last, fields), motion, strict=True)
     ]
     tolerance = _TOLERANCE + math.hypot(*motion) / 2
     best = min((jump for jump in candidates if jump is not None), key=lambda jump: math.dist(jump, observed))
