@@ -23,11 +23,6 @@ from .model.px4_types import BASES, FieldType, encode_text
 from .model.rules import passes_all, wrong_columns
 from .model.validation import Values
 
-__all__ = [
-    "DTYPE", "Arrays", "MessageArray", "arrays_of", "dtype_of", "mask_invalid", "to_array", "to_message",
-]  # fmt: skip
-
-
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 

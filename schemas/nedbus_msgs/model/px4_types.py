@@ -41,8 +41,6 @@ BASES: Final[Mapping[str, Base]] = {
     "float64": Base("d", 0xCB, 11, NAN),
     "char": Base("s", 0xDA, 3, ""),  # only as an array, which is a text; ROS 2 has a uint8 in its place
 }
-
-
 ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 """The types of single values with another name in PX4."""
 

@@ -35,9 +35,10 @@ class Rule:
     `flags`: the fields that are finite while a flag is set, by flag.
     """
 
-    def __init__(self, checks: Iterable[Check], flags: Mapping[str, Sequence[str]] | None = None) -> None:
+    flags: Mapping[str, Sequence[str]] = {}
+
+    def __init__(self, checks: Iterable[Check]) -> None:
         self.checks = tuple(checks)
-        self.flags = flags or {}
 
     @property
     def fields(self) -> Sequence[str]:
@@ -50,12 +51,12 @@ class FiniteWhile(Rule):
     """Fields are finite while their flag is set; `flags` maps each flag to its fields."""
 
     def __init__(self, flags: Mapping[str, Sequence[str]]) -> None:
-        checks = (
+        self.flags = flags
+        super().__init__(
             Check(name, f"must be finite while {flag} is true", f"({{{flag}}} and not isfinite({{{name}}}))")
             for flag, names in flags.items()
             for name in names
         )
-        super().__init__(checks, flags)
 
 
 class NotNegative(Rule):
