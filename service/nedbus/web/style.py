@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import jinja2
 
 from nedbus.client import to_age
 
-from .chronicle import Chronicle
 from .fleet import MAX_STREAMS
 from .stream import is_position
 
@@ -54,13 +53,10 @@ class Style:
         plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
         return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
 
-    def open_panels(self, chronicle: Chronicle) -> Any:
-        """Return the macros of `panels.html`, with the times of a chronicle."""
-        return _panels().make_module({"style": self, "chronicle": chronicle, "moment": chronicle.moment})
-
 
 @cache
-def _panels() -> jinja2.Template:
+def panels() -> jinja2.Template:
+    """Return the macros of `panels.html`, which need a style, a chronicle and its `moment`."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=to_age, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)

@@ -25,7 +25,7 @@ from .fleet import TRUTH, Fleet, Picture, Row
 from .map import FOCUSES, Map
 from .playback import Player
 from .stream import is_position
-from .style import DARK, LIGHT, read_asset
+from .style import DARK, LIGHT, panels, read_asset
 from .time_plots import Plots, Timeline, move, notable
 
 _TICK: Final = 100  # ms between updates of the map
@@ -72,7 +72,8 @@ class Viewer:
         self._undrawn = self._plots.draw()
         self._map = Map(self._style, background)
         self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
-        self._panels = self._style.open_panels(chronicle)
+        context = {"style": self._style, "chronicle": chronicle, "moment": chronicle.moment}
+        self._panels: Any = panels().make_module(context)
         sheets: list[Any] = [read_asset("text.css")]
         wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
         names = "head", "list", "why", "nums", "tool", "more", "marks"

@@ -146,7 +146,13 @@ def rules(
         for name in before:
             write(name)
         return
-    given = {*(vehicles or ()), *(_read_names(source) if source else ())}
+    given = {*(vehicles or ())}
+    if source is not None and source.is_dir():
+        known = [entry.name for entry in certificates.list_certificates(source)]
+        given.update(name.removeprefix(CERTIFICATE_PREFIX) for name in known if name.startswith(CERTIFICATE_PREFIX))
+    elif source is not None:
+        text = sys.stdin.read() if str(source) == "-" else source.read_text(encoding="utf-8")
+        given.update(filter(None, (line.partition("#")[0].strip() for line in text.splitlines())))
     if unknown := sorted(given - set(before)) if remove else []:
         raise ConfigError(str(file), f"its access rules do not name vehicle {unknown[0]!r}")
     wanted = {*before, *given} if add else set(before) - given if remove else given
@@ -156,15 +162,6 @@ def rules(
             write(f"{sign} {name}")
     changed = "no change" if wanted == {*before} else "restart the router to apply them"
     write_stderr(f"{file} names {counted(len(wanted), 'vehicle')}: {changed}")
-
-
-def _read_names(source: Path) -> list[str]:
-    if source.is_dir():
-        names = [entry.name for entry in certificates.list_certificates(source)]
-        return [name.removeprefix(CERTIFICATE_PREFIX) for name in names if name.startswith(CERTIFICATE_PREFIX)]
-    text = sys.stdin.read() if str(source) == "-" else source.read_text(encoding="utf-8")
-    lines = (line.partition("#")[0].strip() for line in text.splitlines())
-    return [line for line in lines if line]
 
 
 def _write_paths(paths: list[Path]) -> None:
