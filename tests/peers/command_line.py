@@ -82,8 +82,8 @@ def _as_process() -> Iterator[None]:
         yield
     finally:
         for limit in [each for handler in root.handlers for each in handler.filters if isinstance(each, RateLimit)]:
-            limit.flush()
-            atexit.unregister(limit.flush)
+            limit.report()
+            atexit.unregister(limit.report)
         root.handlers = handlers
         for logger, level in levels.items():
             logger.setLevel(level)

@@ -27,6 +27,7 @@ from nedbus.whole_file import whole_file
 
 from .certificate import DAYS, MAX_NAME, Certificate
 
+_CA_NAME: Final = "nedbus CA"
 _CA_DAYS: Final = 3650
 _FOREIGN: Final = "signed by another authority"
 _USAGES: Final = (
@@ -43,7 +44,7 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
     Raises PkiError if there is a CA already, or the folder cannot be written.
     """
     key = new_key()
-    return _write_files(folder / "ca", sign_authority(key, days=days), key)
+    return _write_files(folder / "ca", _sign(_CA_NAME, key.public_key(), key, days), key)
 
 
 def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
@@ -110,7 +111,8 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
     folder = entry.path.parent
     authority = Authority.read(folder)
     if entry.use == "authority":
-        return _write_files(folder / "ca", sign_authority(authority.key, days=days), replace=True)
+        signed = _sign(_CA_NAME, authority.key.public_key(), authority.key, days)
+        return _write_files(folder / "ca", signed, replace=True)
     if entry.problem == _FOREIGN:
         raise PkiError(f"{entry.path} is {_FOREIGN}: renew it in the folder of that authority")
     # The private key may be on its vehicle only; the public key is in the old certificate.
@@ -142,12 +144,7 @@ class Authority(NamedTuple):
         self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
     ) -> x509.Certificate:
         """Sign a key, for a router if hosts are given; the certificate never outlives the CA's."""
-        return _sign(name, key, self.key, DAYS if days is None else days, issuer=self.certificate, hosts=hosts)
-
-
-def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
-    """Return a self-signed CA certificate for a key; certificates that the key signed before stay valid."""
-    return _sign("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days)
+        return _sign(name, key, self.key, days, issuer=self.certificate, hosts=hosts)
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
@@ -203,12 +200,14 @@ def _read(path: Path) -> bytes:
 
 
 def _sign(
-    name: str, key: CertificatePublicKeyTypes, signer: ec.EllipticCurvePrivateKey, days: int, *,
+    name: str, key: CertificatePublicKeyTypes, signer: ec.EllipticCurvePrivateKey, days: int | None, *,
     issuer: x509.Certificate | None = None, hosts: Sequence[str] = (),
 ) -> x509.Certificate:  # fmt: skip
     """Return the certificate of a key; without an issuer, that of a CA, signed by itself."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now, is_authority = clock.now(), issuer is None
+    if days is None:
+        days = _CA_DAYS if is_authority else DAYS
     until = now + dt.timedelta(days=days)
     allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
     builder = (

@@ -242,7 +242,7 @@ def test_flood_of_any_length_is_bounded() -> None:
         limited.flood(10)
         limited.now += 1
     assert len(limited.lines) <= BURST + 2 * 10 * PER_MINUTE
-    limited.limit.flush()
+    limited.limit.report()
     told = [int(line.split()[1]) for line in limited.lines if line.startswith("suppressed")]
     assert sum(told) + len(limited.lines) - len(told) == 6000
 
@@ -267,9 +267,9 @@ def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
     limited.now += 60
     assert limited.flood(1, "%s", event="done") == 2
     assert limited.lines[-2].startswith("suppressed 5 more lines")
-    limited.limit.flush()
+    limited.limit.report()
     limited.flood(BURST + 5, "%s is back", event="back")
-    limited.limit.flush()
+    limited.limit.report()
     assert limited.lines[-1].startswith("suppressed 5 more lines")
 
 
@@ -286,7 +286,7 @@ def test_report_is_an_event() -> None:
     limit = RateLimit(reports.append, now=lambda: 0.0)
     for _ in range(BURST + 3):
         limit.filter(record("\x1b[2J"))
-    limit.flush()
+    limit.report()
     (report,) = reports
     fields = json.loads(JsonFormatter().format(report))
     assert (fields["event"], fields["of"], fields["count"], fields["level"]) == ("left-out", "stale", 3, "warning")

@@ -127,7 +127,7 @@ class RateLimit(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
         now = self._now()
-        self._report(lambda bucket: bucket.fill(now))
+        self.report(lambda bucket: bucket.fill(now))
         about = about_of(record)
         event = about.event if about else None
         if event is not None and not EVENTS[event].limited:
@@ -147,11 +147,8 @@ class RateLimit(logging.Filter):
             bucket.left_out += 1
             return False
 
-    def flush(self) -> None:
-        """Report all suppressed lines."""
-        self._report(lambda _: True)
-
-    def _report(self, is_due: Callable[[_TokenBucket], bool]) -> None:
+    def report(self, is_due: Callable[[_TokenBucket], bool] = lambda _: True) -> None:
+        """Report suppressed lines, by default all."""
         reports = []
         with self._lock:
             for (_, event, _), bucket in self._buckets.items():
@@ -186,7 +183,7 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
         threading.excepthook = lambda caught: _log_uncaught(caught.exc_type, caught.exc_value, caught.exc_traceback)
     limit = RateLimit(handler.handle)
     handler.addFilter(limit)
-    atexit.register(limit.flush)
+    atexit.register(limit.report)
     logging.basicConfig(handlers=[handler], force=True)
     number = logging.getLevelNamesMapping()[level.upper()]
     logging.getLogger("nedbus").setLevel(number)
