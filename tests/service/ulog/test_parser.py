@@ -126,7 +126,7 @@ def test_damage_gives_no_wrong_message(rng: random.Random, kind: str) -> None:
 
 @pytest.mark.parametrize("chunk", [100, 1_000_000])
 def test_sync_in_place_of_cut_bytes_is_seen(chunk: int) -> None:
-    """A message that lacks as many bytes as the sync behind it has is not read with that sync as its end."""
+    """Where the bytes cut out of a message are the length of the sync behind it, the sync is not read as its end."""
     log = small_log(10)
     sync = log.index(bytes.fromhex("2f731320250cbb12")) - 3
     whole = data_of(parse(log))
