@@ -33,12 +33,11 @@ from nedbus.transport import open_router
 from nedbus_msgs import MESSAGES, TOPICS, VehicleLocalPosition
 from tests.documents import BLOCKS, PAGES, ROOT, Block, check_options, nedbus_commands, parse_command, shape_of
 from tests.flights.replays import convert_replay
+from tests.nedbus.cli.commands.test_events import write_flight
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start, Zygote, unmeasured
 from tests.waits import wait_for
-
-from .service.commands.test_events_command import write_flight
 
 SERVERS: Final = ("serve", "router", "export", "web", "foxglove", "ros2")
 ENDLESS: Final = (*SERVERS, "echo", "hz", "events")

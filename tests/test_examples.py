@@ -11,11 +11,10 @@ import pytest
 import nedbus
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import convert_replay
+from tests.nedbus.cli.commands.test_query import flying
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
 from tests.waits import wait_for
-
-from .service.commands.test_cli import flying
 
 __all__ = ["flying"]  # a fixture
 

@@ -1,1 +1,0 @@
-"""Delivery: queues, accounts, acknowledgements and flow control."""

@@ -1,0 +1,236 @@
+"""`nedbus echo`: what it prints, how it ends, and what a paused one costs a replay."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import math
+import os
+import signal
+import struct
+import termios
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import nedbus
+from nedbus.timings import Timings
+from nedbus.transport import Session
+from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.replays import open_replay
+from tests.nedbus.cli.output.test_terminal import flying as standing
+from tests.peers.command_line import Ended, fork_command, run_command
+from tests.peers.processes import Forked, Start, Zygote
+from tests.waits import DEADLINE, wait_for
+
+from .test_query import flying
+
+__all__ = ["flying"]  # a fixture
+
+pytestmark = pytest.mark.process
+
+# 4,000 messages: more than a lossless publisher is ahead of a paused reader
+REPLAY = f"sim:?duration=40&speed=max&topics={VLP}"
+LINE = 1000  # bytes that a line of JSON has at least
+
+
+def echo(endpoint: str, *options: str) -> Ended:
+    """Run `nedbus echo` with options that end it."""
+    ended = run_command("echo", "-c", endpoint, *options)
+    assert ended.exit_code == 0, ended.err
+    return ended
+
+
+class Paused(NamedTuple):
+    """`nedbus echo` whose stdout is a full pipe that nobody reads, until `resume`."""
+
+    process: Forked
+    is_full: Callable[[], bool]
+    resume: Callable[[], None]
+
+
+@pytest.fixture
+def pause_echo(zygote: Zygote, endpoint: str, bus: nedbus.Bus) -> Callable[..., AbstractContextManager[Paused]]:
+    """Return what starts `nedbus echo --json` with more options, and publishes until its output blocks."""
+
+    @contextmanager
+    def pause(*options: str) -> Iterator[Paused]:
+        output, write_end = os.pipe()
+        capacity = fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
+        process = fork_command(zygote, "echo", "-c", endpoint, "--json", *options, out=write_end)
+        os.close(write_end)
+
+        def is_full() -> bool:  # so that the next line blocks the process
+            unread = struct.unpack("i", fcntl.ioctl(output, termios.FIONREAD, bytes(4)))[0]
+            return bool(unread > capacity - LINE)
+
+        def publish_until_full() -> bool:
+            publisher.publish(message(1))
+            return is_full()
+
+        def read_all() -> None:
+            while os.read(output, 65536):
+                pass
+
+        reader = threading.Thread(target=read_all)
+        try:
+            with bus.publisher(VLP, vehicle="filler") as publisher:
+                wait_for(publish_until_full, what="the pipe to be full")
+            yield Paused(process, is_full, reader.start)
+        finally:
+            process.kill()
+            process.wait(DEADLINE)
+            if reader.is_alive():
+                reader.join(DEADLINE)
+            os.close(output)
+
+    return pause
+
+
+@pytest.mark.parametrize("arguments", [["--topic", VLP], [VLP], ["/" + VLP], ["1/" + VLP], []])
+def test_echo_prints_a_line_each(flying: str, arguments: list[str]) -> None:
+    """--topic, --vehicle and --count choose; the topic, which is the position by default, may be an argument too."""
+    lines = echo(flying, "--count", "5", *arguments).out.splitlines()
+    assert len(lines) == 5
+    assert all(line.startswith("1/vehicle_local_position ") and " ned " in line for line in lines)
+
+
+def test_echo_json_is_the_message(flying: str) -> None:
+    """Each line is JSON that the model reads back, "Infinity" included; the topic "*" is all topics."""
+    rows = [json.loads(line) for line in echo(flying, "--json", "-n", "50", "*").out.splitlines()]
+    has = {each.address.topic: each.fields.keys() for each in open_replay("sim:?duration=15&speed=max").messages}
+    assert len(rows) == 50
+    for row in rows:
+        assert set(row) == {"vehicle", "topic", "instance", "received", "sent", "lost", "source", "missing", "message"}
+        assert row["source"] == "sim"
+        message = BY_TOPIC[row["topic"]].model.model_validate_json(json.dumps(row["message"]))
+        assert set(row["missing"]) == message.DEFINITION.all_fields - has[row["topic"]]
+    assert any(row["message"].get("vxy_max") == "Infinity" for row in rows)
+    assert len({row["topic"] for row in rows}) > 1
+
+
+def test_echo_full_prints_every_field(flying: str) -> None:
+    """--full has all 53 fields, each on its line."""
+    blocks = echo(flying, "--full", "-n", "2", VLP).out.split("---\n")
+    assert len(blocks) == 3
+    names = [line.split(":")[0].strip() for line in blocks[0].splitlines()[1:]]
+    assert names == list(VehicleLocalPosition.model_fields)
+
+
+def test_interrupt_is_130(run_nedbus: Start, flying: str) -> None:
+    """Ctrl-C ends echo at once and quietly."""
+    process = run_nedbus("echo", "-c", flying, measured=False)
+    wait_for(lambda: process.out, what="a line")
+    process.signal(signal.SIGINT)
+    assert process.wait() == 130
+    assert "Traceback" not in process.err
+
+
+def test_closed_pipe_is_no_error(flying: str, zygote: Zygote) -> None:
+    """`nedbus echo | head` ends without a message."""
+    read_end, write_end = os.pipe()
+    with Path("err").open("wb") as err, os.fdopen(read_end) as head:
+        process = fork_command(zygote, "echo", "-c", flying, out=write_end, err=err.fileno())
+        os.close(write_end)
+        assert all(head.readline().startswith(f"1/{VLP} ") for _ in range(3))
+    assert process.wait(DEADLINE) == 0
+    assert Path("err").read_text() == ""
+
+
+def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+    """Losses and invalid payloads are counted on stderr at the end."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    process = run_nedbus("echo", "-c", endpoint, "-n", "2")
+    wait_for(lambda: process.out, what="the first line")
+    raw.put(publisher.key, b"garbage")
+    wait_for(lambda: "not a VehicleLocalPosition" in process.err, what="the warning")
+    publisher.publish(message(2))
+    assert process.wait() == 0
+    assert "2 received, 0 lost, 0 skipped (--every prints all), 1 invalid" in process.err
+
+
+def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, timings: Timings) -> None:
+    """A last value is marked as old by echo, and hz does not measure it."""
+    timings.old = 0.01
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
+    assert "s old]" in echo(endpoint, "-n", "1").out
+    hz = run_command("hz", "-c", endpoint, "-d", "0.5")
+    assert hz.exit_code == 1
+    assert "nothing arrived" in hz.err
+
+
+def test_paused_echo_does_not_hold_up_a_replay(
+    run_nedbus: Start, endpoint: str, pause_echo: Callable[..., AbstractContextManager[Paused]]
+) -> None:
+    """A replay as fast as its readers take it ends, though the output of an echo is blocked: it is of mode "latest".
+
+    With --every it waits, and ends when that output is read.
+    """
+    replay = ("serve", "--connect", endpoint, "--until-done", "-s", REPLAY)
+    with pause_echo() as paused:
+        service = run_nedbus(*replay)
+        assert service.wait() == 0, service.err
+        assert "slow reader" not in service.err
+        assert paused.process.poll() is None
+        assert paused.is_full()
+    with pause_echo("--every") as paused:
+        service = run_nedbus(*replay)
+        wait_for(lambda: "waiting for a slow reader" in service.err, what="the replay to wait")
+        assert service.popen.poll() is None
+        paused.resume()
+        assert service.wait() == 0, service.err
+
+
+def test_echo_every_skips_nothing(run_nedbus: Start, endpoint: str) -> None:
+    """--every prints each message of a replay, in order, however fast it comes; its help warns that a replay waits."""
+    assert "a replay at speed=max waits" in run_command("echo", "--help", COLUMNS="300").out
+    run_nedbus("serve", "--connect", endpoint, "-s", f"sim:?duration=10&speed=max&wait=1&topics={VLP}")
+    lines = echo(endpoint, "--json", "--every", "-n", "1000").out.splitlines()
+    timestamps = [json.loads(line)["message"]["timestamp"] for line in lines]
+    assert len(timestamps) == 1000
+    assert {later - earlier for earlier, later in pairwise(timestamps)} == {10_000}
+
+
+def test_echo_csv_of_two_vehicles(endpoint: str, bus: nedbus.Bus) -> None:
+    """--csv --field x,y,z writes names, then a row for each message of all vehicles; NaN and pairs included."""
+    with standing(bus, "1", "2"):
+        lines = echo(endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "10").out.splitlines()
+        head, row = csv.reader(echo(endpoint, "--csv", "--once").out.splitlines())
+    assert len(head) == len(row) == 5 + len(VehicleLocalPosition.model_fields) + 2 + 1
+    rows = list(csv.DictReader(lines))
+    fields = ["x", "y", "delta_xy[0]", "delta_xy[1]", "xy_valid"]
+    assert list(rows[0]) == ["vehicle", "topic", "instance", "utc", "sent", "timestamp", *fields, "state"]
+    assert len(rows) == 10
+    assert {each["vehicle"] for each in rows} == {"1", "2"}
+    assert all(int(each["sent"]) > 10**18 and each["timestamp"] == "1" for each in rows)
+    assert all(math.isfinite(float(each["x"])) and each["xy_valid"] == "True" for each in rows)
+    for each in rows:
+        assert datetime.fromisoformat(each["utc"]).timestamp() == pytest.approx(int(each["sent"]) / 1e9, abs=1e-5)
+
+
+def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
+    """A position has its state whatever fields are chosen, and the end of a CSV tells what is not in it."""
+    bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
+    shown = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
+    [row] = csv.DictReader(shown.out.splitlines())
+    assert row["state"] == "xy invalid"
+    assert shown.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
+
+
+def test_echo_shows_chosen_fields(flying: str) -> None:
+    """--field chooses in every form; --once ends after one message."""
+    for form, text in (([], "  x "), (["--full"], "\n  x: "), (["--json"], '"message": {"x":')):
+        out = echo(flying, "--once", "--field", "x,z", *form).out
+        assert text in out
+        assert "vx" not in out
+        assert out.count("vehicle_local_position") == 1

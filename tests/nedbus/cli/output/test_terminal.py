@@ -1,0 +1,604 @@
+"""Terminals: tables of any width, hostile text, closed streams, signals at any moment."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Self
+
+import pytest
+from rich.console import Console
+
+import nedbus
+from nedbus.cli.output.samples import Lines
+from nedbus.cli.output.streams import printable, to_text
+from nedbus.cli.output.table import live_table, to_table
+from nedbus.timings import Timings
+from nedbus.transport import Session, open_router
+from nedbus_msgs import DEFAULT
+from tests.flights.messages import VALID, VLP, message
+from tests.peers.command_line import fork_command, run_command
+from tests.peers.hasty import start_hasty
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Start, Zygote, unmeasured
+from tests.waits import DEADLINE, repeating, wait_for
+
+ROOT = Path(__file__).parents[4]
+EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
+
+
+def has_control(text: str) -> bool:
+    """Return whether anything in a text would act on a terminal."""
+    return any(not (char.isprintable() or char == "\n") for char in text)
+
+
+def test_text_of_a_peer_is_one_short_printable_line() -> None:
+    """Escape sequences, directions of writing and line breaks are spelt out, and what is long is cut."""
+    assert to_text(EVIL) == r"\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
+    assert len(to_text("x" * 100_000)) == 120
+    assert len(to_text("\x1b" * 100_000)) < 500
+    assert printable("déjà vu\n世界") == "déjà vu\n世界"
+    assert printable("name-\udcff") == r"name-\udcff"
+
+
+HEAD = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
+OPTIONAL = ("JITTER", "MAX", "LATENCY", "LOST")
+ROWS = [
+    ("1/vehicle_local_position_groundtruth", "100.0", "12.3 ms", "999 ms", "119.9 s", "12345", "ok"),
+    ("1/vehicle_local_position", "-", "-", "-", "-", "0", "stale: nothing for 4.2 s, xy z invalid, dead reckoning"),
+]
+
+
+@pytest.mark.parametrize("width", [30, 40, 64, 80, 110])
+def test_table_fits(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    """Lines fit, wide ones show more columns; a name is whole while columns can be left out, and then folded."""
+    monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: width)
+    lines = to_table(HEAD, ROWS, optional=OPTIONAL).splitlines()
+    assert all(len(line) <= width for line in lines)
+    shown = " ".join(lines)
+    assert {word in shown for word in ("stale:", "4.2 s", "invalid", "reckoning")} == {True}
+    assert ("JITTER" in lines[0]) == (width >= 110)
+    assert (ROWS[0][0] in shown) == (width >= 60)
+
+
+def test_table_without_rows_is_its_head() -> None:
+    """Before the first message there is a head alone."""
+    assert to_table(HEAD, [], optional=OPTIONAL).split() == list(HEAD)
+
+
+def test_table_is_whole_without_a_terminal() -> None:
+    """Where stdout is no terminal nothing is folded or left out, and no text is markup."""
+    cells = ("1/[bold]", *ROWS[1][1:-1], "x" * 300)
+    head, *lines = to_table(HEAD, [*ROWS, cells]).splitlines()
+    assert head.split() == list(HEAD)
+    assert [line.split()[0] for line in lines] == [ROWS[0][0], ROWS[1][0], "1/[bold]"]
+    assert lines[-1].endswith("x" * 300)
+
+
+def sample(address: nedbus.Address) -> nedbus.Sample:
+    position = {"x": -1234.5678, "y": 2.0, "z": -3.0, "vx": -1.0, "heading": 1.5, "eph": 0.5, "xy_valid": True}
+    return nedbus.Sample(message(99_999_123_456, **position), address, 0, lost=3)
+
+
+ALL_TOPICS = [nedbus.Address("1", name, 0 if topic.instances else None) for name, topic in DEFAULT.topics.items()]
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
+    """Return what makes lines of all topics for a terminal of a width, and of 24 lines."""
+    monkeypatch.setenv("LINES", "24")
+
+    def make(width: int) -> Lines:
+        monkeypatch.setattr("nedbus.cli.output.samples.terminal_width", lambda: width)
+        return Lines()
+
+    return make
+
+
+def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None:
+    """Narrower and narrower: eph goes first, then heading, then velocity; position, doubts and loss never."""
+    one = sample(nedbus.Address("1", VLP))
+    seen: list[list[str]] = []
+    for width in range(150, 87, -1):
+        head, line = lines(width)(one).splitlines()
+        assert len(head) <= width
+        assert len(line) <= width
+        assert all(text in line for text in ("1/veh", "-1234.5", "  z vxy vz unknown", "[3 lost]"))
+        columns = [name for name in ("Z m", "VZ m/s", "HDG deg", "EPH m", "STATE") if name in head]
+        if not seen or seen[-1] != columns:
+            seen.append(columns)
+    most = ["Z m", "VZ m/s", "HDG deg", "EPH m"]
+    assert seen == [[*most[:count], "STATE"] for count in (4, 3, 2, 1)]
+
+
+def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
+    """There is one at first, one in each screenful, and one when the columns change; every state is below STATE."""
+    to_line, headed, state = lines(150), [], 0
+    for number in range(80):
+        *head, line = to_line(sample(nedbus.Address("1" if number < 40 else "wing", VLP))).splitlines()
+        if head:
+            headed.append(number)
+            state = head[0].index("STATE")
+        assert line.index("z vxy vz unknown") == state
+    assert headed == [0, 22, 40, 62]
+    of_fields = lines(150)(sample(nedbus.Address("1", VLP)), ["x", "eph"]).splitlines()
+    assert of_fields[0].split() == ["VEHICLE/TOPIC", "TIME", "s", "x", "eph", "STATE"]
+
+
+class Terminal:
+    """A command on a terminal of its own, and what it shows."""
+
+    def __init__(self, zygote: Zygote, *arguments: str, **environment: str) -> None:
+        self._main, terminal = pty.openpty()
+        self._output = bytearray()
+        environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
+        self.popen = fork_command(zygote, *arguments, out=terminal, err=terminal, **environment)
+        os.close(terminal)
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.popen.kill()
+        self.wait()
+
+    @property
+    def shown(self) -> str:
+        return self._output.decode(errors="replace")
+
+    def wait(self) -> int:
+        """Wait for its end, and for all that it shows."""
+        exit_code = self.popen.wait(DEADLINE)
+        self._reader.join(DEADLINE)
+        return exit_code
+
+    def _read(self) -> None:
+        with suppress(OSError):  # the other side is closed
+            while data := os.read(self._main, 4096):
+                self._output.extend(data)
+        os.close(self._main)
+
+
+OnTerminal = Callable[..., Terminal]
+
+
+@pytest.fixture
+def on_terminal(zygote: Zygote) -> OnTerminal:
+    """Return what runs a command on a terminal of 80 columns."""
+    return partial(Terminal, zygote)
+
+
+@contextmanager
+def flying(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
+    """Publish topics of vehicles that stand still."""
+    publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
+
+    def publish() -> None:
+        for publisher in publishers:
+            publisher.publish(message(1, **VALID))
+
+    with repeating(publish):
+        yield
+
+
+@pytest.mark.process
+def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus) -> None:
+    """At 80 columns a line is a line, below a heading; the addresses of two vehicles are a column, and whole."""
+    with flying(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
+        assert terminal.wait() == 0
+    shown = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
+    assert len([line for line in shown if VLP in line]) == 40
+    assert max(map(len, shown)) <= 80
+    state = -1
+    for line in shown:
+        if VLP not in line:
+            state = line.index("STATE")
+        elif "  ok" in line:
+            assert line.index("  ok") + 2 == state
+
+
+@pytest.mark.process
+def test_info_names_what_is_gone(on_terminal: OnTerminal, endpoint: str, raw: Session) -> None:
+    """The number stands in the table, the addresses below it; on a terminal no address is broken."""
+    gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
+    sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
+    service = answer(raw, "nedbus/@service/s/status", {"service": "s", "sources": sources})
+    info = run_command("info", "-c", endpoint)
+    assert info.exit_code == 0, info.err
+    assert "  5 gone\n" in info.out
+    assert f"\ngone: {', '.join(gone)}\n" in info.out
+    with on_terminal("info", "-c", endpoint) as terminal:
+        assert terminal.wait() == 0
+    lines = terminal.shown.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(any(address in line for line in lines) for address in gone)
+    del service
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_hz_redraws_in_place(
+    on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus, number: signal.Signals, exit_code: int
+) -> None:
+    """On a terminal the table is drawn over the last one, as high as the terminal at most, and stays at the end.
+
+    Ctrl-C and SIGTERM, as of `timeout`, end the redrawing and show the cursor again.
+    """
+    vehicles = [str(vehicle) for vehicle in range(12)]
+    with flying(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
+        wait_for(lambda: terminal.shown.count("VEHICLE/TOPIC") >= 2, what="a second table")
+        terminal.popen.send_signal(number)
+        assert terminal.wait() == exit_code
+    assert "\x1b[1A\x1b[2K" in terminal.shown
+    assert " more" in terminal.shown
+    assert all(drawing.count("\n") <= 10 for drawing in terminal.shown.split("VEHICLE/TOPIC")[1:])
+    assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
+    assert "Traceback" not in terminal.shown
+
+
+@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_signal_while_a_table_starts(
+    monkeypatch: pytest.MonkeyPatch, number: signal.Signals, raised: type[BaseException]
+) -> None:
+    """It has its effect when the table has started, and can be stopped: the cursor is shown again."""
+    shown: list[bool] = []
+
+    def show_cursor(console: Console, show: bool = True) -> bool:
+        shown.append(show)
+        if show is False:
+            signal.raise_signal(number)
+        return True
+
+    monkeypatch.setattr(Console, "show_cursor", show_cursor)
+    monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: 80)
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(raised), live_table(HEAD, ()) as show:
+            show(ROWS)
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+    assert shown == [False, True]
+
+
+@pytest.mark.parametrize("command", ["echo", "hz"])
+def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
+    """`echo` and `hz` say when the link to the router breaks, and when it is back; `hz` says so of each stream."""
+    where = free_endpoint()
+    router = open_router(listen=(where,))
+    run_nedbus("serve", "-c", where, "-s", "sim:")
+    follower = run_nedbus(command, "-c", where, "--json")
+    wait_for(lambda: follower.out, what="data")
+    router.close()
+    wait_for(lambda: f"the link to {where} is lost: still trying" in follower.err, what="the break")
+    if command == "hz":
+        wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
+    with closing(open_router(listen=(where,))):
+        wait_for(lambda: f"the link to {where} is back" in follower.err, what="the link")
+        lines = follower.out.count("\n")
+        wait_for(lambda: follower.out.count("\n") > lines + 3, what="more data")
+
+
+def states(lines: str) -> list[str]:
+    return [json.loads(line)["state"] for line in lines.splitlines() if line.endswith("}")]
+
+
+def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A stream whose service was killed is not "ok", in `hz` as in `list`, and `hz` tells it once, first of all."""
+    service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
+    wait_for(bus.latest, what="data")
+    with bus.publisher(VLP, vehicle="other") as other:
+        hz = run_nedbus("hz", "-c", endpoint, "--json", "-t", VLP)
+        wait_for(lambda: "ok" in states(hz.out), what="a healthy stream")
+        service.kill()
+        wait_for(lambda: "gone" in states(hz.out), what="its end")
+        other.publish(message(1))
+
+        def is_seen() -> bool:
+            other.publish(message(2))
+            return '"vehicle": "other"' in hz.out
+
+        wait_for(is_seen, what="another second")
+    assert states(hz.out).count("gone") == 1
+
+
+def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, timings: Timings) -> None:
+    """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
+    hz = start_hasty(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
+    wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
+    timings.stale = 0.5
+    listed = run_command("list", "-c", endpoint)
+    assert [line.split()[3] for line in listed.out.splitlines()[1:]] == ["stale:"] * 5
+    assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5
+
+
+def answer(raw: Session, key: str, status: object) -> object:
+    """Answer queries for a status as a hostile service would."""
+    return raw.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
+
+
+def test_hostile_status_is_shown_harmless(endpoint: str, raw: Session) -> None:
+    """Escape sequences, forged lines and endless texts of a service are shown as short text, or left out."""
+    flood = [{"source": EVIL * 1000, "state": "retrying", "error": EVIL * 1000, "published": [EVIL] * 1000}]
+    stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
+    source = {**flood[0], "stale": [EVIL], "streams": [stream, None, {"address": 1}], "addresses": EVIL}
+    status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
+    hostile = answer(raw, "nedbus/@service/hostile/status", status)
+    for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
+        shown = run_command(*arguments, "-c", endpoint)
+        assert shown.exit_code == (arguments[0] == "health"), shown.err
+        assert not has_control(shown.out + shown.err)
+        assert "\nforged line" not in shown.out + shown.err
+        assert len(shown.out + shown.err) < 5000
+    del hostile
+
+
+def test_hostile_keys_are_shown_harmless(endpoint: str, raw: Session) -> None:
+    """Keys and tokens with escape sequences reach neither the output nor the log."""
+    tokens = [
+        raw.liveliness().declare_token(f"nedbus/{name}/@alive/1a/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)
+    ]
+
+    def put() -> None:
+        raw.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
+        raw.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
+
+    with repeating(put):
+        for arguments, exit_code in ((["list"], 0), (["echo", "*", "-d", "0.5"], 1), (["hz", "-d", "0.5"], 1)):
+            shown = run_command(*arguments, "-c", endpoint)
+            assert shown.exit_code == exit_code, shown.err
+            assert not has_control(shown.out + shown.err)
+            assert len(shown.out + shown.err) < 5000
+            assert exit_code == 0 or "not a VehicleLocalPosition" in shown.err
+    assert len(tokens) == 3
+
+
+def test_flood_of_keys_leaves_hz_small(endpoint: str, bus: nedbus.Bus) -> None:
+    """Of 100 vehicles there are 50 rows a second and a number, not 100."""
+    with flying(bus, *(f"flood-{number}" for number in range(100))):
+        hz = run_command("hz", "-c", endpoint, "-n", "1000")  # each vehicle has sent by then
+    assert hz.exit_code == 0
+    assert "\n50 more\n" in hz.out
+    assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
+
+
+CLOSING = {
+    "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself finds a stream that is closed
+    "exec 2>&-": "os.close(2); sys.stderr = None",
+}
+CLOSED = "nedbus: cannot write to stdout: standard output is closed\n"
+
+
+@pytest.mark.parametrize("shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"])
+@pytest.mark.parametrize(
+    ("limit", "command", "expected"),  # exit code, number of lines on stdout, stderr
+    [
+        *(("exec >&-", command, (1, 0, CLOSED)) for command in ("list", "schema", "get", "--version", "pki ca .")),
+        ("exec 2>&-", "list", (0, 2, "")),
+        ("exec 2>&-", "get -v 9", (1, 0, "")),
+    ],
+)
+def test_closed_stream_is_one_line(
+    start: Start, endpoint: str, bus: nedbus.Bus, *, limit: str, command: str, expected: object, shell: bool
+) -> None:
+    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain."""
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    script = f"import os, sys\n{CLOSING[limit]}\nfrom nedbus.cli import main\nmain()"
+    if shell:
+        line = f"{limit}; NEDBUS_CONNECT={endpoint} exec {sys.executable} -m nedbus {command}"
+        ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
+        said = ended.returncode, len(ended.stdout.splitlines()), ended.stderr
+    else:
+        process = start("-c", script, *command.split(), NEDBUS_CONNECT=endpoint)
+        said = process.wait(), len(process.out.splitlines()), process.err
+    assert said == expected
+
+
+MOMENTS = [pytest.param("echo", imports) for imports in (1, 50, 150, 300, 10_000)]
+MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz", "list", "serve -s sim:", "router")]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports after that of nedbus.cli; 10,000 are all
+def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: str, imports: int) -> None:
+    """Ctrl-C at any moment from the start of `main` on ends without a traceback, as 130 in a shell."""
+    environment = unmeasured() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
+    arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
+    null, pipe = subprocess.DEVNULL, subprocess.PIPE
+    with subprocess.Popen(arguments, stdout=null, stderr=pipe, text=True, env=environment) as process:
+        assert process.stderr is not None
+        started, seen = False, 0
+        for line in process.stderr:  # the moment is one of the program, not of a clock
+            seen += started
+            started = started or line.rstrip().endswith(" nedbus.cli")
+            if seen == imports or line.rstrip().endswith(" nedbus.cli.app"):
+                break
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+        assert process.wait(DEADLINE) in {-signal.SIGINT, 130, 0}
+    assert "Traceback" not in rest
+
+
+STUCK = """
+import time
+from nedbus.cli import run
+
+def stand_still(stop):
+    print("started", flush=True)
+    time.sleep(100)
+
+run._END_TIMEOUT = 100.0
+run.run_until_stopped(stand_still, on_stop=lambda: print("stopping", flush=True))
+"""
+
+
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
+def test_second_signal_ends_at_once(start: Start, number: signal.Signals, exit_code: int) -> None:
+    """A command that is stuck, and would have some time to end, has none after a second signal."""
+    stuck = start("-c", STUCK, measured=False)
+    for text in ("started", "stopping"):
+        wait_for(lambda text=text: text in stuck.out, what=text)  # type: ignore[misc]
+        stuck.signal(number)
+    assert stuck.wait() == exit_code
+
+
+SLOW = """
+import sys, time
+from nedbus.cli.app import app
+from nedbus.daemon import daemon
+
+def open_slowly(**settings):
+    print("opening", flush=True)
+    time.sleep(2.0)
+    return open_router(**settings)
+
+open_router, daemon.open_router = daemon.open_router, open_slowly
+app(["serve", "-s", "sim:", "-l", sys.argv[1]])
+"""
+
+
+def test_signal_during_a_slow_start_is_no_failure(start: Start) -> None:
+    """Where opening a router takes longer than closing a session may, Ctrl-C ends as ever, and nothing is lost."""
+    service = start("-c", SLOW, free_endpoint(), measured=False)
+    wait_for(lambda: "opening" in service.out, what="the service to open its router")
+    service.signal(signal.SIGINT)
+    assert service.wait() == 130
+    assert "lost" not in service.err
+
+
+ENDLESS = """
+import threading, time
+from nedbus.cli import run
+
+def work(stop):
+    print("started", flush=True)
+    stop.wait()
+    if "LIMIT" == "_CLOSE_TIMEOUT":
+        closing.set()
+    time.sleep(100)
+
+closing = threading.Event()
+run.LIMIT = 0.1
+run.run_until_stopped(work, closing=closing)
+"""
+
+
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
+@pytest.mark.parametrize(
+    ("limit", "reason"),
+    [
+        ("_END_TIMEOUT", "still at work 0.1 s after the signal"),
+        ("_CLOSE_TIMEOUT", "links not closed within 0.1 s"),
+    ],
+)
+def test_what_does_not_end_is_ended_by_force(
+    start: Start, number: signal.Signals, exit_code: int, limit: str, reason: str
+) -> None:
+    """Work has longer to end than a session to be closed; each says that it was cut short."""
+    endless = start("-c", ENDLESS.replace("LIMIT", limit), measured=False)
+    wait_for(lambda: "started" in endless.out, what="the start")
+    endless.signal(number)
+    assert endless.wait() == exit_code
+    assert reason in endless.err
+
+
+def test_hangup_ends_a_router(run_nedbus: Start) -> None:
+    """SIGHUP ends a command that has nothing to reload; the signal is logged, with the date."""
+    where = free_endpoint()
+    router = run_nedbus("router", "-l", where)
+    wait_for(lambda: f"router on {where}" in router.err, what="the router")
+    router.signal(signal.SIGHUP)
+    assert router.wait() == 0
+    last = router.err.splitlines()[-1]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    stopping on SIGHUP", last)
+
+
+ON_TERMINAL = (
+    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+)
+
+
+@contextmanager
+def owning_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run `nedbus` as the first process of a terminal; yield it and the other side of the terminal."""
+    main, terminal = pty.openpty()
+    python = (sys.executable, "-c", ON_TERMINAL, sys.executable, "-m", "nedbus", *command)
+    with log.open("wb") as err, subprocess.Popen(
+        python, stdin=terminal, stdout=terminal, stderr=err, start_new_session=True, env=unmeasured()
+    ) as process:  # fmt: skip
+        os.close(terminal)
+        yield process, main
+        process.kill()
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("command", ["serve -s sim:", "record -o flight.mcap", "web --http 127.0.0.1:PORT"])
+def test_closed_terminal_ends_commands(bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str) -> None:
+    """A closed terminal ends a service, a recording and a page, as Ctrl-C does; none runs on unseen."""
+    log, arguments = tmp_path / "log", command.replace("PORT", str(free_port())).split()
+    with flying(bus, "9"), owning_terminal(log, *arguments, "-c", endpoint) as (process, main):
+        begun = {
+            "serve": lambda: "1" in bus.vehicles(),
+            "record": lambda: Path("flight.mcap").exists() and Path("flight.mcap").stat().st_size > 1000,
+            "web": lambda: "open http" in log.read_text(),
+        }
+        wait_for(begun[arguments[0]], what="the command")
+        os.close(main)
+        assert process.wait(DEADLINE) == 0
+    assert "stopping on SIGHUP" in log.read_text()
+
+
+@pytest.mark.process
+def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> None:
+    """A SIGHUP from `kill` makes a service reload, on an open terminal too."""
+    log = tmp_path / "log"
+    with owning_terminal(log, "serve", "-s", "sim:", "-c", endpoint) as (process, main):
+        wait_for(lambda: "sim:" in log.read_text(), what="the source")
+        process.send_signal(signal.SIGHUP)
+        wait_for(lambda: "settings reloaded: 0 started, 0 stopped, 1 unchanged" in log.read_text(), what="the reload")
+        process.terminate()
+        assert process.wait(DEADLINE) == 0
+        os.close(main)
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_make_run(tmp_path: Path) -> None:
+    """A second one says that the address is in use, and how to choose; Ctrl-C ends the first without make's error."""
+    program = tmp_path / "venv" / "bin" / "nedbus"
+    program.parent.mkdir(parents=True)
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
+    program.chmod(0o755)
+    (tmp_path / "venv" / ".ready").touch()
+    options = f"-s sim: -l {free_endpoint()} --http 127.0.0.1:{free_port()}"
+    command = ["make", "-C", str(ROOT), "run", f"VENV={tmp_path}/venv", f"ARGS={options}"]
+    log = tmp_path / "log"
+    with log.open("w") as written:
+        first = subprocess.Popen(command, stdout=written, stderr=written, env=unmeasured(), start_new_session=True)
+    try:
+        wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
+        second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)
+        assert second.returncode == 2
+        assert "(address already in use): choose another address with --http\n" in second.stderr
+        assert 'make run ARGS="' in second.stderr
+        os.killpg(first.pid, signal.SIGINT)
+        assert first.wait(DEADLINE) in {0, -signal.SIGINT}
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(first.pid, signal.SIGKILL)
+    assert "stopping on SIGINT" in log.read_text()
+    assert "***" not in log.read_text()

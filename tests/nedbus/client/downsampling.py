@@ -1,0 +1,112 @@
+"""Downsampling publishers with a fake clock, and a link that counts its bytes."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import pytest
+
+import nedbus
+from nedbus.client.publishing import downsampler
+from tests.flights.messages import message
+from tests.waits import wait_for
+
+from .numbered import take
+
+MS = 1_000_000  # ns
+
+
+class Link:
+    """A TCP link to a router; `carried` counts its bytes, and it blocks while `flows` is not set."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.carried = 0
+        self.flows = threading.Event()
+        self.flows.set()
+        self.broken = False
+        self._to = endpoint.removeprefix("tcp/").split(":")
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._sockets: list[socket.socket] = []
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Break all connections, and accept no others until `broken` is false again."""
+        self.broken = True
+        for each in self._sockets:
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self.flows.set()
+        self._sockets.append(self._listener)
+        self.cut()
+        for each in self._sockets:
+            each.close()
+
+    def _accept(self) -> None:
+        with suppress(OSError):  # closed
+            while True:
+                near, _ = self._listener.accept()
+                if self.broken:
+                    near.close()
+                    continue
+                far = socket.create_connection((self._to[0], int(self._to[1])))
+                self._sockets += [near, far]
+                for source, target in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=(source, target), daemon=True).start()
+
+    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):  # closed
+            while data := source.recv(4096):
+                self.flows.wait()
+                self.carried += len(data)
+                target.sendall(data)
+
+
+class Clock:
+    """The fake clock of publishers."""
+
+    def __init__(self) -> None:
+        self.now = 10**18
+
+    def monotonic_ns(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Downsample with a fake clock in the publishers of this process."""
+    clock = Clock()
+    monkeypatch.setattr(downsampler, "time", clock)
+    return clock
+
+
+def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -> None:
+    """Publish messages with the timestamps `first`, `first + 1`, ..., 10 ms apart."""
+    for timestamp in range(first, first + count):
+        clock.now += 10 * MS
+        publisher.publish(message(timestamp))
+
+
+def is_wanted(publisher: nedbus.Publisher) -> bool:
+    """Return True if a publisher is matched by a downsampling reader of its vehicle."""
+    return publisher._downsampler.vehicle.is_matched()  # what it does about that shows only once it publishes
+
+
+def wait_for_demand(publisher: nedbus.Publisher) -> None:
+    """Wait until a publisher is matched by a downsampling reader."""
+    wait_for(partial(is_wanted, publisher), what="the demand for a downsampled stream")
+
+
+def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any]) -> None:
+    """Wait until a subscription is open and matched: take message 0, which was published before.
+
+    The last message is queried, and one published meanwhile may be overtaken by the reply.
+    """
+    assert take(subscription, 1) == [0]
+    wait_for_demand(publisher)

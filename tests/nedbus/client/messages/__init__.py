@@ -1,0 +1,1 @@
+"""Messages with and without a file, through a real router."""

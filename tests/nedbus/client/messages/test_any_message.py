@@ -1,0 +1,134 @@
+"""Messages without a file in nedbus: from a log through a service to readers that query their definition."""
+
+from __future__ import annotations
+
+import gc
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+
+import nedbus
+from nedbus.transport import Session
+from nedbus_msgs import Definition, define_msg, field_type, short_hash
+from tests.nedbus_msgs.messages.test_messages import write_wheels
+from tests.peers.answering import answering, reply_with
+from tests.peers.processes import Start
+from tests.waits import DEADLINE, wait_for, wait_for_reader
+
+COUNT = 500
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("form", ["models", "rows", "batches"])
+def test_message_of_a_log_is_read_without_a_file(
+    tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
+) -> None:
+    """No message is lost during the lookup, in any form; the values are those of the log."""
+    log = write_wheels(tmp_path / "rover.ulg", COUNT)
+    with bus.subscribe("wheel_encoders", mode="every") as subscription:
+        run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
+        read: list[tuple[int, tuple[float, ...]]] = []
+        while len(read) < COUNT:
+            if form == "batches":
+                batch = subscription.receive_batch(DEADLINE)
+                assert batch.message.__name__ == "WheelEncoders"
+                read += zip(
+                    batch.messages["timestamp"].tolist(),
+                    map(tuple, batch.messages["wheel_speed"].tolist()),
+                    strict=True,
+                )
+                continue
+            message: Any = next(iter(subscription) if form == "models" else subscription.rows()).message
+            read.append((message.timestamp, message.wheel_speed))
+        assert read == [(number + 1, (number, -number)) for number in range(COUNT)]
+        assert subscription.counts == nedbus.Counts(received=COUNT)
+    [last] = bus.latest("wheel_encoders")
+    assert (last.source, last.missing) == ("ulog", frozenset())
+    assert dict(last.message)["wheel_angle"] == (0.5, 0.5)
+    assert last.address in [address for addresses in bus.vehicles().values() for address in addresses]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"[" * 10_000,
+        b'{"layouts": 7}',
+        {"fields": [{"name": f"f{number}", "type": "float32"} for number in range(100_000)]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "x", "type": "float32[999999999]"}]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "__class__", "type": "uint8"}]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "model_fields", "type": "uint8"}]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "x", "type": "__import__('os')"}]},
+        {"fields": [{"name": "x", "type": "uint8"}]},
+        {"fields": []},
+    ],
+)
+def test_hostile_description_harms_no_other_stream(
+    client: nedbus.Bus, bus: nedbus.Bus, raw: Session, answer: bytes | dict[str, Any]
+) -> None:
+    """If a peer sends a wrong description, its own message is invalid, and others are read."""
+    identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
+    with suppress(ValueError):  # most hashes are right, so that the description itself is rejected
+        identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
+    payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
+    schema = "nedbus/@schema/peer/Evil"
+    with answering(raw, schema, reply_with({schema: payload})), client.subscribe("*", mode="every") as subscription:
+        good = bus.publisher("vehicle_attitude", vehicle="1")
+        wait_for_reader(raw, "nedbus/7/evil")
+        encoding = f"application/msgpack;px4_msgs/Evil;hash={identity}"
+        raw.put("nedbus/7/evil", msgpack.packb([0, 1, 2]), encoding=encoding)
+        good.publish({"timestamp": 5})
+        assert subscription.receive(DEADLINE).message == nedbus.VehicleAttitude(timestamp=5)
+
+        def is_rejected() -> bool:
+            with suppress(nedbus.NoDataError):
+                subscription.receive(0.1)
+            return subscription.counts.invalid == 1
+
+        wait_for(is_rejected, what="the other one, of another priority")
+
+
+def read_once(endpoint: str, topic: str, form: str) -> int:
+    """Connect, read the last message in a form, close, and return its timestamp."""
+    with nedbus.connect(endpoint) as reader:
+        if form == "latest":
+            return int(reader.latest(topic)[0].message.timestamp)
+        with reader.subscribe(topic, mode="every") as subscription:
+            if form == "models":
+                return int(subscription.receive(DEADLINE).message.timestamp)
+            return int(subscription.receive_batch(DEADLINE).messages["timestamp"][0])
+
+
+def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
+    """Of readers that connect, read a message without a file and close, no definition remains, in any form."""
+    definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
+    publisher = bus.publisher("comes_and_goes", vehicle="1", definition=definition)
+    publisher.publish({"timestamp": 1})
+    assert [read_once(endpoint, "comes_and_goes", form) for form in ("latest", "models", "batches")] == [1, 1, 1]
+
+    def is_freed() -> bool:
+        gc.collect()
+        found = [each for each in gc.get_objects() if isinstance(each, Definition) and each.name == definition.name]
+        return len(found) == 1
+
+    wait_for(is_freed, what="the definitions of closed readers")
+
+
+def test_message_of_unknown_encoding_says_so(
+    client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without name and hash in its encoding a message cannot be looked up, and the error says so."""
+    with client.subscribe("wheel_encoders") as subscription:
+        wait_for_reader(raw, "nedbus/7/wheel_encoders")
+        raw.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
+
+        def is_counted() -> bool:
+            with pytest.raises(nedbus.NoDataError):
+                subscription.receive(0.05)
+            return subscription.counts.invalid == 1
+
+        wait_for(is_counted, what="it to be counted")
+    assert "the encoding 'text/plain' has no name and hash of a message" in caplog.text

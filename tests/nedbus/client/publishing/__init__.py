@@ -1,0 +1,1 @@
+"""Publishers: flow control, heartbeats and slow readers."""

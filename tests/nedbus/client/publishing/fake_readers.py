@@ -1,0 +1,191 @@
+"""Readers of a lossless publisher, and Zenoh between them, with a clock that advances only by waiting."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from operator import itemgetter
+from types import SimpleNamespace
+from typing import Final, cast
+
+import pytest
+import zenoh
+
+from nedbus.client.protocol import CLOSED
+from nedbus.client.publishing import flow_control as module
+from nedbus.client.publishing.flow_control import FlowControl, SharedWindow
+from nedbus.client.publishing.writer import Writer
+from nedbus.timings import TIMINGS, Timings
+from tests.nedbus.client.receiving.raw_samples import Payload
+
+KEY: Final = "nedbus/1/vehicle_local_position"
+_TICK: Final = 0.01  # s
+END: Final = 600.0  # s after which a wait is stuck
+
+
+class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
+    """Raised when a wait does not end within ten minutes."""
+
+
+@dataclass(eq=False)
+class Reader:
+    """A reader of `rate` messages per second; its lease expires 5 s after it is suspended."""
+
+    name: str
+    rate: float = math.inf
+    read: float = 0.0
+    alive: bool = True
+    closed: bool = False
+    stopped: float | None = None  # since when
+    stops_in_answer: bool = False  # between its next answer, and the word that this was all
+
+    def is_linked(self, now: float) -> bool:
+        return self.alive and (self.stopped is None or now - self.stopped < TIMINGS.lease)
+
+    def is_running(self) -> bool:
+        return self.alive and self.stopped is None
+
+
+@dataclass(eq=False)
+class Query:
+    """A query of the publisher, and the readers that have not replied yet."""
+
+    number: int
+    read: bool
+    end: float
+    waiting: list[Reader]
+    replies: deque[SimpleNamespace] = field(default_factory=deque)
+    ended: bool = False
+    lost: bool = False  # a full queue dropped it
+
+    def try_recv(self) -> SimpleNamespace | None:
+        """Return the next reply, like the channel of a query."""
+        if not self.replies and self.ended:
+            raise zenoh.ZError("ended")
+        return self.replies.popleft() if self.replies else None
+
+
+@dataclass(eq=False)
+class World:
+    """The session of the publisher, and its clock; everything runs in the waiting thread."""
+
+    readers: list[Reader] = field(default_factory=list)
+    now: float = 0.0
+    published: int = 0
+    sent: list[float] = field(default_factory=list)  # when each message was sent
+    asked: list[dict[str, str]] = field(default_factory=list)  # the parameters of each query
+    pending: list[Query] = field(default_factory=list)
+    plans: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
+    routers: list[str] = field(default_factory=lambda: ["r1"])
+    closed: bool = False
+    dropping: bool = False  # a full queue drops all requests
+
+    def flow_control(
+        self, monkeypatch: pytest.MonkeyPatch, timings: Timings, *, needs_router: bool = True
+    ) -> FlowControl:
+        """Return a flow control in this world."""
+        timings.credit_polls = 0.0005, _TICK
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
+        writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
+        return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)
+
+    def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
+        """Publish `count` messages, `rate` per second if there is credit."""
+        for _ in range(count):
+            self.advance(1 / rate)
+            self.published += 1
+            self.sent.append(self.now)
+            control.wait_for_credit(self.published)
+
+    def plan(self, seconds: float, action: Callable[[], object]) -> None:
+        """Schedule an action in a number of seconds."""
+        self.plans.append((self.now + seconds, action))
+        self.plans.sort(key=itemgetter(0))
+
+    def cut(self, reader: Reader, at: float, *, until: float) -> None:
+        """Break the link of a reader."""
+        self.plan(at, lambda: setattr(reader, "alive", False))
+        self.plan(until, lambda: setattr(reader, "alive", True))
+
+    def restart_router(self, reader: Reader, at: float, *, until: float) -> None:
+        """Break the link of the publisher for a second, and that of a reader for longer."""
+        self.cut(reader, at, until=until)
+        self.plan(at, self.routers.clear)
+        self.plan(at + 1.0, lambda: self.routers.append("r2"))
+
+    def stop(self, reader: Reader, at: float, *, until: float) -> None:
+        """Suspend the process of a reader (SIGSTOP)."""
+        self.plan(at, lambda: setattr(reader, "stopped", self.now))
+        self.plan(until, lambda: setattr(reader, "stopped", None))
+
+    def advance(self, seconds: float) -> None:
+        """Advance the clock."""
+        self.now += seconds
+        if self.now > END:
+            raise Stuck
+        while self.plans and self.plans[0][0] <= self.now:
+            self.plans.pop(0)[1]()
+        for reader in self.readers:
+            if reader.is_running():
+                reader.read = min(self.published, reader.read + reader.rate * seconds)
+        for query in self.pending.copy():
+            self._answer(query)
+
+    def is_linked(self, reader: Reader) -> bool:
+        """Return True if a query reaches this reader."""
+        return bool(self.routers) and reader.is_linked(self.now)
+
+    def longest_pause(self, since: float = 0.0) -> float:
+        """Return the longest time without a sent message."""
+        times = [since, *(each for each in self.sent if each >= since)]
+        return max(later - earlier for earlier, later in pairwise(times))
+
+    # What a flow control needs of a session.
+
+    @property
+    def info(self) -> SimpleNamespace:
+        return SimpleNamespace(routers_zid=self.routers.copy)
+
+    def get(
+        self, selector: str, channel: zenoh.handlers.FifoChannel[zenoh.Reply], *, timeout: float, **options: object
+    ) -> Query:
+        if self.closed:
+            raise zenoh.ZError("session closed")
+        key, _, parameters = selector.partition("?")
+        assert key == f"{KEY}/@ack"
+        parsed = dict(each.split("=") for each in parameters.split(";"))
+        self.asked.append(parsed)
+        linked = [reader for reader in self.readers if self.is_linked(reader) and not reader.closed]
+        query = Query(int(parsed["number"]), parsed["read"] == "1", self.now + timeout, linked)
+        query.lost = self.dropping and bool(self.routers)
+        self.pending.append(query)
+        return query
+
+    def _answer(self, query: Query) -> None:
+        for reader in list(query.waiting):
+            if not self.is_linked(reader):
+                query.waiting.remove(reader)
+            elif query.lost:
+                continue
+            elif reader.closed:
+                self._reply(query, reader, CLOSED)
+            elif reader.is_running() and (not query.read or reader.read > query.number):
+                self._reply(query, reader, b"")
+        late = bool(query.waiting) or query.lost
+        if late and self.now < query.end:
+            return
+        self.pending.remove(query)
+        if late:
+            query.replies.append(SimpleNamespace(ok=None))
+        query.ended = True
+
+    def _reply(self, query: Query, reader: Reader, payload: bytes) -> None:
+        if reader.stops_in_answer:
+            reader.stops_in_answer, reader.stopped = False, self.now
+        else:
+            query.waiting.remove(reader)
+        sample = SimpleNamespace(payload=Payload(payload))
+        query.replies.append(SimpleNamespace(ok=sample, replier_id=reader.name))

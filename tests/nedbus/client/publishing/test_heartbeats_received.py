@@ -1,0 +1,58 @@
+"""Heartbeats of nedbus as received by Zenoh's own advanced subscriber."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import zenoh
+
+import nedbus
+from nedbus.client.receiving.receiver import drain
+from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
+from tests.flights.first_message import decode
+from tests.flights.messages import VLP
+from tests.nedbus.client.downsampling import Link, wait_for_demand
+from tests.nedbus.client.numbered import publish, wait_for_subscriber
+from tests.waits import wait_for
+
+
+def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> None:
+    """Zenoh's advanced subscriber recovers the last message after a heartbeat, although no other message follows."""
+    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(100)
+    recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+    samples: list[zenoh.Sample] = []
+
+    def received() -> list[int]:
+        return [decode(sample.payload.to_bytes()).timestamp for sample in drain(subscriber.handler, samples)]
+
+    with closing(Link(endpoint)) as link, open_client([link.endpoint], timeout=5.0) as session:
+        publisher = bus.publisher(VLP, vehicle="1")
+        subscriber = zenoh.ext.declare_advanced_subscriber(session, publisher.key, channel, recovery=recovery)
+        wait_for_subscriber(publisher)
+        publish(publisher, 1)
+        wait_for(lambda: received() == [1], what="the first message")
+        link.cut()
+        wait_for(lambda: not session.info.routers_zid(), what="the end of the link")
+        publish(publisher, 2)
+        link.broken = False
+        wait_for(lambda: received() == [1, 2], what="the last message")
+        subscriber.undeclare()
+
+
+def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, raw: Session) -> None:
+    """Each downsampled stream has its own numbers, and heartbeats with the last one."""
+    heard: Heartbeats = {}
+    take, undeclare = follow_heartbeats(raw, f"nedbus/*/{VLP}/@rate/*")
+    with bus.publisher(VLP, vehicle="1") as publisher, bus.subscribe(VLP, mode="every", max_rate=1):
+        wait_for_demand(publisher)
+
+        def publish_until_heard() -> bool:
+            publish(publisher, publisher.published)
+            heard.update(take())
+            return bool(heard)
+
+        wait_for(publish_until_heard, what="a heartbeat")
+    [((key, _), number)] = heard.items()
+    assert key == f"{publisher.key}/@rate/1"
+    assert number < 10 < publisher.published
+    undeclare()

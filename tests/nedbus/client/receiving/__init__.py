@@ -1,0 +1,1 @@
+"""Subscriptions: queues, recovery, rates and counts."""

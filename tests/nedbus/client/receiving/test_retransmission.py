@@ -1,0 +1,327 @@
+"""Recovery of lost messages by a reader of mode `every`, with real publishers and sessions on loopback.
+
+Loopback loses nothing, so messages are removed behind Zenoh, before the queue of one reader. The last test restarts a
+real router.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus import Counts
+from nedbus.client.io_thread import Job
+from nedbus.client.receiving import Receiver, pending_queue, retransmission
+from nedbus.client.receiving.decoder import WAKE_UP
+from nedbus.client.receiving.receiver import drain
+from nedbus.timings import Timings
+from nedbus.transport import RetransmitRequest, Session, open_client, open_router
+from tests.flights.first_message import encode, encoding_of
+from tests.flights.messages import VLP, message
+from tests.nedbus.client.lossy import Lossy, LossyQueue
+from tests.nedbus.client.numbered import publish, wait_for_subscriber
+from tests.peers.answering import answering, reply_with
+from tests.peers.ports import free_endpoint
+from tests.waits import DEADLINE, wait_for, wait_for_reader, wait_for_router
+
+KEY = f"nedbus/7/{VLP}"
+
+
+@pytest.fixture
+def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lossy]:
+    """Subscribe to all vehicles, and wait until the publisher is matched."""
+    publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
+    with closing(open_client([endpoint], timeout=DEADLINE)) as session:
+        lossy = Lossy(session, queue, Receiver(session, queue), publisher)
+        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.ask)
+        with lossy.subscription:
+            wait_for_subscriber(publisher)
+            yield lossy
+
+
+def fail(*_: object) -> None:
+    raise ArithmeticError
+
+
+@pytest.mark.parametrize("unanswered", [0, 3])
+def test_missing_samples_are_requested_by_the_exact_key(lossy: Lossy, unanswered: int) -> None:
+    """Requests have an exact key, as routers compare wildcards with all caches, and are repeated after a restart."""
+    lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
+    lossy.publish(*range(7))
+    assert lossy.receive(7) == list(range(7))
+    assert lossy.asked == [(KEY, 1, 5)] * (unanswered + 1)
+    assert lossy.subscription.counts == Counts(received=7)
+
+
+def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages no longer in the publisher's cache are lost, after a second request."""
+
+    def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> RetransmitRequest:
+        return RetransmitRequest(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
+
+    monkeypatch.setattr(retransmission, "RetransmitRequest", forget)
+    lossy.queue.missing = {1, 2, 3, 4}
+    lossy.publish(*range(6))
+    samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]
+    assert [(sample.message.timestamp, sample.lost) for sample in samples] == [(0, 0), (3, 2), (4, 0), (5, 0)]
+    assert lossy.subscription.counts == Counts(received=4, lost=2)
+
+
+def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, raw: Session, timings: Timings) -> None:
+    """A publisher of another program, with sequence numbers but no cache, gets one request per gap after a timeout."""
+    timings.retransmit_timeout = 0.2
+    misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+    key = f"nedbus/foreign/{VLP}"
+    foreign = zenoh.ext.declare_advanced_publisher(raw, key, sample_miss_detection=misses)
+    lossy.queue.missing = {1, 3}
+    wait_for_reader(raw, key)
+    for timestamp in range(3):
+        foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
+    assert lossy.receive(2) == [0, 2]
+    tries = len(lossy.asked)
+    assert tries > 1
+    for timestamp in (3, 4):
+        foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
+    assert lossy.receive(1) == [4]
+    assert len(lossy.asked) == tries + 1
+    assert lossy.subscription.counts == Counts(received=3, lost=2)
+    foreign.undeclare()
+
+
+def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, timings: Timings) -> None:
+    """A publisher that timed out has lost nothing once it replies again."""
+    timings.retransmit_timeout = 0.2
+    lossy.queue.missing, lossy.unanswered = {1, 3, 5}, 1_000_000
+    lossy.publish(0, 1, 2)
+    assert lossy.receive(2) == [0, 2]
+    timings.retransmit_timeout = DEADLINE
+    lossy.unanswered = 0
+    lossy.publish(3, 4)
+    assert lossy.receive(2) == [3, 4]
+    lossy.unanswered = len(lossy.asked) + 1
+    lossy.publish(5, 6)
+    assert lossy.receive(2) == [5, 6]
+
+
+@pytest.mark.parametrize("waits", ["without", "with a timeout"])
+def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, waits: str) -> None:
+    """The newest message is recovered by a heartbeat, also if its reader waits in Zenoh's channel without timeout.
+
+    The sample that wakes it up is invisible to other readers of its session, and does not leave the process.
+    """
+    received: list[int] = []
+    seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
+    foreign = raw.declare_subscriber(KEY, seen)
+    wait_for_router(raw)
+    lossless = LossyQueue(KEY)
+    other = Receiver(lossy.session, lossless)
+
+    def read() -> None:
+        if waits == "without":
+            received.extend(sample.message.timestamp for sample in lossy.subscription)
+        else:
+            while len(received) < 3:
+                received.extend(lossy.receive(1))
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    lossy.queue.missing = {1, 2}
+    lossy.publish(0)
+    wait_for(lambda: received == [0], what="the first message")
+    lossy.publish(1, 2)
+    wait_for(lambda: received == [0, 1, 2], what="what heartbeats tell of")
+    wait_for(lambda: lossless.waiting == 3, what="the other reader")
+    lossy.subscription.close()
+    reader.join(DEADLINE)
+    other.close()
+    assert lossy.subscription.counts == Counts(received=3)
+    assert lossless.counts == Counts()
+    elsewhere: list[zenoh.Sample] = []
+    wait_for(lambda: len(drain(foreign.handler, elsewhere)) == 3, what="the messages in another session")
+    assert WAKE_UP not in {str(sample.encoding) for sample in elsewhere}
+    foreign.undeclare()
+
+
+def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
+    """Replies of peers other than the publisher are ignored."""
+    lie = reply_with({KEY: encode(message(666))}, encoding=encoding_of("sim"))
+    with answering(raw, f"{KEY}/@adv/pub/**", lie):
+        lossy.queue.missing = {1}
+        lossy.publish(0, 1, 2)
+        assert lossy.receive(3) == [0, 1, 2]
+        assert lossy.subscription.counts == Counts(received=3)
+
+
+@pytest.mark.parametrize("when", ["open", "closed"])
+def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str) -> None:
+    """A flood of replies to a request does not stop the session, not even after its reader has closed."""
+    asked = threading.Event()
+
+    def flood(query: zenoh.Query) -> None:
+        with query:
+            asked.set()
+            for _ in range(2000):
+                query.reply(KEY, b"junk")
+
+    with answering(raw, f"{KEY}/@adv/pub/**", flood):
+        lossy.queue.missing = {1}
+        lossy.publish(0, 1, 2)
+        if when == "closed":
+            assert asked.wait(DEADLINE)
+            lossy.subscription.close()
+        else:
+            assert lossy.receive(3) == [0, 1, 2]
+        queue = LossyQueue(KEY)
+        other = Receiver(lossy.session, queue)
+
+        def goes_on() -> bool:
+            lossy.publish(7)
+            return queue.waiting > 0
+
+        wait_for(goes_on, what="a message for another reader of this session")
+        other.close()
+
+
+@pytest.mark.parametrize(
+    "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
+)
+def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> None:
+    """A forged heartbeat causes no request, and prevents no other."""
+    raw.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
+    raw.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
+    lossy.queue.missing = {1}
+    lossy.publish(0, 1, 2)
+    assert lossy.receive(3) == [0, 1, 2]
+    lossy.publish(3)
+    assert lossy.receive(1) == [3]
+    assert {key for key, _, _ in lossy.asked} == {KEY}
+    assert not lossy.queue.account.requesting
+
+
+def test_requests_without_replies_delay_no_others(lossy: Lossy, raw: Session) -> None:
+    """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
+    taken: list[zenoh.Query] = []
+    evil = f"nedbus/evil/{VLP}/@adv/pub"
+    with answering(raw, f"{evil}/**", taken.append):
+        for number in range(1, 300):
+            raw.put(f"{evil}/{number:x}/1/_", b"\x05\x00\x00\x00")
+        wait_for(lambda: taken, what="a question for one that is invented")
+        lossy.queue.missing = {1}
+        lossy.publish(0, 1, 2)
+        assert lossy.receive(3) == [0, 1, 2]
+        assert lossy.queue.account.requesting  # the others still wait
+        taken.clear()
+
+
+def test_job_that_fails_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
+    """An exception in the job of one subscription is logged once, and delays neither it nor others."""
+    calls: list[float] = []
+
+    def fail_at_first(now: float) -> float:
+        calls.append(now)
+        return 0.0 if len(calls) > 2 else 1 / 0
+
+    def go_on(now: float) -> float:
+        others.append(now)
+        return 0.01
+
+    others: list[float] = []
+    jobs = [Job(fail_at_first), Job(go_on)]
+    wait_for(lambda: len(calls) > 5 and len(others) > 5, what="both")
+    for job in jobs:
+        job.end()
+    assert sum("unexpected error" in text for text in caplog.messages) == 1
+
+
+def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gaps of 60 vehicles at once are requested a few at a time, and all are filled."""
+    monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
+    publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
+    for publisher in publishers:
+        wait_for_subscriber(publisher)
+    lossy.queue.missing = {1}
+    for publisher in publishers:
+        publish(publisher, 0, 1, 2)
+    assert sorted(lossy.receive(180)) == [0] * 60 + [1] * 60 + [2] * 60
+    assert lossy.subscription.counts == Counts(received=180)
+    assert 1 < lossy.most <= 4
+
+
+def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
+    """A close counts the missing messages as lost."""
+    lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
+    lossy.publish(*range(4))
+    assert lossy.receive(1) == [0]
+    wait_for(lambda: lossy.queue.account.requesting, what="the hole")
+    lossy.subscription.close()
+    assert lossy.subscription.counts.lost == 2
+
+
+def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of held back samples is bounded; beyond it gaps are lost, and the samples arrive."""
+    monkeypatch.setattr(pending_queue, "MAX_HELD", 50)
+    lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
+    lossy.publish(*range(60))
+    assert lossy.receive(59) == [0, *range(2, 60)]
+    assert lossy.subscription.counts == Counts(received=59, lost=1)
+
+
+def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recovered messages do not displace those that a slow reader has not read yet."""
+    monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
+    lossy.queue.missing = {10}
+    lossy.publish(*range(20))
+    wait_for(
+        lambda: (lossy.queue.waiting, lossy.queue.account.held) == (10, 9),
+        what="what comes before the hole and after it",
+    )
+    asked_before = list(lossy.asked)
+    assert lossy.receive(20) == list(range(20))
+    assert (asked_before, lossy.asked) == ([], [(KEY, 10, 11)])
+
+
+def test_unexpected_error_costs_what_caused_it(
+    lossy: Lossy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An exception caused by a recovered message is logged, the message is lost, and the reader goes on."""
+    take = lossy.queue.on_retransmission
+    monkeypatch.setattr(
+        lossy.queue,
+        "on_retransmission",
+        lambda writer, found, **options: fail() if found else take(writer, found, **options),
+    )
+    lossy.queue.missing = {1}
+    lossy.publish(0, 1, 2)
+    assert lossy.receive(2) == [0, 2]
+    assert lossy.subscription.counts == Counts(received=2, lost=1)
+    assert any("unexpected error, recovered messages discarded" in text for text in caplog.messages)
+
+
+@pytest.mark.parametrize("rest", [0, 1])
+def test_newest_messages_survive_a_restart_of_the_router(rest: int) -> None:
+    """A reader that was disconnected gets the newest messages, whether another one follows or not."""
+    endpoint = free_endpoint()
+    router = open_router(listen=(endpoint,))
+    received: list[int] = []
+    with nedbus.connect(endpoint) as vehicle, nedbus.connect(endpoint) as reader:
+        publisher = vehicle.publisher(VLP, vehicle="1")
+        subscription = reader.subscribe(mode="every")
+        thread = threading.Thread(target=lambda: received.extend(sample.message.timestamp for sample in subscription))
+        thread.start()
+        publish(publisher, 0)
+        wait_for(lambda: received == [0], what="the first message")
+        router.close()
+        publish(publisher, *range(1, 50))
+        with closing(open_router(listen=(endpoint,))):
+            wait_for(lambda: vehicle.connected and reader.connected, what="both to be back")
+            publish(publisher, *range(50, 50 + rest))
+            wait_for(lambda: len(received) == 50 + rest, what="what was published meanwhile")
+            subscription.close()
+            thread.join(DEADLINE)
+    assert received == list(range(50 + rest))
+    assert subscription.counts == Counts(received=50 + rest)

@@ -1,0 +1,505 @@
+"""Publish, subscribe and query: the same behaviour of the blocking and the asyncio client, through a real router."""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import datetime as dt
+import json
+import logging
+import math
+import pickle
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
+from functools import partial
+from typing import cast
+
+import msgpack
+import pytest
+import zenoh
+
+import nedbus
+from nedbus import Mode
+from nedbus.timings import Timings
+from nedbus.transport import Session, alive_tokens, open_router
+from nedbus.transport.queries import Answers
+from nedbus_msgs import DEFAULT, Address
+from tests.flights.first_message import encode
+from tests.flights.messages import VLP, message
+from tests.nedbus.client.downsampling import Link, wait_for_demand
+from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
+from tests.peers.answering import answering, reply_with
+from tests.peers.ports import free_endpoint
+from tests.waits import DEADLINE, wait_for
+
+BOTH: list[Mode] = ["latest", "every"]
+SCHEMA = "nedbus/@schema/peer/VehicleLocalPosition"
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode) -> None:
+    """A published message arrives with its type, bit for bit, with its address and times."""
+    publisher = bus.publisher("estimator_local_position", vehicle=7, instance=1)
+    sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
+    subscription = client.subscribe("*", mode=mode)
+    publisher.publish(sent)
+    sample = subscription.receive(DEADLINE)
+    assert encode(sample.message) == encode(sent)
+    assert sample.address == Address("7", "estimator_local_position", 1)
+    assert (sample.vehicle, sample.topic, sample.instance, sample.lost) == ("7", "estimator_local_position", 1, 0)
+    assert sample.sent is not None
+    assert abs(sample.received - time.time_ns()) < 60e9
+    assert sample.latency is not None
+
+
+@pytest.mark.parametrize("max_rate", [None, 50])
+@pytest.mark.parametrize("mode", BOTH)
+def test_retained_sample(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_rate: float | None) -> None:
+    """The message from before a subscription is retained, also in a pickle and from `latest`; the next one is not."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+    subscription = client.subscribe(mode=mode, max_rate=max_rate)
+    first = subscription.receive(DEADLINE)
+    wait_for_subscriber(publisher) if max_rate is None else wait_for_demand(publisher)
+    publish(publisher, 2)
+    second = subscription.receive(DEADLINE)
+    assert [(each.message.timestamp, each.retained) for each in (first, second)] == [(1, True), (2, False)]
+    assert pickle.loads(pickle.dumps(first)).retained
+    assert [each.retained for each in client.latest()] == [True]
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_time_of_reading_does_not_count_as_latency(
+    client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`received` is when a sample left Zenoh's ring: a script that reads it late adds nothing to its latency."""
+    subscription, publisher = client.subscribe(mode=mode), bus.publisher(VLP, vehicle="1")
+    with suppress(nedbus.NoDataError):
+        subscription.receive(0.01)  # opens it, and starts the thread that empties the ring
+    wait_for_subscriber(publisher)
+    publish(publisher, 1)
+    wait_for(lambda: subscription.waiting, what="the message")
+    arrived = time.time_ns()
+    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: arrived + 3600 * 10**9)
+    sample = subscription.receive(DEADLINE)
+    assert sample.received <= arrived
+    assert sample.latency == (sample.received - (sample.sent or 0)) / 1e9
+
+
+def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
+    """A publisher is known to the router before its first message, which a new reader else misses once in 300 times."""
+    with nedbus.connect(endpoint) as other:
+        for vehicle in range(100):
+            publish(bus.publisher(VLP, vehicle=vehicle), 1)
+            assert take(other.subscribe(vehicle=vehicle), 1) == [1]
+
+
+def test_subscription_is_a_choice(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """A subscription is selected by topic, vehicle name or MAVLink number, and instance; the default is the estimate.
+
+    The estimate is mixed neither with the ground truth nor with single EKFs. A subscription starts with the last value
+    of each key, even if nothing is published any more.
+    """
+    for vehicle in ("1", "2"):
+        for topic in reversed(tuple(DEFAULT.topics.values())):
+            for instance in (0, 1) if topic.instances else (None,):
+                publish(bus.publisher(topic.name, vehicle=vehicle, instance=instance), 1)
+    wait_for(lambda: len(client.latest("*")) == 10, what="everything")
+    for arguments, options, addresses in (
+        ([], {}, [f"1/{VLP}", f"2/{VLP}"]),
+        ([], {"vehicle": 2}, [f"2/{VLP}"]),
+        (["estimator_local_position"], {"vehicle": "2"}, [f"2/estimator_local_position/{each}" for each in (0, 1)]),
+        (["estimator_local_position"], {"instance": 1}, [f"{each}/estimator_local_position/1" for each in (1, 2)]),
+        (["*"], {"vehicle": 3}, []),
+    ):
+        assert [str(sample.address) for sample in client.latest(*arguments, **options)] == addresses
+        subscription = client.subscribe(*arguments, **options)
+        assert sorted(str(subscription.receive(DEADLINE).address) for _ in addresses) == addresses
+        with pytest.raises(nedbus.NoDataError):
+            subscription.receive(0.05)
+
+
+def test_latest_is_empty_where_nothing_is(client: nedbus.Bus) -> None:
+    """Without a publisher the result is empty, without an error."""
+    assert client.latest("*") == []
+    assert client.vehicles() == {}
+    assert client.services() == []
+
+
+def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
+    return len(bus.vehicles()) == count
+
+
+def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Published vehicles appear by their liveliness tokens, and closed ones disappear.
+
+    A query for all tokens costs all clients of the router, so none is sent.
+    """
+    asked: list[str] = []
+
+    def ask(session: Session, key_expr: str, timeout: float) -> Answers:
+        asked.extend([key_expr] if "*" in key_expr else [])
+        return ask_router(session, key_expr, timeout)
+
+    ask_router = alive_tokens._ask
+    monkeypatch.setattr(alive_tokens, "_ask", ask)
+    with nedbus.connect(endpoint) as other:
+        for count, vehicle in enumerate("789", 1):
+            other.publisher("estimator_local_position", vehicle=vehicle, instance=2)
+            wait_for(partial(has_vehicles, client, count), what=f"vehicle {vehicle}")
+        other.publisher(VLP, vehicle="7")
+        wait_for(lambda: len(client.vehicles()["7"]) == 2, what="another address")
+        assert client.vehicles()["7"] == [Address("7", "estimator_local_position", 2), Address("7", VLP)]
+    wait_for(lambda: not client.vehicles(), what="the vehicles to go")
+    assert not asked
+
+
+def test_more_vehicles_appear_between_calls_than_are_kept(
+    endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After an overflow all tokens are listed again: the list is complete and has no vehicles that left."""
+    monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 20)
+    gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
+    wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
+    gone.undeclare()
+    for number in range(12):
+        raw.liveliness().declare_token(f"nedbus/gone-{number}/@alive/1a/{VLP}").undeclare()
+    tokens = [raw.liveliness().declare_token(f"nedbus/{number}/@alive/1a/{VLP}") for number in range(12)]
+    with nedbus.connect(endpoint) as other:
+        wait_for(partial(has_vehicles, other, len(tokens)), what="all to be there")
+    wait_for(partial(has_vehicles, bus, len(tokens)), what="all of them")
+
+
+def test_vehicles_beyond_the_limit_are_logged(
+    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two of three are an incomplete list, which is logged once; it completes once there is room."""
+    monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 2)
+    timings.tokens_retry = 0.0
+    publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
+    with nedbus.connect(endpoint) as other:
+        wait_for(lambda: other.vehicles() and "more than 2 liveliness tokens" in caplog.text, what="a warning")
+        assert len(other.vehicles()) == 2
+        assert not other.vehicles().complete
+        next(each for each in publishers if str(each.address.vehicle) in other.vehicles()).close()
+        wait_for(lambda: len(vehicles := other.vehicles()) == 2 and vehicles.complete, what="the third one")
+    assert caplog.text.count("liveliness tokens") == 1
+
+
+def test_list_of_a_slow_router_is_incomplete(endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture) -> None:
+    """The vehicles that have arrived are returned, marked and logged once; a later call completes the list."""
+    publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
+    with closing(Link(endpoint)) as link, nedbus.connect(link.endpoint) as other:
+        link.flows.clear()
+        for _ in range(2):
+            vehicles = other.vehicles(timeout=0.05)
+            assert (vehicles, vehicles.complete) == ({}, False)
+            assert not other.publishers(timeout=0.0).complete
+        assert caplog.text.count("the router has not listed all vehicles within 0.05 s") == 1
+        link.flows.set()
+        wait_for(lambda: other.vehicles().complete, what="the end of the list")
+        assert len(other.vehicles()) == len(publishers)
+
+
+def test_vehicles_without_a_router_are_incomplete() -> None:
+    """A bus whose router is gone knows no vehicles, and not whether there are any."""
+    where = free_endpoint()
+    router = open_router(listen=(where,))
+    with nedbus.connect(where) as bus:
+        assert bus.vehicles().complete
+        router.close()
+        wait_for(lambda: not bus.connected, what="the end of the link")
+        assert not bus.vehicles().complete
+
+
+def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
+    """More replies than a Zenoh channel holds (256) do not block, neither within their own bus nor in another."""
+    with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:
+        for number in range(300):
+            publish(one.publisher(VLP, vehicle=str(number)), 1)
+        for asking in (one, other):
+            wait_for(partial(has_vehicles, asking, 300), what="300 vehicles")
+            assert len(asking.latest()) == 300
+
+
+def answers(raw: Session, key: str) -> int:
+    """Count the replies to a plain get."""
+    return sum(reply.ok is not None for reply in raw.get(key))
+
+
+def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
+    """All publishers of a key reply to a plain get, also if two processes publish the same vehicle."""
+    with nedbus.connect(endpoint) as other:
+        for each, topic in ((bus, VLP), (other, "external_ins_local_position")):
+            publish(each.publisher(topic, vehicle="1"), 1)
+        for topic in (VLP, "external_ins_local_position"):
+            wait_for(partial(answers, raw, f"nedbus/1/{topic}"), what=topic)
+
+
+def test_error_in_an_answer_is_only_its_own(bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The query thread survives an exception in one reply."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+    wait_for(partial(answers, raw, publisher.key), what="an answer")
+    with monkeypatch.context() as patched:
+        patched.setattr(nedbus.Publisher, "last", property(lambda _: 1 / 0), raising=False)
+        assert answers(raw, publisher.key) == 0
+    assert answers(raw, publisher.key) == 1
+
+
+def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, raw: Session) -> None:
+    """A stored message with a later time, from an earlier run of the vehicle, does not replace the live one."""
+    later = zenoh.Timestamp(dt.datetime.now(dt.UTC) + dt.timedelta(hours=1), b"\x07")
+    stored = {f"nedbus/{vehicle}/{VLP}": encode(message(99)) for vehicle in "12"}
+    publish(bus.publisher(VLP, vehicle="1"), 1)
+
+    def found() -> list[tuple[str, int, bool]]:
+        return [(sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()]
+
+    with answering(raw, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
+        wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="the live one and the stored one")
+
+
+def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) -> None:
+    """`latest` reads a layout described by its publisher, like `subscribe`."""
+    types = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
+    layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
+    explained = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
+    last = reply_with({f"nedbus/1/{VLP}": msgpack.packb([9, 5, True, 2.5])})
+    with answering(raw, SCHEMA, explained), answering(raw, f"nedbus/1/{VLP}", last):
+        wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
+
+
+def services_of(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
+    """Reply to each query for services with all of these contents, by name of the service."""
+    return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
+
+
+def test_hostile_answers_reach_no_script(client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
+    """A status that is not JSON, or nested endlessly, is ignored, with one log line for all of them."""
+    junk = {"evil": b"[" * 100_000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
+    with answering(raw, "nedbus/@service/*/status", services_of(junk)):
+        assert client.services() == []
+    warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
+
+
+def test_status_that_grows_when_it_is_read_fills_no_memory(
+    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """JSON may take 30 times its length in memory: of 480 kB, everything beyond 4 MiB is ignored and logged."""
+    monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
+    large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
+    many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
+    with answering(raw, "nedbus/@service/*/status", services_of(many)):
+        services = bus.services(timeout=DEADLINE)
+    assert len(services) == 3
+    assert "honest" in [each.service for each in services]
+    assert "ignored 18 replies that are too large" in caplog.messages
+
+
+def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) -> None:
+    """The id of a status is that of its key, unknown fields are ignored, and invalid values and rows are dropped."""
+    sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
+    told = {"service": "lie", "host": "here", "now": 10**400, "version": [1], "sources": sources, "shape": {"of": "it"}}
+    with answering(raw, "nedbus/@service/*/status", services_of({"a": json.dumps(told).encode(), "b": b"[5]"})):
+        [status] = client.services()
+    assert status == nedbus.health.ServiceStatus(
+        service="a", host="here", sources=(nedbus.health.SourceStatus(source="sim:", state="new", addresses=("1/x",)),)
+    )
+
+
+def test_answers_that_are_too_many_are_left_out(
+    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The bytes kept of one query are bounded, and the number of ignored replies is logged."""
+    monkeypatch.setattr("nedbus.transport.queries.MAX_ANSWER_BYTES", 10_500)
+    status = b'{"a": "' + 950 * b"x" + b'"}'
+    many = {f"evil{number:02}": status for number in range(50)}
+    with answering(raw, "nedbus/@service/*/status", services_of(many)):
+        assert len(bus.services(timeout=DEADLINE)) == 10
+    assert "nedbus/@service/*/status: 40 answers left out, beyond the limits of a query" in caplog.messages
+
+
+def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """Fields by name are validated; anything that is not a message is refused before it is sent."""
+    publisher = client.publisher(VLP, vehicle="1")
+    publisher.publish({"timestamp": 4, "x": 1.0})
+    wait_for(lambda: [sample.message.x for sample in bus.latest()] == [1.0], what="the message")
+    with pytest.raises(ValueError, match="xy_valid"):
+        publisher.publish({"timestamp": 5, "xy_valid": True})
+    [last] = bus.latest(VLP)
+    assert (last.message.timestamp, last.sent is None) == (4, False)
+    assert publisher.published == 1
+
+
+def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """Fields without a timestamp get the clock of PX4's own messages, in us, and it does not count as missing."""
+    publisher, before = client.publisher(VLP, vehicle="1"), time.monotonic_ns() // 1000
+    publisher.publish({"x": 2.0})
+    wait_for(bus.latest, what="the message")
+    [last] = bus.latest()
+    assert before <= last.message.timestamp <= time.monotonic_ns() // 1000
+    assert "timestamp" not in last.missing
+
+
+def test_two_publishers_of_one_address_are_refused(client: nedbus.Bus) -> None:
+    """A second publisher of an address is refused, as it would mix two flights."""
+    publisher = client.publisher(VLP, vehicle="1")
+    with pytest.raises(nedbus.errors.AddressInUseError, match="this process already publishes 1/"):
+        client.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+
+
+def test_two_threads_get_one_publisher_of_an_address(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two threads that open a publisher for the same address at once, one is refused."""
+    both = threading.Barrier(2)
+
+    def meet(*arguments: object, **options: object) -> nedbus.Publisher:
+        with suppress(threading.BrokenBarrierError):
+            both.wait(0.2)
+        return nedbus.Publisher(*arguments, **options)  # type: ignore[arg-type] # whatever is given
+
+    monkeypatch.setattr("nedbus.client.publishing.publisher_registry.Publisher", meet)
+    with ThreadPoolExecutor(2) as pool:
+        made = [pool.submit(bus.publisher, VLP, vehicle="1") for _ in range(2)]
+    assert sorted(each.exception() is None for each in made) == [False, True]
+
+
+def test_wrong_names_are_refused_before_anything_is_sent(client: nedbus.Bus) -> None:
+    """A wrong topic, vehicle or mode is an error at once, and a ValueError, not a subscription without data."""
+    with pytest.raises(nedbus.AddressError, match="vehicle_local_positon"):
+        client.subscribe("vehicle_local_positon")
+    with pytest.raises(nedbus.ArgumentError, match="mode 'newest' is not valid: expected one of latest, ev") as error:
+        client.subscribe("*", mode=cast("Mode", "newest"))
+    assert isinstance(error.value, ValueError)
+    assert isinstance(error.value, nedbus.NedbusError)
+    assert not isinstance(error.value, nedbus.AddressError)
+    with pytest.raises(nedbus.AddressError, match="vehicle"):
+        client.latest(vehicle="a/b")
+    with pytest.raises(nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .*a call for each of several"):
+        client.subscribe(vehicle=["1", "2"])  # type: ignore[call-overload] # that is the mistake
+    with pytest.raises(nedbus.AddressError, match="instance"):
+        client.publisher("estimator_local_position", vehicle="1")
+
+
+def test_prefix_separates(endpoint: str) -> None:
+    """Fleets with different prefixes on one router do not see each other."""
+    with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
+        publish(one.publisher(VLP, vehicle="1"), 1)
+        assert [sample.vehicle for sample in one.latest("*")] == ["1"]
+        assert list(one.vehicles()) == ["1"]
+        assert two.latest("*") == []
+        assert two.vehicles() == {}
+
+
+def test_receive_times_out_with_words(client: nedbus.Bus) -> None:
+    """NoDataError is a TimeoutError; its text has the key that did not arrive, and advice."""
+    subscription = client.subscribe(VLP, vehicle="9")
+    with pytest.raises(TimeoutError, match=rf"nedbus/9/{VLP} within 0\.05 s.*nedbus list") as info:
+        subscription.receive(0.05)
+    assert isinstance(info.value, nedbus.NoDataError)
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf")])
+def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
+    """No timeout value leads to an error of another library."""
+    publish(bus.publisher(VLP, vehicle="1"), 1)
+    bus.latest("*", timeout=timeout)
+    bus.vehicles(timeout=timeout)
+    subscription = bus.subscribe()
+    taken: list[nedbus.Sample] = []
+
+    def receive() -> list[nedbus.Sample]:
+        with suppress(nedbus.NoDataError):
+            taken.append(subscription.receive(timeout))
+        return taken
+
+    wait_for(receive, what="the message, which a receive without patience gets once it is there")
+    assert taken[0].message.timestamp == 1
+
+
+def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
+    """A reader that always finds a sample still yields to the event loop."""
+    publisher = bus.publisher(VLP, vehicle="1")
+
+    async def scenario() -> int:
+        turns = 0
+
+        async def count_turns() -> None:
+            nonlocal turns
+            while True:
+                turns += 1
+                await asyncio.sleep(0)
+
+        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            await asyncio.to_thread(wait_for_subscriber, publisher)
+            publish(publisher, *range(1, 1001))
+            counter = asyncio.create_task(count_turns())
+            taken = 0
+            async for _ in subscription:
+                taken += 1
+                if taken == 900:
+                    break
+            counter.cancel()
+        return turns
+
+    assert asyncio.run(scenario()) > 5
+
+
+def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
+    """A receive that times out does not lose a sample."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+
+    async def scenario() -> list[int]:
+        taken: list[int] = []
+        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            taken.append((await subscription.receive(DEADLINE)).message.timestamp)
+            publish(publisher, *range(2, 641))
+            while taken[-1] != 640:
+                with suppress(nedbus.NoDataError):
+                    taken.append((await subscription.receive(0.0001)).message.timestamp)
+        return taken
+
+    assert asyncio.run(scenario()) == list(range(1, 641))
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> None:
+    """Each message goes to one of two threads, without an error, in either mode."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    subscription = bus.subscribe(mode=mode)
+    wait_for_subscriber(publisher)
+    taken: list[int] = []
+
+    def read() -> None:
+        taken.extend(sample.message.timestamp for sample in subscription)
+
+    threads = [threading.Thread(target=read) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    publish(publisher, *range(1, 2001))
+    wait_for(lambda: 2000 in taken, what="the last message")
+    if mode == "every":
+        wait_for(lambda: len(taken) == 2000, what="all others")
+    subscription.close()
+    for thread in threads:
+        thread.join(DEADLINE)
+        assert not thread.is_alive()
+    assert len(taken) == len(set(taken)) == subscription.counts.received
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))])
+def test_sample_can_be_copied_pickled_and_hashed(bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]) -> None:
+    """Samples can be queued for another process and kept in sets; the time of sending stays exact."""
+    bus.publisher(VLP, vehicle="1", source="test").publish(message(1, x=math.nan))
+    sample = bus.subscribe().receive(DEADLINE)
+    again = copied(sample)
+    assert again == sample
+    assert (again.sent, again.source, again.missing) == (sample.sent, "test", sample.missing)
+    assert len({sample, again}) == 1
+    assert again != nedbus.Sample(sample.message, sample.address, sample.received)

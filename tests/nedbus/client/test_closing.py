@@ -1,0 +1,365 @@
+"""Opening and closing of a bus: absent routers, cancelling, forks and garbage collection, with either client."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import signal
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from itertools import islice
+from typing import Any, Final, cast
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus import Mode
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
+from nedbus.transport import Session, open_router
+from tests.flights.messages import VLP, message
+from tests.nedbus.client.numbered import publish, wait_for_subscriber
+from tests.peers.answering import answering
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
+from tests.waits import DEADLINE, wait_for
+
+from .test_bus import BOTH
+
+_STEPS: Final = 100  # more than there are in a read that waits
+
+
+def test_nothing_listening_is_a_clear_error() -> None:
+    """The error is a ConnectionError with the endpoint, the time waited, and advice."""
+    where = free_endpoint()
+    assert issubclass(nedbus.ConnectError, ConnectionError)
+    with pytest.raises(nedbus.ConnectError, match=rf"nothing answers at {where} .*nedbus serve.*NEDBUS_CONNECT"):
+        nedbus.connect(where, timeout=0.1)
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
+    """`timeout=None` waits for a router without a limit."""
+    where = free_endpoint()
+
+    async def connect_async() -> bool:
+        async with nedbus.connect_async(where, timeout=None) as bus:
+            return bus.connected
+
+    def connect() -> bool:
+        with nedbus.connect(where, timeout=None) as bus:
+            return bus.connected
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit((lambda: asyncio.run(connect_async())) if is_async else connect)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.2)
+        router = open_router(listen=(where,))
+        assert waiting.result(DEADLINE)
+    router.close()
+
+
+@pytest.mark.parametrize("read", [lambda subscription: subscription.receive(DEADLINE), next])
+def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
+    endpoint: str, bus: nedbus.Bus, read: Callable[[nedbus.Subscription[Any]], nedbus.Sample[Any]]
+) -> None:
+    """A read interrupted at any point blocks neither the next read nor the close.
+
+    CPython handles signals where a Python function begins, and where a C function has returned.
+    """
+    publisher, interrupted = bus.publisher(VLP, vehicle="1"), list[int]()
+
+    def interrupt_all() -> None:
+        with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            wait_for_subscriber(publisher)
+            for step in range(1, _STEPS):
+                steps = iter(range(step))
+
+                def note(_: object, event: str, __: object, steps: Iterator[int] = steps) -> None:
+                    if event in ("call", "c_return") and next(steps, None) is None:
+                        raise KeyboardInterrupt
+
+                soon = threading.Timer(0.003, publish, [publisher, 2 * step])  # while it waits
+                soon.start()
+                sys.setprofile(note)
+                try:
+                    read(subscription)
+                except KeyboardInterrupt:
+                    interrupted.append(step)
+                finally:
+                    sys.setprofile(None)
+                soon.join()
+                publish(publisher, 2 * step + 1)
+                while read(subscription).message.timestamp <= 2 * step:
+                    pass
+
+    reading = threading.Thread(target=interrupt_all, daemon=True)
+    reading.start()
+    reading.join(DEADLINE)
+    assert not reading.is_alive(), interrupted
+    assert len(interrupted) > 25
+
+
+def test_wait_that_is_cancelled_leaves_nothing() -> None:
+    """After a cancelled connect the connecting thread ends without a trace."""
+    said: list[object] = []
+
+    async def scenario() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context))
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(nedbus.connect_async(free_endpoint(), timeout=None).__aenter__(), 0.1)
+        while len(asyncio.all_tasks()) > 1:
+            await asyncio.sleep(0.01)
+        gc.collect()
+
+    asyncio.run(scenario())
+    assert not said
+
+
+def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first of several endpoints that answers is used; NEDBUS_CONNECT is used by scripts without an endpoint."""
+    with nedbus.connect([free_endpoint(), endpoint]) as bus:
+        assert bus.connected
+    monkeypatch.setenv("NEDBUS_CONNECT", endpoint)
+    with nedbus.connect() as bus:
+        assert bus.connected
+
+
+def test_timeout_includes_the_opening() -> None:
+    """A receive with a timeout does not wait longer for an absent router than for a message."""
+    where = free_endpoint()
+    router = open_router(listen=(where,))
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(where) as bus:
+            subscription = bus.subscribe(mode="every")
+            await asyncio.to_thread(router.close)
+            with pytest.raises(nedbus.NoDataError):  # and not ConnectError, after 3 s
+                await subscription.receive(0.01)
+
+    asyncio.run(scenario())
+
+
+def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
+    """Receives cancelled while the subscription opens leave one subscriber, without duplicates."""
+    publisher = bus.publisher(VLP, vehicle="1")
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(endpoint) as other:
+            subscription = other.subscribe(mode="every")
+            for _ in range(3):
+                task = asyncio.create_task(subscription.receive())
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+                task.cancel()
+            for timestamp in (1, 2):
+                publish(publisher, timestamp)
+                assert (await subscription.receive(DEADLINE)).message.timestamp == timestamp
+            assert subscription.counts == nedbus.Counts(received=2)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, mode: Mode) -> None:
+    """A close ends an iteration without an error, also in another thread; receive raises; close is idempotent."""
+    with nedbus.connect(endpoint) as bus:
+        waiting = bus.subscribe(VLP, mode=mode)
+        reader = threading.Thread(target=list, args=(waiting,), daemon=True)
+        reader.start()
+        waiting.close()
+        reader.join(DEADLINE)
+        assert not reader.is_alive()
+    subscription = client.subscribe(VLP, mode=mode)
+    assert not subscription.closed
+    subscription.close()
+    subscription.close()
+    assert subscription.closed
+    assert list(islice(subscription, 1)) == []
+    with pytest.raises(nedbus.ClosedError):
+        subscription.receive(1.0)
+
+
+@pytest.mark.parametrize("mode", BOTH)
+@pytest.mark.parametrize("forms", [iter, nedbus.Subscription.rows, nedbus.Subscription.batches])
+def test_dead_session_raises_in_iteration(
+    endpoint: str, mode: Mode, forms: Callable[[nedbus.Subscription[Any]], Iterator[object]]
+) -> None:
+    """A session that ends by itself, before or during a wait, ends no iteration without an error."""
+    with nedbus.connect(endpoint) as bus:
+        subscription = bus.subscribe(VLP, mode=mode)
+        closer = threading.Thread(target=bus._zenoh.close)
+        closer.start()
+        for _ in range(2):
+            with pytest.raises(nedbus.ReceiveError, match=r"its Zenoh session was closed.*subscribe again"):
+                list(forms(subscription))
+        closer.join()
+        subscription.close()
+        with pytest.raises(nedbus.ReceiveError):
+            subscription.receive(1.0)
+
+
+def test_dead_session_raises_in_asyncio(endpoint: str) -> None:
+    """`async for` ends without an error only after a close."""
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(endpoint) as bus, bus.subscribe(VLP) as subscription:
+            closing = asyncio.create_task(asyncio.to_thread(bus._blocking._zenoh.close))
+            with pytest.raises(nedbus.ReceiveError, match="its Zenoh session was closed"):
+                async for _ in subscription:
+                    pass
+            with pytest.raises(nedbus.ReceiveError):
+                async for _ in subscription.rows():
+                    pass
+            await closing
+
+    asyncio.run(scenario())
+
+
+def test_failed_pump_raises_in_iteration(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unexpected error of the receiving thread reaches the reader, with its text."""
+
+    def fail(_: Receiver) -> None:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr(Receiver, "_receive", fail)
+    subscription = client.subscribe(VLP)
+    with pytest.raises((nedbus.NoDataError, nedbus.ReceiveError)):
+        subscription.receive(0.01)  # starts the thread
+    with pytest.raises(nedbus.ReceiveError, match="unexpected RuntimeError: out of luck"):
+        list(subscription)
+
+
+def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """A closed publisher is not listed, does not reply, refuses to publish, and frees its address."""
+    publisher = client.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+    wait_for(bus.latest, what="the message")
+    publisher.close()
+    publisher.close()
+    assert client.latest("*") == []
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    with pytest.raises(nedbus.ClosedError):
+        publish(publisher, 2)
+    with client.publisher(VLP, vehicle="1") as again:
+        publish(again, 3)
+
+
+def test_closed_publishers_of_this_bus_are_not_listed(client: nedbus.Bus) -> None:
+    """A bus that lists vehicles for the first time lists none of the 50 that it has published and closed."""
+    for number in range(50):
+        client.publisher(VLP, vehicle=number).close()
+    assert not client.vehicles()
+
+
+def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
+    """Every call on a closed bus raises ClosedError, and its subscriptions end."""
+    subscription = client.subscribe(VLP)
+    publisher = client.publisher(VLP, vehicle="1")
+    with suppress(nedbus.NoDataError):
+        subscription.receive(0.0)  # opens it
+    assert not any(each.closed for each in (client, subscription, publisher))
+    client.close()
+    client.close()
+    assert all(each.closed for each in (client, subscription, publisher))
+    assert list(islice(subscription, 1)) == []
+    with pytest.raises(nedbus.ClosedError):
+        publisher.publish(message())
+    for ask in (client.latest, client.vehicles, client.services, lambda: client.connected, client.subscribe):
+        with pytest.raises(nedbus.ClosedError):
+            ask()
+
+
+def test_forgotten_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
+    """A bus stays open while any of its objects exists, even only a publisher, and closes before the process exits."""
+    forgotten = nedbus.connect(endpoint)
+    gone = weakref.ref(forgotten)
+    publisher, subscription = forgotten.publisher(VLP, vehicle="1"), forgotten.subscribe(mode="every")
+    publish(publisher, 1)
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    del forgotten, subscription
+    gc.collect()
+    publish(publisher, 2)
+    wait_for(lambda: [sample.message.timestamp for sample in bus.latest()] == [2], what="the message")
+    del publisher
+    gc.collect()
+    assert gone() is None
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+
+
+def test_collecting_garbage_never_closes() -> None:
+    """Garbage is collected in any thread with any lock held, so the closer thread does the closing, which may block."""
+    lock = threading.Lock()
+    closed: list[threading.Thread] = []
+
+    class Subscriber:
+        def close(self) -> None:
+            with lock:
+                closed.append(threading.current_thread())
+
+    queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
+    subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, owner=None)
+    with lock:  # as a thread holds it that is in the midst of something
+        del subscription
+        gc.collect()  # a closing in this thread would wait for the lock for ever
+    wait_for(lambda: closed, what="the end of the subscription")
+    assert closed != [threading.current_thread()]
+
+
+def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
+    """A Ctrl-C ends the wait for a queryable that never replies."""
+    kept: list[zenoh.Query] = []
+    code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
+    with answering(raw, "nedbus/**", kept.append):
+        process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+        wait_for(lambda: kept, what="the question")
+        process.signal(signal.SIGINT)
+        assert process.wait() == -signal.SIGINT, process.err
+
+
+def test_ctrl_c_while_a_thread_starts(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Ctrl-C in the start of the receiving thread, which then runs all the same, is raised, and closing waits."""
+    start, late = threading.Thread.start, list[threading.Thread]()
+
+    def interrupted(thread: threading.Thread) -> None:
+        if thread.name != "nedbus-pump":
+            start(thread)
+            return
+        late.append(thread)
+        threading.Timer(0.05, start, [thread]).start()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt), bus.subscribe() as subscription:
+        subscription.receive(timeout=DEADLINE)
+    assert late[0].ident is not None, "it has run"
+    assert not late[0].is_alive()
+
+
+def test_forked_process_gets_an_error_at_once(start: Start, endpoint: str) -> None:
+    """Zenoh does not survive a fork: in the child everything raises ForkError, and the child can exit."""
+    code = """
+import os, sys
+import nedbus
+bus = nedbus.connect()
+subscription = bus.subscribe()
+publisher = bus.publisher("vehicle_local_position", vehicle="1")
+publisher.publish({"timestamp": 1})
+if child := os.fork():
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+publish, receive = lambda: publisher.publish({"timestamp": 2}), lambda: next(subscription)
+for ask in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
+    try:
+        ask()
+    except nedbus.errors.ForkError as exc:
+        print(exc)
+sys.exit(7)
+"""
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False, fresh=True)
+    assert process.wait() == 7, process.err
+    assert process.out.count("start processes with multiprocessing.get_context('spawn')") == 5
+    assert "Traceback" not in process.err

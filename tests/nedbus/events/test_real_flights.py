@@ -1,0 +1,393 @@
+"""Events of real flight logs, beside a table of what happened in them that was made without nedbus.
+
+The peers are eight logs of PX4 1.12 to 1.17 (six flights and two simulations), and `events_table.py`, which reads them
+with pyulog and tells first differences of single topics.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import pytest
+from pyulog import ULog
+
+from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
+from nedbus.sources import FileAccount
+from tests.flights import ulogs
+from tests.flights.ulogs import LOGS
+from tests.nedbus.events import events_table
+from tests.nedbus.events.events_table import Row
+
+TABLE: Final = json.loads(events_table.TABLE.read_text())
+TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
+NAMES: Final = [name for name in TABLE if name != "from"]
+MILLISECOND: Final = 1.0005e-3  # the table has rounded times
+FLAPPING: Final = 4, 10.0, 5.0  # changes within so many seconds that are told; then the last, after so many without one
+NOT_IN_TABLE: Final = (
+    "dropout", "text", "ekf_changed", "other_ekf", "height_contradicted", "position_contradicted",
+)  # fmt: skip
+RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # as the layout of today calls what PX4 1.15 logs
+
+pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there")]
+
+
+def path_of(name: str) -> Path:
+    return next(LOGS.parent.rglob(f"{name}.ulg"))
+
+
+def account_of(name: str) -> FileAccount:
+    return ulogs.account_of(path_of(name))
+
+
+def told_in(name: str) -> list[Event]:
+    return account_of(name).account.events_since(0)[0]
+
+
+def time_of(event: Event) -> float:
+    """Return the time since boot; of a jump, which is told when it has ended, that of the last message before it."""
+    time = event.numbers["begin"] if event.kind == "jump" else event.boot
+    assert time is not None
+    return time
+
+
+def without_flapping(rows: Sequence[Row]) -> Iterator[tuple[Row, int]]:
+    """Yield the rows that are told, each with the number of changes that it stands for."""
+    times: dict[tuple[str, ...], list[float]] = {}
+    untold: dict[tuple[str, ...], list[Row]] = {}
+    limit, window, pause = FLAPPING
+    for row in rows:
+        key = (row["kind"], *row["numbers"].get("flags", ()))
+        if key in untold and row["t"] - untold[key][-1]["t"] > pause:
+            yield untold[key][-1], len(untold.pop(key))
+        before = times.setdefault(key, [])
+        is_fast = row["change"] != "once" and len(before) >= limit and row["t"] - before[-limit] < window
+        before.append(row["t"])
+        if is_fast:
+            untold.setdefault(key, []).append(row)
+        else:
+            yield row, 1
+    for left in untold.values():
+        yield left[-1], len(left)
+
+
+def is_same(row: Row, event: Event) -> bool:
+    """Return whether an event is this row: kind, change, time, flags and quantities."""
+    # The table has the first message that the velocity does not explain; a jump begins with the one before it.
+    tolerance = 0.05 if row["kind"] == "jump" else MILLISECOND
+    names = row["numbers"].get("flags", row["numbers"].get("quantities"))
+    return (
+        (row["kind"], row["change"]) == (event.kind, event.change)
+        and abs(row["t"] - time_of(event)) <= tolerance
+        and (names is None or sorted(RENAMED.get(name, name) for name in names) == sorted(event.names))
+    )
+
+
+def sizes_of(event: Event) -> Mapping[str, float]:
+    """Return the numbers as the table has them: down for up."""
+    down = {f"{name.removesuffix('up')}down": -value for name, value in event.numbers.items() if name[-2:] == "up"}
+    return {**event.numbers, **(down if event.kind == "reset" else {})}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_event_of_the_table_is_told(name: str) -> None:
+    """Nothing more, nothing less: kind, change, time within a millisecond, flags and sizes.
+
+    Meant to differ: what holds at the first message is no event, in both; a flag that changes more than four times in
+    ten seconds is told once more, when it has come to rest; PX4's older names are those of the newest layout.
+    """
+    dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]  # which the table does not have
+    left = [each for each in told_in(name) if each.kind not in NOT_IN_TABLE]
+    told = [each.numbers["duration"] for each in told_in(name) if each.kind == "dropout"]
+    assert sum(told) == pytest.approx(sum(dropouts))
+    for row, count in without_flapping(TABLE[name]):
+        event = next((each for each in left if is_same(row, each)), None)
+        assert event is not None, f"not told: {row}"
+        left.remove(event)
+        assert ("suppressed changes" in event.text) == (count > 1), event.text
+        assert count == 1 or f"the last of {count} suppressed changes" in event.text
+        sizes = sizes_of(event)
+        for number, value in row["numbers"].items():
+            if number == "distance" and row["kind"] == "jump":
+                assert sizes[number] == pytest.approx(value, rel=0.01)
+            elif number not in ("flags", "quantities", "origin"):  # with a new origin the table gives no sizes
+                assert sizes[number] == pytest.approx(value, abs=2e-4), (number, row)
+    assert [(time_of(event), event.kind, event.text) for event in left] == []
+
+
+def test_table_is_what_its_script_makes() -> None:
+    """The file is not edited, and has every log."""
+    logs = {path.stem: path for path in LOGS.parent.glob("*/*.ulg")}
+    made = {name: events_table.rows_of(logs[name]) for name in NAMES}
+    assert set(logs) == set(NAMES)
+    assert events_table.to_json(made) == events_table.TABLE.read_text()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_numbers_are_finite(name: str) -> None:
+    """Each event can be written as JSON, which has no NaN."""
+    for event in told_in(name):
+        assert all(math.isfinite(number) for number in event.numbers.values()), event
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_evidence_precedes(name: str) -> None:
+    """Evidence was told before, or held at the first message; it is at most ten seconds old, or goes on."""
+    told = told_in(name)
+    for index, event in enumerate(told):
+        for each in event.evidence:
+            assert each.time <= event.time
+            earlier = [other for other in told[:index] if (other.kind, other.text) == (each.kind, each.text)]
+            since = [other for other in told[:index] if other.kind == each.kind and each.time < other.time < event.time]
+            ended = {name for other in since if other.change == "end" for name in other.names}
+            is_on = not ended.issuperset(each.names)
+            assert event.time - each.time <= 10.0 or is_on
+            begun = [other for other in told[:index] if other.kind == each.kind and other.change == "begin"]
+            assert earlier or (each.change == "begin" and not begun), f"{each.text} was never told"
+
+
+def why(name: str, *, at: float | None = None) -> list[Story]:
+    """Return the stories of a log; `at` is seconds since boot."""
+    read, told = account_of(name), told_in(name)
+    followed = read.account.vehicles["1"]
+    if at is not None:
+        at = read.times.find(str(at), told[-1])
+    return stories_of(told, followed.conditions.values(), topics=list(followed.topics), at=at)
+
+
+def short(events: Sequence[Event]) -> list[tuple[str, float | None]]:
+    """Return kinds and times since boot of the events but for PX4's texts."""
+    own = [event for event in events if event.kind != "text"]
+    return [(event.kind, None if event.boot is None else round(event.boot, 3)) for event in own]
+
+
+def test_flight_without_a_fault_has_no_story() -> None:
+    """The estimate is good from begin to end; the start of the estimator, without a fix and an origin, is no fault."""
+    assert why("sitl_1.15_events") == []
+
+
+def test_flight_without_gnss_has_one_story() -> None:
+    """It has the lack of a fix and of a global reference from the first message on, and an estimate that is valid."""
+    (only,) = why("cuav_1.16_gps_interference")
+    assert (only.begin, only.until, only.is_bad) == (None, None, False)
+    assert only.what == "no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
+
+
+@pytest.mark.parametrize(
+    ("name", "lacking"),
+    [
+        ("cubeorange_1.12_small", ("estimator_status_flags", "failsafe_flags")),
+        ("sitl_1.13_three_topics", ("failsafe_flags",)),
+    ],
+)
+def test_estimate_that_was_never_valid(name: str, lacking: tuple[str, ...]) -> None:
+    """Where xy was not valid in any message that is told, and the topics that would say why and are not there."""
+    only = why(name)
+    assert [(each.what, each.begin, each.until) for each in only] == [("xy and vxy not valid", None, None)]
+    assert only[0].since < 1.0
+    assert (only[0].before, only[0].lacking) == ((), lacking)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_held_for_the_whole_flight(name: str) -> None:
+    """A flight without fix and global reference has these conditions, also after landing; others got both in time."""
+    vehicle = account_of(name).account.vehicles["1"]
+    held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
+    not_global = {"xy has no global reference", "z has no global reference"}
+    assert held == {
+        "cuav_1.16_gps_interference": {"no GPS fix, 0 satellites", *not_global},
+        "cubeorange_1.12_small": {"xy not valid", "vxy not valid", *not_global},
+        "sitl_1.13_three_topics": {"xy not valid", "vxy not valid"},
+    }.get(name, set())
+
+
+def test_gps_loss_without_gps_messages() -> None:
+    """The log has the position and the state alone: dead reckoning precedes it, and what is missing is named."""
+    only = why("gps_loss")
+    assert [each.what for each in only] == ["xy and vxy not valid"]
+    story = only[0]
+    assert story.begin is not None
+    assert story.begin.boot == pytest.approx(27.908, abs=1e-3)
+    assert story.until is not None
+    assert story.until - story.since == pytest.approx(30.036 - 27.908, abs=1e-3)
+    assert short(story.before) == [("dead_reckoning", 23.908)]
+    assert short(story.meanwhile) == [("failsafe", 27.932), ("mode", 27.932)]
+    assert short(story.after) == [("dead_reckoning", 30.036)]
+    assert story.lacking == ("vehicle_gps_position", "estimator_status_flags", "failsafe_flags")
+
+
+def test_gps_loss_with_all_messages() -> None:
+    """With everything logged the receiver is the cause, and the position jumps when it is back."""
+    only = why("twelve_messages")
+    assert [each.what for each in only] == ["xy and vxy not valid"]
+    story = only[0]
+    assert story.until is not None
+    assert story.until - story.since == pytest.approx(48.324 - 32.444, abs=1e-3)
+    assert short(story.before) == [("gps_fix_lost", 27.392), ("few_satellites", 27.392), ("dead_reckoning", 28.444)]
+    assert short(story.meanwhile) == [
+        ("failsafe_flag", 32.468), ("failsafe", 32.48), ("mode", 32.48), ("not_fused", 34.564),
+    ]  # fmt: skip
+    assert {kind for kind, _ in short(story.after)} == {
+        "gps_fix_lost", "few_satellites", "not_fused", "dead_reckoning", "jump",
+    }  # fmt: skip
+    assert story.lacking == ()
+
+
+def test_what_held_at_a_moment() -> None:
+    """Asked about a moment, what held then is told, bad or not, or else what was before."""
+    assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
+    assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
+    assert [each.what for each in why("gps_loss", at=36.0)] == ["failsafe"]
+
+
+def test_changes_of_the_ekf_in_use() -> None:
+    """Each change that the selector's messages have is an event, and evidence for the reset after it."""
+    path = path_of("fmuv6c_1.17_selector_whipsaw")
+    selector = ULog(str(path), ["estimator_selector_status"]).data_list[0].data
+    primary = selector["primary_instance"]
+    changes = [index for index in range(1, len(primary)) if primary[index] != primary[index - 1]]
+    told = [each for each in told_in(path.stem) if each.kind == "ekf_changed"]
+    assert [each.boot for each in told] == [pytest.approx(selector["timestamp"][index] / 1e6) for index in changes]
+    assert [each.numbers["to"] for each in told] == [primary[index] for index in changes]
+    assert len(told) == 15  # PX4 counts 16, with the first choice
+    resets = [each for each in told_in(path.stem) if each.kind == "reset" and "xy" in each.names and each.evidence]
+    assert sum("ekf_changed" in [cause.kind for cause in each.evidence] for each in resets) >= 15
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_only_one_estimate_is_contradicted(name: str) -> None:
+    """The height that ran 27 m below GNSS and barometer in two seconds, and the position that stayed 6 to 9 m off.
+
+    By the logs' own numbers no other valid estimate is off for as long: 92 m in twelve_messages for half a second, 3 m
+    in gps_loss, and by the barometer alone 16 m in fast flight and 6 m at lift-off.
+    """
+    told = [each for each in told_in(name) if each.kind.endswith("_contradicted")]
+    right = [
+        ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z is valid"),
+        ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy is valid"),
+        ("height_contradicted", "end", 118.9, "height 27 m below GNSS and barometer: over after 2.0 s"),
+    ]
+    found = [(each.kind, each.change, round(each.boot or 0.0, 1), each.text) for each in told]
+    assert sorted(found, key=lambda each: each[2]) == (right if name == "nxp_v0_ekf_failure" else [])
+
+
+def test_vehicle_that_fell() -> None:
+    """The estimate that fell through the ground: its evidence, the reset that ended it, and the position meanwhile."""
+    height = next(each for each in why("nxp_v0_ekf_failure") if each.begin and each.begin.kind == "height_contradicted")
+    assert [each for each in short(height.before) if each[0] != "text"] == [
+        ("dead_reckoning", 116.238), ("estimator_fault", 116.609),
+    ]  # fmt: skip
+    assert "position_contradicted" in [each.kind for each in height.meanwhile]
+    assert "reset of height by 24.3 m, vz by 4.8 m/s" in [each.text for each in height.after]  # delta_z: -19.2
+    assert height.lacking == ()
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_texts_are_those_of_px4(name: str) -> None:
+    """Each statement of a table made by hand with pyulog is an event, once, with its time and words, and no other.
+
+    Of a statement in two forms, one is an event. A failed check that PX4 repeats because another check has changed
+    is an event only the first time.
+    """
+    told = [(each.boot or 0.0, each.text) for each in told_in(name) if each.kind == "text"]
+    checks: set[str] = set()
+    for time, _, _, group, has_twin, text in TABLES[name]["texts"]:
+        near = [each for each in told if abs(each[0] - time) < 0.002]
+        same = [each for each in near if text.strip() in each[1] or each[1].rpartition("] ")[2] in text]
+        if same:
+            told.remove(same[0])
+        else:
+            assert text in checks or has_twin, (time, text)
+        checks |= {text} if group == "arming_check" else set()
+    assert told == []
+
+
+def verdict(path: Path) -> Verdict:
+    """Return the verdict on the vehicle of a log."""
+    read = ulogs.account_of(path)
+    events, (followed,) = read.account.events_since(0)[0], read.account.vehicles.values()
+    held = [each for each in followed.conditions.values() if each.severity != "info"]
+    return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "end", "cause", "quoted"),
+    [
+        (
+            "twelve_messages", 32.444, 48.324,
+            [("gps_fix_lost", 27.392), ("dead_reckoning", 28.444)], "Offboard requires local position",
+        ),
+        ("gps_loss", 27.908, 30.036, [("dead_reckoning", 23.908)], "invalid setpoints"),
+    ],
+)  # fmt: skip
+def test_verdict_names_cause_and_times(
+    name: str, begin: float, end: float, cause: list[tuple[str, float]], quoted: str
+) -> None:
+    """It says what, from when to when, and the causes in order of time, as the table by hand does."""
+    found = verdict(path_of(name))
+    assert found.begin is not None
+    assert found.end is not None
+    assert (found.usable, found.begin.boot, found.end.boot) == (False, begin, end)
+    assert [each for each in short(found.cause) if each in cause] == cause
+    times = account_of(name).times
+    moments = [times.text(each) for each in (found.begin, found.end, *found.cause) if (each.kind, each.boot) in cause]
+    assert all(moment in found.text for moment in moments)
+    assert f"({end - begin:.1f} s)" in found.text
+    assert quoted in found.text
+    assert ("Not in the data: vehicle_gps_position" in found.text) == (name == "gps_loss")
+
+
+def test_verdict_of_a_crash() -> None:
+    """Valid flags are not believed: the height that ran away, with PX4's own words first. Table by hand."""
+    found = verdict(path_of("nxp_v0_ekf_failure"))
+    assert found.begin is not None
+    assert found.end is not None
+    assert found.usable is False
+    assert 115.4 < (found.begin.boot or 0.0) < 117.5
+    assert found.end.boot == pytest.approx(118.8, abs=0.2)
+    assert "height 27 m below GNSS" in found.text
+    assert found.text.index('PX4: "Attitude failure detected"') < found.text.index("dead reckoning")
+    assert [short([each]) for each in found.cause if each.kind == "dead_reckoning"] == [[("dead_reckoning", 116.238)]]
+    assert "position 9 m off GNSS while xy is valid" in found.text
+
+
+def test_verdict_of_a_flight_without_gps() -> None:
+    """The position is usable by vision, but a fix and a global reference are missing throughout. Table by hand."""
+    found = verdict(path_of("cuav_1.16_gps_interference"))
+    assert found.usable is True
+    text = (
+        "position valid throughout, but no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
+    )
+    assert found.text == f"{text} from the first message on, until the end (62.3 s)."
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_state_and_verdict_name_the_same_cause(name: str) -> None:
+    """While a flight goes on, the fault of the badge is the one that the live verdict names, after each event."""
+    events, (followed,) = told_in(name), account_of(name).account.vehicles.values()
+    spans, states = spans_of(events, list(followed.initial)), 0
+    for now in sorted({event.time + after for event in events for after in (0.001, 1.0)}):
+        state = state_at(spans, now)
+        if state.severity == "bad":
+            before = [event for event in events if event.time <= now]
+            found = verdict_of(
+                followed.name, before, state.conditions, topics=followed.topics, times=Times(is_live=True), end=now
+            )
+            worst = next(each for each in found.stories if each.spans[0].text == state.text)
+            assert found.text.startswith(f"not usable: {worst.what} " if state.text != "failsafe" else state.text), now
+            states += 1
+    assert bool(states) == (name != "cuav_1.16_gps_interference")
+
+
+@pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
+def test_verdict_has_three_lines(path: Path) -> None:
+    """A verdict has at most three lines; of a healthy flight it is that there are no faults, and nothing else."""
+    text = verdict(path).text
+    assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3
+    is_healthy = path.stem in ("sitl_1.15_events", "ulog_stream_flight1", "ulog_stream_lossy1")
+    assert not is_healthy or re.fullmatch(r"no faults in \d+ s", text)

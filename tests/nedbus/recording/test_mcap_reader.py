@@ -1,0 +1,319 @@
+"""Files of other MCAP writers and of `ros2 bag record`, and files that are not recordings: read whole, or refused."""
+
+from __future__ import annotations
+
+import itertools
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType, Writer
+
+import nedbus
+from nedbus.errors import SourceError
+from nedbus.recording import RecordingReader, RecordingWriter
+from nedbus_msgs import DEFAULT, Address, Provenance
+from nedbus_msgs.arrays import to_array
+from tests.flights.first_message import ROS2_TYPE, downgrade, encode_cdr, message_definition
+from tests.flights.messages import VLP, message
+from tests.flights.replays import open_replay
+from tests.nedbus.sources.test_damage import payloads_of
+from tests.peers.command_line import run_command
+
+TOPIC = "/fmu/out/vehicle_local_position"
+CASES = Path(__file__).parents[4] / "shared/cases"
+WIND = b"\x00\x00\x60\x40"  # 3.5 as a float32
+
+
+def write_bag(
+    path: Path,
+    numbers: range = range(10),
+    *,
+    definition: str = message_definition("1.16"),
+    encoding: str = "ros2msg",
+    change: Callable[[bytes], bytes] = bytes,
+) -> Path:
+    """Write positions with x = 0, 1, ..., as `ros2 bag record` does; `change`: what to do to each payload."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(ROS2_TYPE, encoding, definition.encode())
+        channel = writer.register_channel(TOPIC, "cdr", schema, {"offered_qos_profiles": ""})
+        for number in numbers:
+            payload = encode_cdr(downgrade(message(number + 1, x=float(number)), "1.16"), layout="1.16")
+            writer.add_message(channel, number * 10**9, change(payload), number)
+        writer.finish()
+    return path
+
+
+def assert_whole(path: Path, *, warnings: tuple[str, ...] = ()) -> None:
+    """Check that all of ten positions are read as an array and replayed."""
+    assert nedbus.read(path)["x"].tolist() == list(range(10))
+    run = open_replay(f"mcap:{path}")
+    assert [each.fields["x"] for each in run.messages if not each.error] == list(range(10))
+    assert run.warnings == warnings
+    assert run.damage is None
+
+
+def add_in_middle(payload: bytes) -> bytes:
+    """Add 3.5 after `timestamp_sample`, and what keeps the fields behind it aligned: two floats."""
+    return payload[:20] + WIND + WIND + payload[20:]
+
+
+@pytest.mark.parametrize("where", ["end", "middle"])
+def test_own_fields_of_a_bag_are_left_out_and_named(tmp_path: Path, where: str) -> None:
+    """Fields that the file's own definition has besides those of PX4 cost no message, wherever they are."""
+    text, own = message_definition("1.16"), "float32 wind_north\nfloat32 wind_east\n"
+    if where == "end":
+        path = write_bag(
+            tmp_path / "a.mcap", definition=text + own, change=lambda each: each + -len(each) % 4 * b"\0" + 2 * WIND
+        )
+    else:
+        first, second = text.split("uint64 timestamp_sample", 1)
+        rest, text = second.split("\n", 1)
+        text = f"{first}uint64 timestamp_sample{rest}\n{own}{text}"
+        path = write_bag(tmp_path / "a.mcap", definition=text, change=add_in_middle)
+    left_out = f"{TOPIC}: wind_east, wind_north left out: not in any VehicleLocalPosition that nedbus knows"
+    assert_whole(path, warnings=(left_out,))
+
+
+def test_definition_of_another_message_is_refused(tmp_path: Path) -> None:
+    """A definition that lacks fields of every release, or has them with other types, names these fields."""
+    text = message_definition("1.16").replace("float32 x ", "float64 x ").replace("float32 y ", "float32 y2 ")
+    with pytest.raises(SourceError, match=r"its definition of x, y is not that of any PX4 release"):
+        nedbus.read(write_bag(tmp_path / "a.mcap", definition=text))
+
+
+FLAGS = {
+    "repeat_schemas": (True, False), "repeat_channels": (True, False), "use_statistics": (True, False),
+    "use_summary_offsets": (True, False), "enable_crcs": (True, False), "has_extras": (True, False),
+    "has_padding": (True, False),
+    "index_types": tuple(
+        IndexType.NONE | chunk | each | extra
+        for chunk in (IndexType.CHUNK, IndexType.NONE)
+        for each in (IndexType.MESSAGE, IndexType.NONE)
+        for extra in (IndexType.ATTACHMENT | IndexType.METADATA, IndexType.NONE)
+    ),
+}  # fmt: skip
+
+
+def write_variant(*, has_extras: bool, **options: object) -> bytes:
+    file = BytesIO()
+    writer = Writer(file, chunk_size=200, **options)  # type: ignore[arg-type] # all combinations of them
+    writer.start()
+    channels = []
+    for topic in ("first_topic", "second_topic"):
+        name = topic.title().replace("_", "")
+        schema = writer.register_schema(f"px4_msgs/msg/{name}", "ros2msg", b"uint64 timestamp\n")
+        channels.append(writer.register_channel(f"/fmu/out/{topic}", "cdr", schema))
+    channels.append(writer.register_channel("/without_schema", "cdr", 0))
+    for number in range(10):
+        payload = b"\x00\x01\x00\x00" + number.to_bytes(8, "little")
+        writer.add_message(channels[number % 3], number, payload, number)
+        if has_extras and number == 5:
+            writer.add_attachment(1, 1, "a", "text/plain", b"1234")
+            writer.add_metadata("a", {"b": "c"})
+    writer.finish()
+    return file.getvalue()
+
+
+SLOW_FORMS = [pytest.param(form, marks=pytest.mark.slow) for form in (CompressionType.NONE, CompressionType.LZ4)]
+
+
+@pytest.mark.parametrize("form", [None, CompressionType.ZSTD, *SLOW_FORMS])
+def test_every_variant_of_mcap_is_read_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: CompressionType | None
+) -> None:
+    """As many messages as the mcap package reads, for all combinations of the features that its writers may leave out.
+
+    Records with bytes behind their known fields, as later versions of the format may have, are among them.
+    """
+    path = tmp_path / "a.mcap"
+    has_padding = False
+    # The package skips bytes behind known fields only outside of chunks, and a footer is found by its length.
+    exact = {Opcode.MESSAGE, Opcode.FOOTER} | ({Opcode.SCHEMA, Opcode.CHANNEL} if form else set())
+    finish: Callable[[RecordBuilder], None] = RecordBuilder.finish_record
+
+    def finish_padded(self: RecordBuilder) -> None:
+        opcode = self._buffer.getvalue()[self._record_start_offset]
+        if has_padding and opcode not in exact:
+            self.write(b"\x01\xff\xff")
+        finish(self)
+
+    monkeypatch.setattr(RecordBuilder, "finish_record", finish_padded)
+    for values in itertools.product(*FLAGS.values()):
+        options = dict(zip(FLAGS, values, strict=True))
+        has_padding = bool(options.pop("has_padding"))
+        data = write_variant(
+            use_chunking=form is not None, compression=form or CompressionType.NONE, **options  # type: ignore[arg-type]
+        )  # fmt: skip
+        path.write_bytes(data)
+        expected = [each.log_time for schema, _, each in NonSeekingReader(BytesIO(data)).iter_messages() if schema]
+        assert len(expected) == 7, options
+        with RecordingReader(path, vehicle="1") as reader:
+            assert sum(reader.counts.values()) == len(expected), options
+            assert [each.logged for each in reader.messages()] == expected, options
+            one = [each.logged for each in reader.messages([Address("1", "second_topic")])]
+            assert one == [1, 4, 7], options
+            assert not reader.warnings, options
+
+
+@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
+def test_flipped_bits_outside_of_chunks_are_reported_or_harmless(tmp_path: Path, every: int) -> None:
+    """The heads of records and the indexes behind chunks have no checksum: no flipped bit there makes up a message."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for number in range(2):
+            positions = [message(2 * number + 1), message(2 * number + 2)]
+            streams = [(Address(vehicle, VLP), Provenance("sim", frozenset({"dist_bottom"}))) for vehicle in "12"]
+            writer.write(to_array(positions), DEFAULT, streams, logged=[number] * 2, published=[number] * 2)
+            writer.flush()
+        data = path.read_bytes()
+    path.write_bytes(data)
+    original = payloads_of(path)[0]
+    assert original.total() == 4
+    offset, places = 8, list[int]()
+    while offset < len(data) - 8:
+        length = int.from_bytes(data[offset + 1 : offset + 9], "little")
+        places += range(offset, offset + 9 + min(length, 30))
+        offset += 9 + length
+    for place in places:
+        for bit in range(place % every, 8, every):
+            changed = bytearray(data)
+            changed[place] ^= 1 << bit
+            path.write_bytes(changed)
+            try:
+                read, reader = payloads_of(path)
+            except SourceError:
+                continue
+            assert not read - original, (place, bit)
+            assert reader.damaged or read == original, (place, bit)
+
+
+def lfs(path: Path) -> None:
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:12\n")
+
+
+def bag_in_sqlite(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE topics (name)")
+
+
+@pytest.mark.parametrize("suffix", [".ulg", ".mcap", ".zip", ".db3"])
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda path: path.write_bytes(b"ULogKey\x01" + bytes(100)), "an encrypted log: decrypt it"),
+        (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "a zip archive: unpack it"),
+        (lambda path: path.write_bytes(b"\x1f\x8b" + bytes(100)), "compressed by gzip: unpack it"),
+        (lambda path: path.write_bytes(b""), "an empty file"),
+        (lfs, "a pointer of Git LFS .* 'git lfs pull'"),
+        (bag_in_sqlite, "a bag in SQLite: convert it to MCAP with 'ros2 bag convert'"),
+    ],
+)
+def test_files_of_other_kinds_are_named(
+    tmp_path: Path, make: Callable[[Path], object], reason: str, suffix: str
+) -> None:
+    """A file that is no flight is named, with what to do, by its content and by every command that reads files."""
+    path = tmp_path / f"a{suffix}"
+    make(path)
+    with pytest.raises(SourceError, match=reason):
+        nedbus.read(path)
+    for arguments in (["events"], ["why"], ["convert"], ["plot"]):
+        output = ["b.mcap"] if arguments == ["convert"] else []
+        ended = run_command(*arguments, str(path), *output)
+        assert ended.exit_code in {1, 2}, ended.err
+        assert reason.partition(" .*")[0] in " ".join(ended.err.split()), ended.err
+    with pytest.raises(SourceError, match=reason):
+        open_replay(f"ulog:{path}")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "definition", "reason"),
+    [
+        ("ros2idl", "module px4_msgs {};", "its encoding is cdr with ros2idl, not cdr with ros2msg"),
+        ("", "", "the file has no definition of px4_msgs/msg/VehicleLocalPosition"),
+        ("ros2msg", "uint64 timestamp\nstring name\n", "line 2, column 1"),
+    ],
+)
+def test_refused_recording_names_the_reason(tmp_path: Path, encoding: str, definition: str, reason: str) -> None:
+    """A recording of which no message can be read says why, as an array and as a replay."""
+    path = write_bag(tmp_path / "a.mcap", encoding=encoding, definition=definition)
+    for read in (nedbus.read, lambda path: open_replay(f"mcap:{path}")):
+        with pytest.raises(SourceError, match=f"{TOPIC}: {reason}"):
+            read(path)
+
+
+def test_bags_of_compressed_messages_are_read(tmp_path: Path) -> None:
+    """`ros2 bag record --compression-mode message` packs each payload."""
+    assert_whole(write_bag(tmp_path / "a.mcap", change=zstandard.compress))
+
+
+def test_compressed_message_has_a_limit(tmp_path: Path) -> None:
+    """A message of 64 MiB in a few kilobytes is not unpacked, but rejected."""
+    path = write_bag(tmp_path / "a.mcap", change=lambda _: zstandard.compress(bytes(2**26)))
+    assert [bool(each.error) for each in open_replay(f"mcap:{path}").messages] == [True] * 10
+
+
+@pytest.mark.parametrize("suffix", ["", ".zstd"])
+def test_split_bags_are_one_recording(tmp_path: Path, suffix: str) -> None:
+    """A folder with the files of one bag is read in order; a file of its metadata that is absent is named."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for number, part in enumerate([range(4), range(4, 9), range(9, 10)]):
+        path = write_bag(folder / f"bag_{number + 8}.mcap", part)
+        if suffix:
+            path.with_name(path.name + suffix).write_bytes(zstandard.compress(path.read_bytes()))
+            path.unlink()
+    listed = "".join(f"    - bag_{number}.mcap{suffix}\n" for number in (8, 9, 10))
+    (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}")
+    assert_whole(folder)
+    assert run_command("events", str(folder)).exit_code == 0
+    (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}    - bag_11.mcap\n")
+    assert open_replay(f"mcap:{folder}").damage == (
+        f"{folder}: messages lost to damage: bag_11.mcap of this bag is not there"
+    )
+
+
+def test_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
+    """A folder has to have MCAP files; one with a bag in SQLite says what to do."""
+    with pytest.raises(SourceError, match=r"no \.mcap file is in this folder"):
+        nedbus.read(tmp_path)
+    bag_in_sqlite(tmp_path / "a_0.db3")
+    with pytest.raises(SourceError, match="a bag in SQLite: convert it"):
+        nedbus.read(tmp_path)
+
+
+def test_compressed_recordings_are_read(tmp_path: Path) -> None:
+    """`--compression-mode file` packs a whole file; what is before damage in it is read."""
+    path = tmp_path / "a.mcap.zstd"
+    data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
+    path.write_bytes(data)
+    assert_whole(path)
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
+        nedbus.read(path)
+    path.write_bytes(zstandard.compress(bytes(2**28)))
+    with pytest.raises(SourceError, match="not a readable MCAP file; the compressed file is damaged: more than"):
+        nedbus.read(path)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "23_no_repeat_schemas.mcap", "26_rosbag2_message_compression.mcap", "26_split_bag",
+        "29_own_field_appended.mcap", "29b_own_field_middle.mcap",
+    ],
+)  # fmt: skip
+def test_files_of_users_are_read_whole(name: str) -> None:
+    """Ten messages each, x = 0..9, by rosbags and mcap."""
+    assert nedbus.read(CASES / name)["x"].tolist() == list(range(10))
+    assert nedbus.read(CASES / name, VLP)["timestamp"].size == 10

@@ -1,0 +1,108 @@
+"""Saving a ULog stream: the file is a valid log at any moment."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import pytest
+from pyulog import ULog
+
+from nedbus.errors import OutputError
+from nedbus.sources.mavlink.log_stream import LogFile
+from tests.flights.ulogs import write_log
+from tests.nedbus.ulog.test_parser import small_log
+from tests.peers.processes import unmeasured
+
+BEGIN: Final = 1500
+"""Bytes that hold the definitions and some messages of the small log."""
+KILLS: Final = 50
+PIECE: Final = 249
+"""Bytes of a LOGGING_DATA."""
+SAVE: Final = f"""
+import os, sys, time
+from pathlib import Path
+from nedbus.sources.mavlink.log_stream import LogFile
+log = Path(sys.argv[1]).read_bytes()
+for folder in sys.stdin:
+    if not (pid := os.fork()):
+        print(os.getpid(), flush=True)
+        file = LogFile(Path(folder.strip()), "1")
+        for start in range(0, len(log), {PIECE}):
+            file.write(log[start : start + {PIECE}])
+            print(file.path.stat().st_size, flush=True)
+        time.sleep(3600)
+    os.waitpid(pid, 0)
+    print("killed", flush=True)
+"""
+
+
+def test_file_has_whole_records_after_each_write(tmp_path: Path) -> None:
+    """However the stream is cut, pyulog reads the file without damage after every write, as after kill -9."""
+    log, file = small_log(), LogFile(tmp_path, "1")
+    file.write(log[:BEGIN])
+    counts = []
+    for start in range(BEGIN, len(log), 97):
+        file.write(log[start : start + 97])
+        saved = ULog(str(file.path))
+        assert not saved.file_corruption
+        counts.append(len(saved.data_list[0].data["timestamp"]))
+    file.close()
+    assert counts == sorted(counts)
+    assert counts[-1] == 20
+    assert file.path.read_bytes() == log
+
+
+def test_gap_is_marked_as_dropout(tmp_path: Path) -> None:
+    """A gap discards the record that it cut, and is a dropout of its duration."""
+    log, file = small_log(), LogFile(tmp_path, "1")
+    file.write(log[: len(log) - 100])
+    file.mark_gap(0.25)
+    file.close()
+    saved = ULog(str(file.path))
+    assert [each.duration for each in saved.dropouts] == [250]
+    assert not saved.file_corruption
+
+
+def test_streams_of_one_second_have_files_of_their_own(tmp_path: Path) -> None:
+    """A file is never overwritten; a folder that cannot be made is an error that names it."""
+    files = [LogFile(tmp_path / "logs", "1") for _ in range(3)]
+    for each in files:
+        each.close()
+    assert len({each.path for each in files}) == 3
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        LogFile(tmp_path / "file" / "logs", "1")
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(300)
+def test_killed_process_leaves_a_valid_log(tmp_path: Path) -> None:
+    """Killed with SIGKILL at 50 random moments, the file has every record that was complete, and nothing else."""
+    path = write_log(tmp_path / "flight.ulg", range(0, 20_000_000, 10_000))
+    log, chance = path.read_bytes(), random.Random(1)
+    command = [sys.executable, "-c", SAVE, os.fspath(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=unmeasured()
+    ) as process:
+        assert process.stdin
+        assert process.stdout
+        for number in range(KILLS):
+            print(tmp_path / f"{number}", file=process.stdin, flush=True)
+            pid, count = int(process.stdout.readline()), chance.randrange(1, len(log) // PIECE)
+            written = [int(process.stdout.readline()) for _ in range(count)][-1]
+            os.kill(pid, signal.SIGKILL)
+            while not process.stdout.readline().endswith("killed\n"):  # behind half a line, maybe
+                pass
+            (saved,) = (tmp_path / f"{number}").iterdir()
+            content = saved.read_bytes()
+            assert len(content) >= written > count * PIECE - PIECE - 2**12
+            assert log.startswith(content)
+            assert not ULog(str(saved)).file_corruption
+        process.stdin.close()

@@ -1,0 +1,448 @@
+"""Damaged recordings and logs: what is hit is left out and reported, what is read is right, in every try.
+
+The chunks of a recording have CRCs, so that every message that is read equals the original to the bit.
+A log has no checksums: a bit inside a value cannot be noticed by anybody.
+There the rule is that only messages that were hit differ, and that damage of the structure is noticed.
+
+`DAMAGE_TRIES=10000 pytest tests/nedbus/sources/test_damage.py` tries more, on the real logs of ../shared as well.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import re
+import struct
+import tracemalloc
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from io import BytesIO
+from pathlib import Path
+from zlib import crc32
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Chunk, ChunkIndex, Footer
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+import nedbus
+from nedbus.errors import SourceError
+from nedbus.recording import RecordingReader, RecordingWriter
+from nedbus_msgs import DEFAULT, Address, Provenance
+from nedbus_msgs.arrays import MessageArray, to_array
+from tests.flights.first_message import ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay, open_replay
+from tests.flights.ulogs import LOGS, UlogWriter
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
+
+_log = logging.getLogger(__name__)
+
+TRIES = int(os.environ.get("DAMAGE_TRIES", "320"))
+FEW = 60  # tries of the quick tier, of files that are made here
+each_tier = pytest.mark.parametrize("tries", [FEW, pytest.param(TRIES, marks=pytest.mark.slow)])
+MAX_LOG = 150_000  # bytes of a real log that a try reads
+
+Rows = Counter[tuple[str, bytes]]  # topic and values of messages
+
+
+def damage(data: bytes, rng: random.Random) -> tuple[str, int, bytes]:
+    """Flip a bit, cut the end off, or zero a range; return what was done, how many bytes were hit, and the rest."""
+    kind, damaged = rng.choice(("bit", "bit", "cut", "zeros")), bytearray(data)
+    offset = rng.randrange(len(data))
+    if kind == "bit":
+        damaged[offset] ^= 1 << rng.randrange(8)
+        return f"bit at {offset}", 1, bytes(damaged)
+    if kind == "cut":
+        return f"cut at {offset}", 0, data[:offset]
+    length = min(rng.choice((1, 4, 16, 64, 512, 4096)), len(data) - offset)
+    damaged[offset : offset + length] = bytes(length)
+    return f"{length} zeros at {offset}", length, bytes(damaged)
+
+
+def write_recording(path: Path, *, finish: bool) -> Path:
+    """Write a flight of two vehicles in a dozen chunks; without `finish` as a power cut leaves it."""
+    messages = [
+        (each.address, upgrade(each.fields))
+        for each in open_replay("sim:?duration=2&topics=VehicleLocalPosition").messages
+    ]
+    writer = RecordingWriter(path)
+    for start in range(0, len(messages), 40):
+        part = messages[start : start + 40]
+        streams = [(Address(vehicle, a.topic, a.instance), Provenance("sim")) for vehicle in "12" for a, _ in part]
+        both = to_array([each for _, each in part] * 2)
+        times = [each * 1000 for each in both["timestamp"].tolist()]
+        writer.write(both, DEFAULT, streams, logged=times, published=times)
+        writer.flush()
+    flushed = path.read_bytes()
+    writer.close()
+    if not finish:
+        path.write_bytes(flushed)
+    return path
+
+
+def make_recordings(folder: Path) -> list[Path]:
+    found = [write_recording(folder / "whole.mcap", finish=True), write_recording(folder / "cut.mcap", finish=False)]
+    for log in sorted(LOGS.glob("*.ulg")) if TRIES > 1000 else []:
+        convert_replay(f"ulog:{log}", folder / f"{log.stem}.mcap")
+        found.append(folder / f"{log.stem}.mcap")
+    return found
+
+
+def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], RecordingReader]:
+    with RecordingReader(path, vehicle="1") as reader:
+        messages = [(each.stream, each.payload) for each in reader.messages()]
+    return Counter((each.address, data + repr(sorted(each.missing)).encode()) for each, data in messages), reader
+
+
+@pytest.mark.timeout(120 + TRIES)
+@each_tier
+def test_damaged_recordings_are_read_in_part_and_never_wrong(tmp_path: Path, tries: int) -> None:
+    """Whatever is hit, each message that is read is one of the original, none twice, and what is lost is reported."""
+    rng = random.Random(12)
+    originals = [(path.read_bytes(), payloads_of(path)[0], path.stem) for path in make_recordings(tmp_path)]
+    path = tmp_path / "damaged.mcap"
+    outcomes: Counter[str] = Counter()
+    for number in range(tries * 3 // 4):
+        data, original, name = originals[number % 2] if number % 4 < 3 else rng.choice(originals)
+        done, _, damaged = damage(data, rng)
+        path.write_bytes(damaged)
+        where = f"{name}, try {number}, {done}"
+        try:
+            read, reader = payloads_of(path)
+            run = open_replay(f"mcap:{path}?speed=max")
+        except SourceError:
+            outcomes["refused"] += 1
+            continue
+        lost = original - read
+        assert not read - original, where
+        assert reader.damaged or not lost, f"{where}: {sum(lost.values())} lost: {reader.warnings}"
+        assert bool(run.damage) == reader.damaged, where
+        assert run.total == sum(read.values()), where
+        # Where the index is lost as well, nobody knows whether there was anything in what cannot be read.
+        assert lost or not reader.damaged or not reader._files[0].chunks.summary, (
+            f"{where}: nothing lost: {reader.warnings}"
+        )
+        outcomes["lost" if lost else "whole"] += 1
+        if number % 20 == 0:
+            assert sum(1 for _ in run.messages) == run.total, where
+            address = rng.choice([each for each, _ in original])
+            expected = sum(count for (each, _), count in read.items() if each == address)
+            if expected:
+                array = nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
+                assert len(array) == expected, where
+    assert outcomes["lost"] > outcomes["refused"], outcomes
+    assert outcomes["whole"], outcomes
+    _log.info("%s", outcomes)
+
+
+def write_log(path: Path) -> Path:
+    """Write a log of two instances of the estimate and of the selected one, all of one format."""
+    writer = UlogWriter()
+    writer.define([VLP, "estimator_local_position"])
+    for number in range(60):
+        for instance in (0, 1):
+            one = message(number + 1, x=number / 7, y=float(instance))
+            writer.add("estimator_local_position", one, instance=instance)
+        writer.add(VLP, message(number + 1, x=number / 7, z=-5.0, z_valid=True))
+    return writer.write(path)
+
+
+def shorten(log: Path, path: Path) -> Path:
+    """Write the first messages of a real log."""
+    data = log.read_bytes()
+    end = offset = 16
+    while offset + 3 <= len(data) and (offset < MAX_LOG or data[offset + 2] != ord("D")):
+        offset += 3 + int.from_bytes(data[offset : offset + 2], "little")
+    for _ in range(1000):  # of the data section
+        if offset + 3 > len(data):
+            break
+        offset += 3 + int.from_bytes(data[offset : offset + 2], "little")
+        end = offset if offset <= len(data) else end
+    path.write_bytes(data[:end])
+    return path
+
+
+def make_logs(folder: Path) -> list[Path]:
+    logs = sorted([*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").glob("*.ulg")])
+    return [write_log(folder / "ours.ulg"), *(shorten(log, folder / f"{log.stem}.ulg") for log in logs)]
+
+
+def rows_of(path: Path) -> dict[Address, MessageArray]:
+    """Return the messages of a log without PX4's words: one bit of the metadata changes all that are events."""
+    return {
+        address: nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
+        for address in nedbus.addresses_of(path)
+        if address.topic != "log_message"
+    }
+
+
+def count_rows(streams: dict[Address, MessageArray], missing: Mapping[str, set[str]]) -> Counter[tuple[str, bytes]]:
+    """Count the messages of each topic by the values of all fields that its log has; names of vehicles are values."""
+    found: Counter[tuple[str, bytes]] = Counter()
+    for address, messages in streams.items():
+        fields = [name for name in messages.dtype.names or () if name not in missing.get(address.topic, ())]
+        columns = [np.ascontiguousarray(messages[name]).view(np.uint8).reshape(len(messages), -1) for name in fields]
+        found.update((address.topic, row.tobytes()) for row in np.hstack(columns))
+    return found
+
+
+def is_shorter(damaged: bytes, data: bytes) -> bool:
+    """Return whether a log is the beginning of another one."""
+    return len(damaged) < len(data) and data.startswith(damaged)
+
+
+@pytest.mark.timeout(120 + TRIES)
+@each_tier
+def test_damaged_logs_are_read_in_part(tmp_path: Path, tries: int) -> None:
+    """No more messages differ than were hit, and what is lost with the structure is reported."""
+    rng = random.Random(13)
+    logs = make_logs(tmp_path) if tries > FEW else [write_log(tmp_path / "ours.ulg")]
+    originals = [(path.read_bytes(), rows_of(path), path.stem) for path in logs]
+    path = tmp_path / "damaged.ulg"
+    outcomes: Counter[str] = Counter()
+    for number in range(max(FEW, tries // 4)):
+        data, original, name = rng.choice(originals)
+        done, count, damaged = damage(data, rng)
+        path.write_bytes(damaged)
+        where = f"{name}, try {number}, {done}"
+        try:
+            read, run = rows_of(path), open_replay(f"ulog:{path}")
+            assert list(run.messages)
+        except SourceError:
+            outcomes["refused"] += 1
+            continue
+        missing: dict[str, set[str]] = {}
+        for address, messages in read.items():
+            missing.setdefault(address.topic, set()).update(nedbus.missing_of(messages))
+        before, after = count_rows(original, missing), count_rows(read, missing)
+        hit = 1 + count // 50 if count else 0
+        strange, lost = (after - before).total(), (before - after).total()
+        assert strange <= hit, f"{where}: {strange} messages differ: {run.warnings}"
+        # A log has no end: one whose writer lost power is a whole log.
+        assert run.damage or lost <= hit or is_shorter(damaged, data), f"{where}: {lost} lost: {run.warnings}"
+        outcomes["reported" if run.damage else "lost" if lost else "whole"] += 1
+    assert outcomes["whole"], outcomes
+    assert outcomes["reported"], outcomes
+    _log.info("%s", outcomes)
+
+
+def damage_chunk(path: Path, number: int) -> int:
+    """Flip a bit in the middle of a chunk of a recording; return how many messages are in it."""
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    index = summary.chunk_indexes[number - 1]
+    data[index.chunk_start_offset + index.chunk_length - 100] ^= 4
+    path.write_bytes(data)
+    with RecordingReader(path, vehicle="1") as reader:
+        total = sum(reader.counts.values())
+        return total - sum(1 for _ in reader.messages())
+
+
+def rewrite_index(path: Path, field: str, value: int) -> None:
+    """Change a field of the first two chunks in the index of a recording, and give it the CRC that fits."""
+    data = path.read_bytes()
+    start, _, _ = struct.unpack_from("<QQI", data, len(data) - 28)
+    builder = RecordBuilder()
+    left = 2
+    for record in StreamReader(BytesIO(data[start:]), skip_magic=True).records:
+        if isinstance(record, ChunkIndex) and left:
+            setattr(record, field, value)
+            left -= 1
+        if not isinstance(record, Footer):
+            record.write(builder)
+    index = builder.end() + struct.pack("<BQQQ", 2, 20, start, 0)
+    path.write_bytes(data[:start] + index + struct.pack("<I", crc32(index)) + data[-8:])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("chunk_start_offset", each) for each in (0, 100, 2**40, 2**62, 2**63, 2**64 - 1)]
+    + [("chunk_length", each) for each in (10_000, 2**40, 2**62, 2**63, 2**64 - 1)],
+)
+def test_index_that_points_elsewhere_is_not_used(tmp_path: Path, field: str, value: int) -> None:
+    """Chunks outside of the file, or two in one place: the file is read without its index, and nothing is lost."""
+    path = write_recording(tmp_path / "a.mcap", finish=True)
+    original = payloads_of(path)[0]
+    rewrite_index(path, field, value)
+    read, reader = payloads_of(path)
+    assert read == original
+    assert reader.warnings == ["the index is damaged: reading without it"]
+
+
+def add_chunk(path: Path, records: bytes, *, size: int, compression: str, in_index: bool) -> None:
+    """Add a chunk that says to be of this size to the end of a recording without an index, or make it the index."""
+    data = path.read_bytes()
+    end = len(data) - 50
+    packed = zstandard.compress(records) if compression == "zstd" else lz4.frame.compress(records)
+    builder = RecordBuilder()
+    Chunk(compression, packed, 1, 2, crc32(records), size).write(builder)
+    if in_index:
+        footer = struct.pack("<BQQQ", 2, 20, end + 13, 0)
+        index = builder.end() + footer
+        path.write_bytes(data[: end + 13] + index + struct.pack("<I", crc32(index)) + data[-8:])
+    else:
+        path.write_bytes(data[:end] + builder.end() + data[end:])
+
+
+@pytest.mark.parametrize(
+    ("size", "said", "compression", "in_index"),
+    [(2**28, said, compression, False) for said in (2**28, 2**20) for compression in ("zstd", "lz4")]
+    + [(2**28, 2**28, "zstd", True), (2**20, 2**20, "zstd", False)],
+)
+def test_chunk_too_large_is_left_out(tmp_path: Path, size: int, said: int, compression: str, *, in_index: bool) -> None:
+    """A chunk of 256 MiB that is packed into some kilobytes is not unpacked, whatever size it says; the rest is read.
+
+    A smaller one is unpacked: no record is of zeros, so that the rest of the chunk is left out where they begin.
+    """
+    path = write_recording(tmp_path / "a.mcap", finish=False)
+    original = payloads_of(path)[0]
+    add_chunk(path, bytes(size), size=said, compression=compression, in_index=in_index)
+    tracemalloc.start()
+    try:
+        read, reader = payloads_of(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert read == original
+    assert peak < 2**26
+    assert reader.damaged != in_index
+    if size == 2**20:
+        assert reader.warnings == ["damaged: a chunk has an invalid record; skipped the rest of that chunk"]
+
+
+def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
+    """A file of a thousand damaged places causes a hundred warnings, and one that says that there are more."""
+    path = write_recording(tmp_path / "a.mcap", finish=False)
+    place = struct.pack("<BQ", Opcode.MESSAGE_INDEX, 6) + bytes(6)
+    path.write_bytes(path.read_bytes()[:-50] + (place + struct.pack("<BQ", 0x80, 0)) * 1000)
+    reader = payloads_of(path)[1]
+    assert len(reader.warnings) == 101
+    assert reader.warnings[-1] == "further damage is not listed"
+
+
+CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged: its messages are skipped"
+
+
+def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
+    """One flipped bit: convert, plot and serve --until-done use what can be read, say what is lost, and exit with 1."""
+    path = write_recording(tmp_path / "a.mcap", finish=True)
+    with RecordingReader(path, vehicle="1") as reader:
+        total = sum(reader.counts.values())
+    assert (lost := damage_chunk(path, 3)) == 80
+    [warning] = open_replay(f"mcap:{path}").warnings
+    assert re.fullmatch(CHUNK, warning)
+    said = []
+    for arguments in (
+        ["convert", str(path), "b.mcap"],
+        ["plot", str(path), "-v", "1", "-o", "b.png"],
+        ["serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max"],
+    ):
+        ended = run_command(*arguments)
+        assert ended.exit_code == 1, ended.err
+        assert re.search(CHUNK, ended.err)
+        said.append(ended.err)
+    assert f"{total - lost} messages" in said[0]
+    assert f"{total - lost} published" in said[2]
+    assert Path("b.png").stat().st_size > 10_000
+    with RecordingReader("b.mcap", vehicle="1") as reader:
+        assert sum(reader.counts.values()) == total - lost
+
+
+def test_damage_of_a_converted_flight_costs_seconds(tmp_path: Path) -> None:
+    """`convert` writes chunks that are small enough for the rest to be worth reading."""
+    path = tmp_path / "a.mcap"
+    convert_replay("sim:?duration=30", path)
+    with RecordingReader(path, vehicle="1") as reader:
+        total = sum(reader.counts.values())
+    assert 0 < damage_chunk(path, 3) < total / 5
+
+
+def test_cut_log_is_converted_with_a_warning(tmp_path: Path) -> None:
+    """A log that ends inside a message, as after a loss of power, is converted up to there; nothing is missing."""
+    path = write_log(tmp_path / "a.ulg")
+    path.write_bytes(path.read_bytes()[:-50])
+    convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))
+    assert convert.exit_code == 0
+    assert "179 messages" in convert.err
+    assert "truncated: the file ends inside a message" in convert.err
+
+
+def write_payloads(path: Path, payloads: Iterable[bytes], *, layout: str = "1.16") -> Path:
+    """Write a recording of one vehicle as another program may write it: any payload, one a millisecond."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(layout).encode())
+        channel = writer.register_channel("/fmu/out/vehicle_local_position", "cdr", schema)
+        for number, payload in enumerate(payloads):
+            writer.add_message(channel, number * 10**6, payload, number * 10**6)
+        writer.finish()
+    return path
+
+
+def payload(timestamp: int, *, layout: str = "1.16", **fields: object) -> bytes:
+    return encode_cdr(downgrade(message(timestamp, **fields), layout), layout=layout)
+
+
+BAD_BOOL = payload(7)[: 4 + 16] + b"\x02" + payload(7)[4 + 16 + 1 :]  # xy_valid
+POISON = {
+    "bool of 2": BAD_BOOL,
+    "big-endian": b"\x00\x00" + payload(7)[2:],
+    "short": payload(7)[:-4],
+    "long": payload(7) + bytes(100),
+    "empty": b"",
+}
+
+
+@pytest.mark.parametrize("poison", POISON.values(), ids=POISON)
+def test_undecodable_message_is_skipped(tmp_path: Path, poison: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    """It is rejected with its place, and counted; the others are replayed, converted and read."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), poison, payload(3)])
+    run = open_replay(f"mcap:{path}")
+    messages = list(run.messages)
+    assert [each.error is None for each in messages] == [True, True, False, True]
+    assert str(messages[2].error).startswith("message 3 of the recording: ")
+    assert run.damage is None
+    assert convert_replay(f"mcap:{path}", tmp_path / "b.mcap") == "3 messages, 1 rejected"
+    assert "rejected: message 3 of the recording: " in caplog.text
+    assert nedbus.read(path)["timestamp"].tolist() == [1, 2, 3]
+    assert "1 of 4 messages" in caplog.text
+
+
+def test_service_goes_on_after_a_message_that_cannot_be_decoded(tmp_path: Path) -> None:
+    """The replay is not started again: what follows is published once, and the exit code is 0."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(1), BAD_BOOL, payload(2)])
+    service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
+    assert service.exit_code == 0, service.err
+    assert "rejected: message 2 of the recording: " in service.err
+    assert "xy_valid: 2, where a bool is 0 or 1" in service.err
+    assert "done, 2 published, 1 rejected" in service.err
+
+
+def test_wrong_sizes_do_not_shift_into_each_other(tmp_path: Path) -> None:
+    """55 payloads that are all too long by the same number of bytes are 55 invalid messages, not 56 of garbage."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(each) + bytes(60) for each in range(55)])
+    assert len(nedbus.read(path)) == 0
+
+
+@pytest.mark.parametrize("layout", ["1.13", "V0", "1.16"])
+def test_invalid_message_is_left_out(tmp_path: Path, layout: str, caplog: pytest.LogCaptureFixture) -> None:
+    """`read` leaves one invalid message out and counts it, whatever the layout."""
+    bad = bytearray(payload(2, layout=layout, ref_lat=12.5))
+    offset = bad.index(struct.pack("<d", 12.5))
+    bad[offset : offset + 8] = struct.pack("<d", 91.0)
+    payloads = payload(1, layout=layout), bytes(bad), payload(3, layout=layout)
+    path = write_payloads(tmp_path / "a.mcap", payloads, layout=layout)
+    assert nedbus.read(path)["timestamp"].tolist() == [1, 3]
+    assert "vehicle_local_position: skipped 1 of 3 messages as invalid" in caplog.text

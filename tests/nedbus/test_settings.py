@@ -1,0 +1,279 @@
+"""Settings: nedbus.toml below the environment below flags; every mistake names its place, in a router's file too."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+
+import pytest
+
+import nedbus
+from nedbus import Tls
+from nedbus.errors import ConfigError, ConnectError, ListenError
+from nedbus.pki import make_authority, make_certificate
+from nedbus.settings import load_settings
+from nedbus.sources import SOURCE_KINDS
+from nedbus.transport import open_client, open_router
+from nedbus.transport.endpoints import explain_endpoints
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
+from tests.waits import wait_for
+
+
+def test_order_is_file_environment_flag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each beats the one before it; None is no flag. Without any setting a client joins loopback.
+
+    A variable is the place of its mistake.
+    """
+    settings = load_settings()
+    assert settings.routers == ("tcp/127.0.0.1:7447",)
+    assert (settings.prefix, settings.vehicle, settings.source, settings.until_done) == ("nedbus", "1", (), False)
+    file = tmp_path / "other.toml"
+    file.write_text('connect = "tcp/file:1"\nprefix = "file"\nvehicle = 5\n')
+    assert load_settings(file).connect == ("tcp/file:1",)
+    monkeypatch.setenv("NEDBUS_CONNECT", "tcp/env:1, tcp/env:2")
+    monkeypatch.setenv("NEDBUS_PREFIX", "env")
+    settings = load_settings(file, prefix="flag", connect=None)
+    assert (settings.connect, settings.prefix, settings.vehicle) == (("tcp/env:1", "tcp/env:2"), "flag", "5")
+    monkeypatch.setenv("NEDBUS_LISTEN", "here")
+    with pytest.raises(ConfigError, match=r"^NEDBUS_LISTEN: 'here' is not an endpoint"):
+        load_settings()
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_script_with_an_endpoint_reads_what_it_needs(tmp_path: Path, endpoint: str, *, is_async: bool) -> None:
+    """With an endpoint only `prefix` and, for tls/, the files of TLS are read from ./nedbus.toml."""
+
+    async def connect_async(where: str | None, prefix: str | None) -> str:
+        async with nedbus.connect_async(where, prefix=prefix) as bus:
+            return bus.prefix
+
+    def connect(where: str | None = endpoint, prefix: str | None = None) -> str:
+        if is_async:
+            return asyncio.run(connect_async(where, prefix))
+        with nedbus.connect(where, prefix=prefix) as bus:
+            return bus.prefix
+
+    file = tmp_path / "nedbus.toml"
+    file.write_text('prefix = "fleet"\nlisten = "nowhere"\nconect = 1\ntls_ca = 7\n')
+    assert connect() == "fleet"
+    for where, prefix in ((None, None), ("tls/127.0.0.1:1", "fleet")):
+        with pytest.raises(ConfigError, match=r"nedbus\.toml"):
+            connect(where, prefix)
+    file.write_text("prefix = 7\n")
+    with pytest.raises(ConfigError, match="prefix"):
+        connect()
+    file.write_text("not TOML")
+    assert connect(prefix="other") == "other"
+
+
+def test_file_is_the_named_one_or_the_one_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """--config, else NEDBUS_CONFIG, else ./nedbus.toml."""
+    for name in ("a", "b", "nedbus"):
+        (tmp_path / f"{name}.toml").write_text(f'prefix = "{name}"\n')
+    assert load_settings().prefix == "nedbus"
+    monkeypatch.setenv("NEDBUS_CONFIG", str(tmp_path / "a.toml"))
+    assert load_settings().prefix == "a"
+    assert load_settings(tmp_path / "b.toml").prefix == "b"
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "reason"),
+    [
+        ('connect = ["tcp/a:1"', "line 1, column 21", "Unclosed array"),
+        ("vehicle = 1\nx y", "line 2, column 3", "Expected '=' after a key"),
+        ("vehicle = 1\n\n  conect = 3", "line 3, column 3", "there is no setting 'conect': choose from connect,"),
+        ('until_done = "maybe"', "line 1, column 1", "until_done: "),
+        ("[source]\na = 1", "line 1, column 2", "source: "),
+        ('{\n  mode: "router",\n  acess_control: {}\n}', "line 3, column 3", "unknown field 'acess_control'"),
+        ('{\n  mode: "routr",\n}', "line 2, column 9", "unknown variant 'routr', expected one of 'router'"),
+        ('{\n  mode: "router"\n listen: 5}', "line 2, column 9", "expected"),
+        ('{\n  listen: {endpoints: ["foo"]}}', "line 2, column 23", "Endpoints must be of the form"),
+        ("{ transport: {link: {tls: {bad: 3}}}}", "line 1, column 28", "unknown field 'bad'"),
+    ],
+)
+def test_mistake_in_a_file_is_found(tmp_path: Path, text: str, place: str, reason: str) -> None:
+    """File, line, column, and what to write instead; of a router's, without paths of another program's sources."""
+    file = tmp_path / ("router.json5" if text.startswith("{") else "nedbus.toml")
+    file.write_text(text)
+    with pytest.raises(ConfigError) as info:
+        load_settings(file) if file.suffix == ".toml" else open_router(config_file=file)
+    assert re.match(rf"{re.escape(str(file))}, {place}: {reason}", str(info.value))
+    assert not re.search(r"/root/|\.rs", str(info.value))
+
+
+def test_file_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file that was asked for must be there, and be one; one that another user owns is no "cannot write"."""
+    (tmp_path / "folder.toml").mkdir()
+    for name in ("no.toml", "folder.toml"):
+        with pytest.raises(ConfigError, match=rf"{name}: there is no such file"):
+            load_settings(tmp_path / name)
+    (tmp_path / "nedbus.toml").symlink_to("/proc/self/mem")
+    with pytest.raises(ConfigError, match=r"nedbus\.toml: cannot be read: "):
+        load_settings()
+    monkeypatch.setenv("NEDBUS_CONFIG", "gone.toml")
+    with pytest.raises(ConfigError, match=r"gone\.toml: there is no such file"):
+        load_settings()
+
+
+def test_mark_of_windows_editors_is_read_over(tmp_path: Path) -> None:
+    """A BOM before the first line is no mistake, and lines and columns are counted without it."""
+    file = tmp_path / "nedbus.toml"
+    file.write_bytes(b'\xef\xbb\xbfprefix = "own"\n')
+    assert load_settings().prefix == "own"
+    file.write_bytes(b"\xef\xbb\xbfconect = 3\n")
+    with pytest.raises(ConfigError, match=r"^nedbus\.toml, line 1, column 1: there is no setting 'conect'"):
+        load_settings()
+    file.write_text('prefix = "own"\n', encoding="utf-16")
+    with pytest.raises(ConfigError, match="not UTF-8 text"):
+        load_settings()
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("NEDBUS_CONECT", "NEDBUS_CONNECT"),
+        ("NEDBUS_SOURCES", "NEDBUS_SOURCE"),
+        # What begins as a setting is more like it than one that differs in fewer letters.
+        ("NEDBUS_TLS_CERT", "NEDBUS_TLS_CERTIFICATE"),
+        ("NEDBUS_TLS_K", "NEDBUS_TLS_KEY"),
+        ("NEDBUS_TLS", "NEDBUS_TLS_CA or NEDBUS_TLS_CERTIFICATE or NEDBUS_TLS_KEY"),
+        *((f"NEDBUS_{name}", None) for name in ("PUBLISH", "ROUTER_IMAGE", "PKI")),  # of the compose files
+    ],
+)
+def test_misspelt_variable_is_reported(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str, meant: str | None
+) -> None:
+    """A variable that is nearly a setting, or its beginning, is warned of; other variables are not."""
+    monkeypatch.setenv(name, "x")
+    load_settings()
+    assert caplog.messages == [f"{name} is not a setting: did you mean {meant}?"] * (meant is not None)
+
+
+@pytest.mark.parametrize(
+    ("text", "sources"),
+    [
+        ("sim:", ["sim:"]),
+        ("sim:, ulog:/a.ulg?speed=2,px4-zenoh:", ["sim:", "ulog:/a.ulg?speed=2", "px4-zenoh:"]),
+        ("mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail", ["mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail"]),
+        ("px4-zenoh:?vehicles=5:a,6:b,sim:?vehicle=c", ["px4-zenoh:?vehicles=5:a,6:b", "sim:?vehicle=c"]),
+        ("px4-zenoh:?vehicles=left:a,right:b; sim:", ["px4-zenoh:?vehicles=left:a,right:b", "sim:"]),
+        ("px4-zenoh:?vehicles=left:a,right:b;", ["px4-zenoh:?vehicles=left:a,right:b"]),
+        ("px4-zenoh:?vehicles=left:a,right:b\nsim:\n", ["px4-zenoh:?vehicles=left:a,right:b", "sim:"]),
+    ],
+)
+def test_sources_in_the_environment(monkeypatch: pytest.MonkeyPatch, text: str, sources: list[str]) -> None:
+    """Commas inside options are theirs; semicolons or lines separate sources whatever their options contain."""
+    monkeypatch.setenv("NEDBUS_SOURCE", text)
+    assert load_settings().source == tuple(sources)
+
+
+def test_name_without_an_address_is_reported() -> None:
+    """The reason is found on this host, and no other is guessed."""
+    with pytest.raises(ConnectError, match=r"cannot resolve no-such-host\.invalid"):
+        nedbus.connect("tcp/no-such-host.invalid:7447", timeout=0.1)
+    assert explain_endpoints(["tcp/no-such-host.invalid:1", "tcp/127.0.0.1:1"]) is None
+    assert explain_endpoints(["tcp/[::1]:1"]) is None
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make an authority, the certificates of two clients, one that expires at once, and files that hold none."""
+    folder = tmp_path_factory.mktemp("keys")
+    make_authority(folder)
+    for name, days in (("wing", 100), ("tail", 100), ("old", 0)):
+        make_certificate(folder, name, days=days)
+    (folder / "empty").touch()
+    (folder / "text").write_text("hello\n")
+    (folder / "cut").write_text((folder / "wing.crt").read_text()[:200])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("ca", "certificate", "key", "reason"),
+    [
+        ("wing.key", "wing.crt", "wing.key", "wing.key holds a private key, where a certificate is needed: check"),
+        ("ca.crt", "wing.key", "wing.crt", "wing.key holds a private key, where a certificate is needed: check"),
+        ("ca.crt", "wing.crt", "ca.crt", "ca.crt holds a certificate, where a private key is needed: check"),
+        ("ca.crt", "wing.crt", "tail.key", "tail.key is not the key of "),
+        ("ca.crt", "empty", "wing.key", "empty holds nothing, where a certificate is needed: 'nedbus pki' makes"),
+        ("text", "wing.crt", "wing.key", "text holds no PEM, where a certificate is needed"),
+        ("ca.crt", "cut", "wing.key", "is damaged, or the key has a password"),
+        ("gone", "wing.crt", "wing.key", "gone cannot be read"),
+        ("ca.crt", ".", "wing.key", "cannot be read"),
+    ],
+)
+def test_mistaken_certificate_is_found_locally(keys: Path, ca: str, certificate: str, key: str, reason: str) -> None:
+    """Files that are swapped, empty, damaged, or do not belong together, need no router to be found."""
+    with pytest.raises(ConfigError) as info:
+        nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=Tls(keys / ca, keys / certificate, keys / key))
+    assert reason in str(info.value)
+
+
+def test_certificate_that_is_refused_is_explained(keys: Path, tmp_path: Path) -> None:
+    """A certificate that is expired, or of another authority, is named when nothing answers."""
+    other = tmp_path / "other"
+    make_authority(other)
+    tls = Tls(keys / "ca.crt", keys / "wing.crt", keys / "wing.key")
+    assert tls.explain() is None
+    assert Tls(keys / "ca.crt").explain() is None
+    assert "not the certificate of an authority" in str(Tls(keys / "wing.crt").explain())
+    old = Tls(keys / "ca.crt", keys / "old.crt", keys / "old.key")
+    wait_for(lambda: "old.crt or its authority has expired" in str(old.explain()), what="its end")
+    foreign = Tls(other / "ca.crt", keys / "wing.crt", keys / "wing.key")
+    assert "wing.crt is not signed by the authority in tls_ca" in str(foreign.explain())
+    with pytest.raises(ConnectError, match=r"wing\.crt is not signed by the authority"):
+        nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=foreign)
+
+
+# What a router refuses to start with
+
+
+def test_router_file_must_be_one(tmp_path: Path) -> None:
+    """A missing file and a foreign ending are named."""
+    for name, said in (
+        ("no.json5", "there is no such file"),
+        ("router.conf", r"expected a \.json5, \.json, \.yaml or \.yml"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            open_router(config_file=tmp_path / name)
+
+
+def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Zenoh's Python library ignores them without a word: each is named, and one that is required is an error."""
+    file = tmp_path / "router.json5"
+    file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
+    open_router(listen=(free_endpoint(),), config_file=file).close()
+    ignored = "plugin rest and plugin storage_manager not loaded: unlike zenohd, this router loads no plugins"
+    assert caplog.messages == [f"{file}: {ignored}"]
+    file.write_text("{ plugins: { rest: { __required__: true } } }")
+    with pytest.raises(ConfigError, match="it requires plugin rest, but this router loads no plugins: run it with"):
+        open_router(config_file=file)
+    for name in ("storage.json5", "rest-reader.json5"):  # as shipped, for zenohd alone
+        with pytest.raises(ConfigError, match="this router loads no plugins"):
+            open_router(config_file=Path(__file__).parents[2] / "config" / name)
+
+
+def test_help_names_every_source() -> None:
+    """`nedbus serve --help` derives from the table of sources: none is forgotten."""
+    help_ = run_command("serve", "--help", COLUMNS="300")
+    assert help_.exit_code == 0
+    assert all(f" {name}:{kind.target or ''}" in help_.out for name, kind in SOURCE_KINDS.items())
+
+
+def test_address_that_cannot_be_listened_on_names_the_reason(endpoint: str) -> None:
+    """ListenError is an OSError, with what the system said: the port is taken, or the address another host's."""
+    for where, reason in ((endpoint, "address already in use"), ("tcp/192.0.2.1:7447", "cannot assign requested")):
+        with pytest.raises(ListenError, match=rf"cannot listen on {where} \({reason}") as info:
+            open_router(listen=(where,))
+        assert isinstance(info.value, OSError)
+
+
+@pytest.mark.parametrize("endpoint", ["7447", "localhost:7447", "foo/localhost:7447", "tcp/", ""])
+def test_malformed_endpoint_is_refused(endpoint: str) -> None:
+    """Zenoh's own form of an endpoint is told."""
+    with pytest.raises(ConfigError, match=r"write PROTOCOL/HOST:PORT, as in tcp/127\.0\.0\.1:7447"):
+        open_client((endpoint,), timeout=0)
+    with pytest.raises(ConfigError, match="is not an endpoint"):
+        open_router(listen=(endpoint,))

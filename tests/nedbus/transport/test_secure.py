@@ -1,0 +1,474 @@
+"""config/router-secure.json5 and `nedbus pki`: who may do what, proved by what arrives; denials are silent in Zenoh."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import stat
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Final
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.client.publishing.flow_control import WINDOW
+from nedbus.daemon.write_permission import WritePermission
+from nedbus.pki import write_access_rules
+from nedbus.timings import Timings
+from nedbus.transport import Session, open_client, open_router
+from nedbus_msgs import Address, define, field_type
+from nedbus_msgs.arrays import to_array
+from tests.flights.first_message import encode
+from tests.flights.messages import VLP, message
+from tests.nedbus.client.numbered import take
+from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_demand
+from tests.nedbus.sources.px4.test_source import Px4
+from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.command_line import run_command
+from tests.peers.hasty import start_hasty
+from tests.peers.http_pages import Pages
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Process, Start
+from tests.peers.zenohd import EITHER, start_zenohd
+from tests.waits import DEADLINE, wait_for, wait_for_reader
+
+__all__ = ["clock", "pki"]
+
+Join = Callable[[str], nedbus.Bus]
+Open = Callable[[str], Session]
+
+
+@pytest.fixture
+def configured(pki: Path, tmp_path: Path) -> tuple[Path, str]:
+    """Copy the shipped configuration, with these certificates and a free port; return the file and its endpoint."""
+    endpoint = secure_endpoint()
+    return write_config(pki, tmp_path / "router-secure.json5", endpoint), endpoint
+
+
+@pytest.fixture(params=EITHER)
+def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iterator[str]:
+    """Run a router on the shipped configuration: ours, or the real zenohd."""
+    file, endpoint = configured
+    if request.param == "zenohd":
+        start_zenohd(request.getfixturevalue("start"), "-c", str(file))
+        yield endpoint
+    else:
+        with open_router(config_file=file):
+            yield endpoint
+
+
+@pytest.fixture
+def join(secure: str, pki: Path) -> Iterator[Join]:
+    """Connect as somebody."""
+    with ExitStack() as opened:
+        yield lambda name: opened.enter_context(nedbus.connect(secure, tls=tls_of(pki, name), timeout=DEADLINE))
+
+
+@pytest.fixture
+def open_as(secure: str, pki: Path) -> Iterator[Open]:
+    """Open a plain session as somebody."""
+    with ExitStack() as opened:
+        yield lambda name: opened.enter_context(open_client([secure], tls=tls_of(pki, name), timeout=DEADLINE))
+
+
+def test_vehicle_is_read_whole(join: Join) -> None:
+    """Through the secure router everything works as through an open one: data, liveliness, last values, recovery."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    reader = join("reader")
+    wait_for(lambda: reader.latest(VLP), what="the last value")
+    wait_for(lambda: "1" in reader.vehicles(), what="the vehicle")
+    with reader.subscribe("*", mode="every") as subscription:
+        assert take(subscription, 1) == [1]
+        for timestamp in range(2, 1000):
+            publisher.publish(message(timestamp))
+        assert take(subscription, 998) == list(range(2, 1000))
+    assert publisher.flush()
+
+
+def test_vehicle_learns_what_was_read(join: Join) -> None:
+    """A vehicle may ask readers how far they are, and they may answer: it waits for one that reads nothing."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1", lossless=True)
+    publisher.publish(message(1))
+    with join("reader").subscribe("*", mode="every") as subscription:
+        assert take(subscription, 1) == [1]
+        count = 3 * WINDOW
+        many = to_array([message(number) for number in range(2, count + 1)])
+        sending = threading.Thread(target=publisher.publish_many, args=[many])
+        sending.start()
+        wait_for(lambda: publisher.published > WINDOW, what="the first window")
+        assert publisher.published < count
+        assert take(subscription, count - 1)[-1] == count
+        sending.join(DEADLINE)
+        assert publisher.flush()
+        publisher.close()  # else it waits for the reader to come back
+
+
+def test_message_without_a_file_is_read(join: Join) -> None:
+    """Readers may ask vehicles what any message is, one that has no file here too; other topics need no rule."""
+    vehicle, reader = join("vehicle-1"), join("reader")
+    definition = define(
+        "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
+    )
+    encoders = vehicle._publishers.publisher(Address("1", "wheel_encoders"), definition)
+    attitude = vehicle.publisher("vehicle_attitude", vehicle="1")
+    sent = definition.model.model_validate({"timestamp": 1, "wheel_speed": (0.5, 2.0)})
+    with reader.subscribe("*", mode="every") as subscription:
+        for key in (encoders.key, attitude.key):
+            wait_for_reader(vehicle._session, key)
+        attitude.publish({"timestamp": 1, "q": (1.0, 0.0, 0.0, 0.0)})
+        assert subscription.receive(DEADLINE).topic == "vehicle_attitude"
+
+        def is_read() -> bool:
+            encoders.publish(sent)
+            with suppress(nedbus.NoDataError):
+                return bool(subscription.receive(0.1).message.model_dump() == sent.model_dump())
+            return False
+
+        wait_for(is_read, what="a message that a vehicle has described")
+
+
+@pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])
+def test_nobody_else_writes_a_vehicles_keys(join: Join, intruder: str) -> None:
+    """Messages of an intruder as vehicle 1 reach no reader: no data, no liveliness, no last value."""
+    genuine = join("vehicle-1").publisher(VLP, vehicle="1")
+    genuine.publish(message(1))
+    reader = join("reader")
+    with reader.subscribe("*", mode="every") as subscription:
+        assert take(subscription, 1) == [1]
+        other = join(intruder)
+        other.publisher(VLP, vehicle="1").publish(message(666))
+        other.publisher(VLP, vehicle="3").publish(message(667))
+        for timestamp in (2, 3):
+            genuine.publish(message(timestamp))
+            assert take(subscription, 1) == [timestamp]
+        assert [sample.message.timestamp for sample in reader.latest("*")] == [3]
+        assert list(reader.vehicles()) == ["1"]
+
+
+@pytest.mark.parametrize("name", ["reader", "operator", "stranger"])
+def test_strangers_cannot_announce_vehicles(join: Join, open_as: Open, name: str) -> None:
+    """Only a vehicle's own certificate declares its liveliness tokens: false ones would cost every reader."""
+    vehicle, reader, own, stranger = join("vehicle-1"), join("reader"), open_as("vehicle-1"), open_as(name)
+    keys = [f"nedbus/{each}/@alive/1a/{VLP}" for each in (1, 2, "x")]
+    tokens = [stranger.liveliness().declare_token(key) for key in keys]
+    tokens += [own.liveliness().declare_token(key) for key in keys[1:]]
+    with vehicle.publisher(VLP, vehicle="1"):
+        wait_for(reader.vehicles, what="the vehicle")
+        assert reader.vehicles() == {"1": [Address("1", VLP)]}
+    wait_for(lambda: not reader.vehicles(), what="its end, as no token of a stranger stands for it")
+    assert len(tokens) == 5
+
+
+def test_certificate_reads_what_it_is_for(join: Join, open_as: Open) -> None:
+    """A vehicle's is for writing: it gets no data, its own neither; who is connected is for operators to ask."""
+    join("vehicle-1").publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(join("reader").latest, what="the message")
+    assert join("vehicle-2").latest("*") == join("vehicle-1").latest("*") == []
+    operator, reader = open_as("operator"), open_as("reader")
+    wait_for(lambda: [reply.ok for reply in operator.get("@/*/router")], what="an answer to the operator")
+    assert [reply.ok for reply in reader.get("@/*/router")] == []
+
+
+@pytest.mark.parametrize(
+    ("ca", "certificate", "key", "reason"),
+    [
+        (None, "vehicle-1.crt", "vehicle-1.key", "tls_ca: a certificate is set, but not"),
+        ("ca.crt", None, "vehicle-1.key", "a certificate needs its key"),
+        ("gone.crt", None, None, "gone.crt cannot be read"),
+    ],
+)
+def test_half_a_setting_is_refused(
+    pki: Path, monkeypatch: pytest.MonkeyPatch, *, ca: str | None, certificate: str | None, key: str | None, reason: str
+) -> None:
+    """A missing half or file is reported before anything is dialled, from the settings as from a script."""
+    paths = [pki / file if file else None for file in (ca, certificate, key)]
+    if paths[0] is not None:
+        with pytest.raises(nedbus.ConfigError, match=reason):
+            nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=nedbus.Tls(paths[0], paths[1], paths[2]))
+    for name, path in zip(("TLS_CA", "TLS_CERTIFICATE", "TLS_KEY"), paths, strict=True):
+        if path is not None:
+            monkeypatch.setenv(f"NEDBUS_{name}", str(path))
+    with pytest.raises(nedbus.ConfigError, match=reason):
+        nedbus.connect("tls/127.0.0.1:1", timeout=0.1)
+
+
+def test_commands_use_certificates(secure: str, pki: Path, run_nedbus: Start) -> None:
+    """Service and commands take the same files, as flags or from the environment; health tells of what is refused."""
+    run_nedbus("serve", "-c", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+    wait_for(lambda: run_command("health", "-c", secure, "-v", "1", *flags_of(pki, "reader")).exit_code == 0, what="1")
+    files = {"CA": "ca.crt", "CERTIFICATE": "reader.crt", "KEY": "reader.key"}
+    environment = {"NEDBUS_CONNECT": secure, **{f"NEDBUS_TLS_{name}": f"{pki / file}" for name, file in files.items()}}
+    echo = run_command("echo", "-n", "20", **environment)
+    assert (echo.exit_code, len(echo.out.splitlines())) == (0, 20), echo.err
+    info = run_command("info", **environment)
+    assert info.exit_code == 0
+    assert "sim:" in info.out
+    refused = run_command("health", "-v", "2", **environment)
+    assert refused.exit_code == 1
+    assert "vehicle 2 is not published, although its service reports it as published" in refused.err
+
+
+def test_px4_reaches_the_secure_router_through_its_own(
+    join: Join, open_as: Open, secure: str, pki: Path, run_nedbus: Start
+) -> None:
+    """A PX4 without TLS is read through a service beside it, a router with a certificate; its own keys stay there."""
+    beside = free_endpoint()
+    service = run_nedbus(
+        *("serve", "--vehicle", "1", "-s", "px4-zenoh:", "--listen", beside),
+        *("--connect", secure, *flags_of(pki, "vehicle-1")),
+    )
+    wait_for(lambda: f"joined {secure}" in service.err, what="the secure link")
+    beyond = open_as("reader").declare_subscriber("*/fmu/**", zenoh.handlers.RingChannel(10))
+    with (
+        join("reader").subscribe("*", mode="every") as subscription,
+        open_client([beside], timeout=DEADLINE) as on_vehicle,
+    ):
+        px4 = Px4(on_vehicle)
+        for timestamp in range(1, 101):
+            px4.put(timestamp)
+        samples = [subscription.receive(DEADLINE) for _ in range(100)]
+    assert {(sample.vehicle, sample.topic, sample.source) for sample in samples} == {("1", VLP, "px4-zenoh")}
+    assert [sample.message.timestamp for sample in samples] == list(range(1, 101))
+    assert beyond.try_recv() is None
+    swapped = run_nedbus("serve", "--listen", free_endpoint(), "--connect", secure, "--tls-ca", "no.crt", "-s", "sim:")
+    assert swapped.wait() == 2
+    assert "no.crt cannot be read" in swapped.err
+
+
+def test_list_does_not_ask_for_a_source_that_is_there(secure: str, pki: Path, run_nedbus: Start) -> None:
+    """Where a service answers and no vehicle is seen, the hint is about what the router lets through."""
+
+    def hint() -> str:
+        listed = run_command("list", "-c", secure, *flags_of(pki, "reader"))
+        assert listed.exit_code == 0
+        return listed.err
+
+    assert "start a source with 'nedbus serve'" in hint()
+    run_nedbus("serve", "--connect", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
+    wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
+
+
+def test_pki_commands_never_overwrite(tmp_path: Path) -> None:
+    """Keys are made once, for their owner only, and never shown."""
+    folder = tmp_path / "pki"
+    assert run_command("pki", "cert", str(folder), "reader").exit_code == 1
+    for arguments in (["ca", str(folder)], ["cert", str(folder), "router", "--host", "127.0.0.1", "--host", "gcs"]):
+        made = run_command("pki", *arguments)
+        assert made.exit_code == 0, made.err
+        key = Path(made.out.splitlines()[0])
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+        before = key.read_bytes()
+        assert b"PRIVATE KEY" in before
+        assert "PRIVATE" not in made.out + made.err
+        again = run_command("pki", *arguments)
+        assert again.exit_code == 1
+        assert "it is not overwritten" in again.err
+        assert key.read_bytes() == before
+    assert run_command("pki", "cert", str(folder), "../evil").exit_code == 1
+
+
+def test_missing_certificate_is_named(run_nedbus: Start, tmp_path: Path) -> None:
+    """A router whose certificates were forgotten says which file it misses."""
+    file = tmp_path / "secure.json5"
+    file.write_text((CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(tmp_path / "nowhere")))
+    router = run_nedbus("router", str(file))
+    assert router.wait() == 2
+    assert re.search(r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: check that it exists", router.err)
+
+
+@pytest.mark.parametrize(
+    ("command", "environment"),
+    [(("router",), {}), (("serve", "-s", "sim:", "--router-config"), {"RUST_LOG": "zenoh=info"})],
+    ids=["router", "service"],
+)
+def test_refused_clients_are_logged(
+    run_nedbus: Start, pki: Path, configured: tuple[Path, str], *, command: tuple[str, ...], environment: dict[str, str]
+) -> None:
+    """A refused client learns what to check; the log on stderr says why; lines of RUST_LOG are on stdout."""
+    file, endpoint = configured
+    router = run_nedbus(*command, str(file), **environment)
+    wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")
+    with nedbus.connect(endpoint, tls=tls_of(pki, "reader")) as bus:
+        assert bus.connected
+    assert "refused" not in router.err
+
+    for name, ca, reason, advice in (
+        ("foreign/reader", "ca.crt", "its certificate is signed by another authority", "is not signed by the autho"),
+        ("expired", "ca.crt", "its certificate has expired", "expired.crt or its authority has expired"),
+        (None, "ca.crt", "it sent no certificate", "no certificate given: "),
+        ("reader", "foreign/ca.crt", "it does not accept the certificate of this router", "is not signed by"),
+    ):
+        with pytest.raises(nedbus.ConnectError) as refused:
+            nedbus.connect(endpoint, tls=tls_of(pki, name, ca), timeout=0.1)
+        assert str(refused.value).startswith(f"no TLS connection to {endpoint}: ")
+        assert advice in str(refused.value)
+        assert len(str(refused.value)) < 250, "short enough to be read"
+        wait_for(lambda: f"WARNING a client is refused: {reason}\n" in router.err, what=reason)  # noqa: B023 - at once
+    with pytest.raises(nedbus.ConnectError):
+        nedbus.connect(endpoint.replace("tls/", "tcp/"), timeout=0.1)
+    wait_for(lambda: "a client is refused: it does not speak TLS\n" in router.err, what="the client without TLS")
+    assert ("Zenoh can be reached at" in router.out) == bool(environment)
+    assert "certificate" not in router.out
+
+
+def test_last_lines_of_a_process_that_logs_refusals(start: Start) -> None:
+    """Lines printed just before the end of a process pass through the pipe of Zenoh's log, whole and in order."""
+    code = """
+from nedbus.transport import log_refusals
+log_refusals()
+for number in range(2000):
+    print(number, flush=True)
+print("the end", end="")
+"""
+    process = start("-c", code, measured=False)
+    assert process.wait() == 0
+    assert process.out.split("\n") == [*map(str, range(2000)), "the end"]
+
+
+def test_thinned_stream_flows_as_the_stream_does(
+    join: Join, open_as: Open, clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A reader with a maximum rate gets what the vehicle thins, and its cache; nobody else writes it."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    stranger, reader = open_as("vehicle-2"), join("reader")
+    with reader.subscribe(mode="every", max_rate=5) as subscription:
+        assert take(subscription, 1) == [1]
+        wait_for_demand(publisher)
+        stranger.put(Address("1", VLP).rate_key(5), encode(message(666)))
+        publish(publisher, clock, 2, 1000)
+        assert take(subscription, 50) == list(range(2, 1002, 20))
+        assert subscription.counts.lost == 0
+        assert "nobody" not in caplog.text
+
+
+PERMISSION: Final = "nedbus.daemon.write_permission."
+SOON: Final = Timings(
+    probe_first=(0.1, 0.3), probe_confirm=0.3, probe_poll=0.3, probe=0.3, probe_unsure=0.3, probe_pause=0.3
+)
+
+
+@pytest.mark.parametrize(
+    ("certificate", "kind"),
+    [("vehicle-1", "nedbus"), pytest.param("vehicle-2", "zenohd", marks=pytest.mark.slow)],
+    ids=["certificate of another vehicle", "certificate without a rule"],
+)
+def test_refused_service_says_so_until_the_rules_are_mended(
+    configured: tuple[Path, str], pki: Path, run_nedbus: Start, start: Start, *, certificate: str, kind: str
+) -> None:
+    """Log, health, metrics and `nedbus info` say that nothing of vehicle 2 passes the router, until something does."""
+    file, endpoint = configured
+
+    def start_router() -> Process:
+        return run_nedbus("router", str(file)) if kind == "nedbus" else start_zenohd(start, "-c", str(file))
+
+    router, pages = start_router(), Pages(free_port())
+    options = (*flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
+    service = start_hasty(start, SOON, "serve", "-c", endpoint, *options)
+    refused = (503, "the router refuses vehicle 2\n")
+    wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
+    assert (pages.ask("/healthz"), pages.ask("/readyz")) == (refused, refused)
+    assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
+    assert json.loads(pages.ask("/status")[1])["refused"] == ["2"]
+    reader = ("--wait", "-c", endpoint, *flags_of(pki, "reader"))
+    if certificate == "vehicle-1":  # else not even its status passes
+        info = run_command("info", *reader)
+        assert info.exit_code == 0, info.err
+        assert "refused by the router: vehicle 2" in info.out
+        assert re.search(rf"2/{VLP} .*refused by the router", info.out)
+        health = run_command("health", *reader)
+        assert health.exit_code == 1
+        assert "the router refuses vehicle 2" in health.err
+
+    write_access_rules(file, ["1", "2"])
+    own = '{ rules: ["vehicle-2-in"], subjects: ["vehicle-2"] }'
+    assert own in file.read_text()
+    file.write_text(file.read_text().replace(own, own.replace('vehicle-2"] }', f'{certificate}"] }}')))
+    router.kill()
+    start_router()
+    wait_for(lambda: "the router accepts vehicle 2 now" in service.err, what="its end")
+    assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert pages.values("nedbus_vehicle_refused", vehicle="2") == [0.0]
+    health = run_command("health", "--vehicle", "2", *reader)
+    assert health.exit_code == 0, health.err
+
+
+Outcome = tuple[bool | None, float]
+
+
+def permission_of(session: Session, endpoint: str, pki: Path, *vehicles: str) -> WritePermission:
+    tls = tls_of(pki, "vehicle-1")
+    return WritePermission(session, [endpoint], tls=tls, prefix="nedbus", vehicles=lambda: set(vehicles))
+
+
+def look(permission: WritePermission) -> Mapping[str, bool]:
+    """Look at which vehicles the router refuses, and return what is known then."""
+    permission.check()
+    return permission.refused
+
+
+@pytest.mark.parametrize(
+    ("history", "outcome"),  # the outcome: refused or not, and the pause after it
+    [
+        (["denied"], (None, 1)),
+        (["denied", "denied", "denied"], (True, 60)),
+        (["denied", "denied", "allowed"], (False, 600)),
+        (["denied", "denied", "allowed", "denied"], (None, 1)),
+        (["denied", "unknown", "denied", "denied"], (True, 60)),
+        (["denied", "denied", "denied", "unknown"], (True, 60)),
+        (["denied", "denied", "denied", "allowed"], (False, 600)),
+        (["allowed", "unknown"], (None, 60)),
+        (["unknown"] * 9, (None, 60)),
+    ],
+    ids=lambda value: " ".join(map(str, value)),
+)
+def test_refusal_is_believed_when_it_is_repeated(
+    endpoint: str, raw: Session, pki: Path, monkeypatch: pytest.MonkeyPatch, *, history: list[str], outcome: Outcome
+) -> None:
+    """Three denials in a row, asked for by the second, are a refusal until the router takes something."""
+    verdicts = iter(history)
+    monkeypatch.setattr(f"{PERMISSION}probe_writes", lambda *_, **__: {"1": next(verdicts)})
+    permission = permission_of(raw, endpoint, pki, "1")
+    refused, pause = outcome
+    assert [permission.check() for _ in history][-1] == pause
+    assert permission.refused == ({} if refused is None else {"1": refused})
+
+
+def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path, timings: Timings) -> None:
+    """Messages of an embedded router's service pass the router that it joins, or not, by its certificate."""
+    timings.probe = 0.5
+    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=tls_of(pki, "vehicle-1")) as session:
+        permission = permission_of(session, secure, pki, "1", "2")
+        wait_for(lambda: look(permission) == {"1": False}, what="the vehicle that is allowed")
+        wait_for(lambda: look(permission) == {"1": False, "2": True}, what="the vehicle that is not")
+
+
+def test_only_access_rules_are_a_refusal(
+    configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
+    """A router with older rules, without any, that is away, or that is frozen, refuses nobody."""
+    timings.probe_open, timings.probe = 0.1, 0.5
+    monkeypatch.setattr(f"{PERMISSION}_BELIEVED", 1)
+    file, endpoint = configured
+    shipped = file.read_text()
+    file.write_text(shipped.replace("@doctor", "@probe"))
+    older = open_router(config_file=file)
+    with open_client([endpoint], timeout=DEADLINE, tls=tls_of(pki, "vehicle-1")) as session:
+        permission = permission_of(session, endpoint, pki, "1", "2")
+        assert look(permission) == {}
+        older.close()
+        assert look(permission) == {}
+        rules = "access_control: {\n    enabled: "
+        assert f"{rules}true" in shipped
+        file.write_text(shipped.replace(f"{rules}true", f"{rules}false"))
+        plain = run_nedbus("router", str(file))
+        wait_for(lambda: look(permission) == {"1": False, "2": False}, what="a router that takes everything")
+        plain.signal(signal.SIGSTOP)
+        assert look(permission) == {"1": False, "2": False}
+        plain.signal(signal.SIGCONT)

@@ -1,0 +1,223 @@
+"""Models, rows, fields and arrays: each form accepts and rejects exactly what the model does."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from pydantic import ValidationError, field_validator
+
+from nedbus_msgs import DEFAULT, DecodeError, EncodeError, InvalidMessageError, Row, VehicleLocalPosition
+from nedbus_msgs.arrays import DTYPE, to_array, to_message
+from tests.flights.first_message import (
+    CURRENT,
+    FIELD_TYPES,
+    decode,
+    decode_array,
+    decode_cdr_array,
+    decode_row,
+    describe,
+    downgrade,
+    encode,
+    encode_array,
+    encode_cdr,
+    encode_cdr_array,
+    encode_fields,
+    encode_row,
+    row_of,
+    valid_mask,
+)
+from tests.nedbus_msgs.strategies import BROKEN, bits, messages, pack_full_width
+
+GOOD = VehicleLocalPosition(timestamp=5, vxy_max=math.inf, eph=math.inf)
+# Values for any field, valid or not, whatever its type.
+ODD = st.one_of(
+    st.integers(-(2**70), 2**70),
+    st.floats(allow_subnormal=True),
+    st.floats(width=32),
+    st.booleans(),
+    st.none(),
+    st.sampled_from(["", "x", "NaN"]),
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e39, -0.0, -1e-50, 2**64, 2**64 - 1, 256, 255, math.pi, 90.5]),
+    st.tuples(st.floats(), st.floats()),
+    st.lists(st.floats(), max_size=3),
+)
+CHANGES = st.dictionaries(st.sampled_from(list(FIELD_TYPES)), ODD, max_size=3)
+
+
+def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
+    """Return the payload of the message with these fields, None if the model rejects them."""
+    try:
+        return encode(VehicleLocalPosition.model_validate(fields))
+    except ValidationError:
+        return None
+
+
+def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
+    """Return the reasons for which these values are rejected, by the model or by what encodes them."""
+    with pytest.raises((ValidationError, InvalidMessageError)) as info:
+        encode_values(values)
+    if isinstance(info.value, InvalidMessageError):
+        return info.value.reason
+    assert isinstance(info.value, ValidationError)
+    return describe(info.value)
+
+
+@given(messages(), CHANGES)
+@example(GOOD, {"x": 1e39})
+@example(GOOD, {"delta_xy": (0.0, -1e39)})
+@example(GOOD, {"x": "1"})
+def test_fields_and_rows_are_validated_as_by_the_model(
+    message: VehicleLocalPosition, changes: dict[str, object]
+) -> None:
+    """As keywords, as fields or as a row: the same bytes, or the same rejection, with the same reasons."""
+    fields = {**message.model_dump(), **changes}
+    expected = payload_by_model(fields)
+    if expected is not None:
+        made = VehicleLocalPosition(**fields)
+        assert encode(made) == encode_fields(fields) == encode_row(list(fields.values())) == expected
+        assert bits(made) == bits(VehicleLocalPosition.model_validate(fields))
+        return
+    expected_reasons = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
+    assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected_reasons
+    assert reasons(encode_fields, fields) == reasons(encode_row, list(fields.values())) == expected_reasons
+
+
+def test_misspelled_field_among_all_others_is_rejected() -> None:
+    """The number of fields is right, and yet the model decides, with its reasons."""
+    fields = {("hagl" if name == "hagl_min" else name): value for name, value in GOOD.model_dump().items()}
+    expected = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
+    assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected
+    assert reasons(encode_fields, fields) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"eph": -1.0}, "eph: must not be negative (is -1.0)"),
+        ({"x": "1", "xy_reset_counter": 300}, "x: Input should be a valid number (is '1'); xy_reset_counter: "),
+        ({"delta_xy": (0.0, None)}, "delta_xy.1: Input should be a valid number (is None)"),
+        ({"z_dervi": 1.0}, "there is no field 'z_dervi': did you mean z_deriv or "),
+        ({"Heading": 1.0}, "there is no field 'Heading': did you mean heading or "),
+        ({"temperature": 20.0}, "there is no field 'temperature': 'nedbus schema' lists them (is 20.0)"),
+        ({"timestamp": None}, "timestamp: Field required"),
+    ],
+)
+def test_invalid_message_is_explained(changes: dict[str, object], told: str) -> None:
+    """An error of ours, and a ValueError, names each field, its rule and value, and the field that was meant."""
+    fields = {name: value for name, value in {"timestamp": 1, **changes}.items() if name != "timestamp" or value}
+    with pytest.raises(InvalidMessageError) as info:
+        encode_fields(MappingProxyType(fields))
+    assert str(info.value).startswith(f"not a valid VehicleLocalPosition: {told}")
+    assert isinstance(info.value, ValueError)
+    assert [field for field, _ in info.value.violations] == list(changes)
+    assert str(pickle.loads(pickle.dumps(info.value))) == str(info.value)
+
+
+@given(st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=3)), min_size=1, max_size=5))
+def test_payloads_are_valid_as_by_the_model(cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]]) -> None:
+    """Decoded one by one, as rows, or as an array: the same values to the bit, or the same rejection."""
+    payloads = [pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases]
+    array, valid = decode_array(b"".join(payloads))
+    for index, payload in enumerate(payloads):
+        fields = dict(zip(FIELD_TYPES, msgpack.unpackb(payload, use_list=False)[1:], strict=True))
+        expected = payload_by_model(fields)
+        assert (expected is not None) == valid[index]
+        if expected is None:
+            for decode_payload in (decode, decode_row):
+                with pytest.raises(DecodeError):
+                    decode_payload(payload)
+            with pytest.raises(ValidationError):
+                to_message(array[index])
+        else:
+            message = decode(payload)
+            assert expected == payload == encode(message) == encode_row(decode_row(payload))
+            assert bits(message) == bits(VehicleLocalPosition.model_validate(fields))
+            assert message.model_fields_set == set(FIELD_TYPES)
+            assert encode(to_message(array[index])) == payload
+            assert DEFAULT.row._fields == tuple(FIELD_TYPES)
+            assert isinstance(decode_row(payload), DEFAULT.row)
+    assert encode_array(array) == b"".join(payloads)
+
+
+@given(st.lists(messages(), max_size=4))
+def test_arrays_are_messages(many: list[VehicleLocalPosition]) -> None:
+    """Messages survive the round trip through an array and its payloads, msgpack or CDR, with exact types."""
+    array = to_array(many)
+    assert array.dtype == DTYPE
+    assert valid_mask(array).all()
+    assert [bits(to_message(element)) for element in array] == [bits(message) for message in many]
+    assert encode_array(array) == b"".join(map(encode, many))
+    assert decode_array(encode_array(array))[0].tobytes() == array.tobytes()
+    payloads = [encode_cdr(downgrade(message, "1.16"), layout="1.16") for message in many]
+    assert encode_cdr_array(array).tobytes() == b"".join(payloads)
+    decoded, valid = decode_cdr_array(payloads)
+    assert valid.all()
+    assert decoded.tobytes() == array.tobytes()
+
+
+def test_dtypes_are_px4s() -> None:
+    """The columns have PX4's types: nothing is widened."""
+    kinds = {"uint64": "u8", "uint8": "u1", "bool": "?", "float32": "f4", "float64": "f8"}
+    for name, kind in FIELD_TYPES.items():
+        expected = np.dtype(("f4", 2)) if kind == "float32[2]" else np.dtype(kinds[kind])
+        assert DTYPE[name] == expected
+
+
+@pytest.mark.parametrize("values", [[], [1], range(54)])
+def test_row_of_another_length_is_rejected(values: list[object]) -> None:
+    """Too few or too many values are not a message."""
+    with pytest.raises(EncodeError, match="where a row has 53"):
+        encode_row(values)
+
+
+class Low(VehicleLocalPosition):
+    """A user's own model, with a rule more."""
+
+    @field_validator("z")
+    @classmethod
+    def _low(cls, z: float) -> float:
+        if z < -10:
+            raise ValueError("too high")
+        return z
+
+
+def test_subclass_keeps_its_own_rules() -> None:
+    """The fast path is for the model itself: the validators of a subclass run."""
+    fields = {name: value for name, value in GOOD.model_dump().items() if name != "z"}
+    assert type(Low(z=-5.0, **fields)) is Low
+    with pytest.raises(ValidationError, match="too high"):
+        Low(z=-20.0, **fields)
+
+
+def test_dicts_and_json_do_not_call_the_constructor() -> None:
+    """Pydantic treats the constructor as its own: JSON keeps its strings for NaN and infinities."""
+    assert not VehicleLocalPosition.__pydantic_custom_init__
+
+
+PYTHON_TYPES = {
+    "uint64": int, "uint8": int, "bool": bool, "float32": float, "float64": float, "float32[2]": tuple[float, float],
+}  # fmt: skip
+
+
+def test_row_has_the_fields_of_the_model() -> None:
+    """Names and order of a row are PX4's, and so the model's and the current layout's."""
+    assert DEFAULT.row._fields == tuple(FIELD_TYPES) == tuple(VehicleLocalPosition.model_fields) == CURRENT.fields
+
+
+def test_row_is_a_tuple_with_names() -> None:
+    """A row is as light as a tuple: it has the names of the fields, and none of a model's methods."""
+    row = row_of(VehicleLocalPosition(timestamp=5, delta_xy=(1.0, 2.0)))
+    assert isinstance(row, Row)
+    assert (row.timestamp, row.delta_xy, len(row)) == (5, (1.0, 2.0), 53)
+    assert list(row._asdict()) == list(FIELD_TYPES)
+    assert repr(pickle.loads(pickle.dumps(row))) == repr(row)
+    assert not hasattr(row, "model_dump")

@@ -1,0 +1,192 @@
+"""The msgpack codec: the golden bytes, round trips, foreign encodings, hostile input."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import msgpack
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from nedbus_msgs import PAYLOAD_LIMIT, DecodeError, EncodeError, UnknownLayoutError, VehicleLocalPosition
+from nedbus_msgs.arrays import to_message
+from tests.flights.first_message import (
+    FIELD_TYPES,
+    PAYLOAD_SIZE,
+    decode,
+    decode_array,
+    decode_row,
+    downgrade,
+    encode,
+    encode_row,
+)
+from tests.nedbus_msgs.strategies import DATA, FLIGHTS, MANY, REAL, bits, messages
+
+GOLDEN = json.loads((DATA / "golden.json").read_text())
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_bytes(name: str) -> None:
+    """These bytes are the wire format; to change them is a breaking release."""
+    message = VehicleLocalPosition.model_validate_json(json.dumps(GOLDEN[name]["message"]))
+    payload = bytes.fromhex(GOLDEN[name]["payload"])
+    assert encode(message) == payload
+    assert bits(decode(payload)) == bits(message)
+
+
+@given(messages())
+def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) -> None:
+    """Any msgpack decoder returns an array of the layout and the 53 fields, with PX4's types; ours the same message."""
+    payload = encode(message)
+    assert len(payload) == PAYLOAD_SIZE
+    array = msgpack.unpackb(payload, use_list=False)
+    assert array[0] == 1
+    assert [repr(value) for value in array[1:]] == [repr(getattr(message, name)) for name in FIELD_TYPES]
+    assert bits(decode(payload)) == bits(message)
+
+
+@given(messages(), st.booleans(), st.booleans())
+def test_other_encodings_are_decoded(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
+    """Short ints, doubles for floats, and ints where a float is meant decode to the same message, or row."""
+    values = [value for name, value in message.model_dump().items()]
+    if whole:
+        values = [int(each) if isinstance(each, float) and each.is_integer() and each else each for each in values]
+        values = [each if not isinstance(each, int) or -(2**63) <= each < 2**64 else float(each) for each in values]
+    payload = msgpack.packb([1, *values], use_single_float=single and not (message.ref_lat or message.ref_lon))
+    assert bits(decode(payload)) == bits(message)
+    assert encode_row(decode_row(payload)) == encode(message)
+
+
+@given(messages())
+def test_layout_0_is_decoded(message: VehicleLocalPosition) -> None:
+    """V0 has 52 fields and one hagl_max."""
+    older = downgrade(message, "V0")
+    decoded = decode(msgpack.packb([0, *older.values()]))
+    assert bits(decoded) == bits(message.model_copy(update={"hagl_max_xy": message.hagl_max_z}))
+
+
+def test_newer_layout_is_decoded_by_names() -> None:
+    """With the field names of an unknown layout, known fields are decoded and the others ignored."""
+    names = ["timestamp", "x", "y", "brand_new"]
+    payload = msgpack.packb([2, 5, 1.0, 2.0, True])
+    with pytest.raises(UnknownLayoutError, match="layout 2 with 4 fields; this reader knows layouts 0, 1") as info:
+        decode(payload)
+    assert (info.value.layout, info.value.count, info.value.known) == (2, 4, (0, 1))
+    message = decode(payload, newer={2: names})
+    assert (message.timestamp, message.x, message.y) == (5, 1.0, 2.0)
+    with pytest.raises(DecodeError, match="3 fields where layout 2 has 4"):
+        decode(msgpack.packb([2, 5, 1.0, 2.0]), newer={2: names})
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "0 bytes that are not one msgpack value"),
+        (b"\xc1", "1 bytes"),
+        (b"hello", "5 bytes"),
+        (msgpack.packb({"x": 1}), "not one msgpack value"),
+        (msgpack.packb([]), "does not start|not an array that starts"),
+        (msgpack.packb(["1"]), "not an array that starts"),
+        (msgpack.packb([True, 1]), "not an array that starts"),
+        (msgpack.packb([1, 2, 3]), "2 fields where layout 1 has 53"),
+        (msgpack.packb(7), "not an array"),
+        (b"\x00" * (PAYLOAD_LIMIT + 1), "4097 bytes, more than the 4096"),
+        (b"\xdd\xff\xff\xff\xff", "not one msgpack value"),
+        (b"\x91" * 4000, "not one msgpack value"),
+        (REAL[0] + b"\x00", "245 bytes that are not one msgpack value"),
+        (REAL[0][:-1], "243 bytes that are not one msgpack value"),
+        (REAL[0][1:], "243 bytes that are not one msgpack value"),
+    ],
+)
+def test_reason_of_a_bad_payload(payload: bytes, reason: str) -> None:
+    """Each kind of bad payload has a reason of its own."""
+    with pytest.raises(DecodeError, match=reason):
+        decode(payload)
+
+
+def test_violation_in_a_payload_is_rejected() -> None:
+    """A received message is validated like a sent one, on both paths of the decoder."""
+    values = [1, *VehicleLocalPosition(timestamp=1).model_dump().values()]
+    values[3] = True  # xy_valid, while x is NaN
+    with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):
+        decode(msgpack.packb(values))
+    payload = bytearray(encode(VehicleLocalPosition(timestamp=1)))
+    assert payload[22] == 0xC2
+    payload[22] = 0xC3
+    with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):
+        decode(bytes(payload))
+
+
+def test_flipped_bit_is_the_same_in_every_form() -> None:
+    """A payload with one bit that is wrong is decoded or rejected, alone, as a row and among others in an array."""
+    number = int.from_bytes(REAL[0], "big")
+    payloads = [(number ^ 1 << bit).to_bytes(PAYLOAD_SIZE, "big") for bit in range(8 * PAYLOAD_SIZE)]
+    array, valid = decode_array(b"".join(payloads))
+    for index, payload in enumerate(payloads):
+        try:
+            message = decode(payload)
+        except DecodeError:
+            assert not valid[index]
+            with pytest.raises(DecodeError):
+                decode_row(payload)
+        else:
+            assert encode(message) == encode_row(decode_row(payload))
+            assert not valid[index] or bits(to_message(array[index])) == bits(message)
+    assert 1000 < valid.sum() < len(payloads)
+
+
+@given(st.binary(max_size=600))
+@example(b"\xdc\x00\x36")
+@example(b"\xc7\x0c\xff" + bytes(12))
+@MANY
+def test_any_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
+    """Any byte string decodes or raises DecodeError."""
+    try:
+        decode(payload)
+    except DecodeError as exc:
+        assert exc.reason
+
+
+SHORT = st.binary(max_size=5)
+msgpack_values = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=5), SHORT),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.sampled_from(FLIGHTS), st.integers(0, 53), msgpack_values)
+@MANY
+def test_any_value_at_any_index_is_the_models_decision(good: VehicleLocalPosition, index: int, value: object) -> None:
+    """A payload with one odd value decodes only if the model accepts that value."""
+    array: list[object] = [1, *good.model_dump().values()]
+    array[index] = value
+    try:
+        message = decode(msgpack.packb(array))
+    except DecodeError:
+        return
+    forms = [value]
+    if isinstance(value, int | float):
+        forms += [float(value), *struct.unpack("<f", struct.pack("<f", value))]
+    elif isinstance(value, list) and len(value) == 2:
+        forms += [tuple(map(float, value)), struct.unpack("<2f", struct.pack("<2f", *value))]
+    assert index == 0 or repr(message.model_dump()[list(FIELD_TYPES)[index - 1]]) in map(repr, forms)
+
+
+def test_bypassed_validation_is_an_error_at_encode() -> None:
+    """A message of model_construct with values that do not fit its fields raises, and never encodes other values."""
+    for field, value in (("x", 1e39), ("timestamp", -1), ("xy_reset_counter", 300), ("x", "1"), ("delta_xy", None)):
+        message = VehicleLocalPosition.model_construct(**{**VehicleLocalPosition(timestamp=1).__dict__, field: value})
+        with pytest.raises(EncodeError, match="VehicleLocalPosition"):
+            encode(message)
+
+
+def test_deep_nesting_is_rejected() -> None:
+    """An array nested a thousand deep is rejected before anything prints it: that would exhaust the stack."""
+    deep = b"\x91" * 400 + b"\x01"
+    values = [msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()]
+    values[6] = deep
+    with pytest.raises(DecodeError, match="x: an array within an array"):
+        decode(b"\xdc\x00\x36\x01" + b"".join(values))

@@ -1,0 +1,99 @@
+"""VehicleLocalPosition as it was before there were others: its schema, types, hashes and error texts, to the byte.
+
+The table was written by the version that knew this message alone; a difference is a break of the contract.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from hashlib import sha256
+from typing import Any, Final
+
+import pytest
+from pydantic import ValidationError
+
+from nedbus_msgs import NedbusError, VehicleLocalPosition
+from nedbus_msgs.arrays import DTYPE
+from tests.flights.first_message import (
+    LAYOUTS,
+    decode_row,
+    describe,
+    encode_fields,
+    json_schema,
+    layout_table,
+    message_definition,
+    type_hash,
+)
+from tests.flights.first_message import decode as decode_payload
+from tests.nedbus_msgs.strategies import DATA, FLIGHTS, REAL
+
+KEPT: Final = DATA / "vehicle_local_position.json"
+VALID: Final[dict[str, Any]] = {"timestamp": 5, "timestamp_sample": 4, "xy_valid": True, "x": 1.0, "y": 2.0}
+BAD: Final[Mapping[str, Mapping[str, object]]] = {
+    "no timestamp": {"x": 1.0},
+    "text": {**VALID, "x": "north"},
+    "int beyond its width": {**VALID, "xy_reset_counter": 256},
+    "negative": {**VALID, "timestamp": -1, "timestamp_sample": 0},
+    "bool of an int": {**VALID, "z_valid": 1},
+    "a short pair": {**VALID, "delta_xy": (1.0,)},
+    "text in a pair": {**VALID, "delta_vxy": (1.0, "2")},
+    "beyond float32": {**VALID, "vx": 1e39, "delta_xy": (1e39, 0.0)},
+    "not finite while valid": {**VALID, "x": math.nan, "y": math.inf},
+    "several rules": {**VALID, "timestamp_sample": 6, "eph": -1.0, "heading": 4.0, "ref_lat": -91.0},
+    "an unknown field": {**VALID, "hight": 1.0},
+    "nothing like it": {**VALID, "qqqq": 1.0},
+}
+PAYLOADS: Final[Mapping[str, Callable[[bytes], bytes]]] = {
+    "empty": lambda whole: b"",
+    "cut": lambda whole: whole[:-1],
+    "one byte more": lambda whole: whole + b"\x00",
+    "too large": lambda whole: whole * 20,
+    "a map": lambda whole: b"\x80",
+    "another layout": lambda whole: b"\xdc\x00\x02\x07\x01",
+    "too few fields": lambda whole: b"\xdc\x00\x02\x01\x01",
+    "a wrong type": lambda whole: whole[:4] + b"\xc2" + whole[13:],
+    "text": lambda whole: whole[:4] + b"\xa3abc" + whole[13:],
+    "a broken rule": lambda whole: whole[:5] + bytes(8) + whole[13:],
+}
+
+
+def reasons() -> dict[str, str]:
+    """Return what each form of each bad message says."""
+    said = {}
+    for name, fields in BAD.items():
+        for form in (lambda fields: VehicleLocalPosition(**fields), encode_fields):
+            try:
+                form(fields)
+            except ValidationError as exc:
+                said[f"model: {name}"] = describe(exc)
+            except NedbusError as exc:
+                said[f"{type(exc).__name__}: {name}"] = str(exc)
+    for name, change in PAYLOADS.items():
+        for decode in (decode_payload, decode_row):
+            try:
+                decode(change(REAL[0]))
+            except NedbusError as exc:
+                said[f"{type(exc).__name__} of {decode.__name__}: {name}"] = str(exc)
+    return said
+
+
+def contract() -> dict[str, object]:
+    """Return everything that other programs rely on."""
+    texts = {f".msg {name}": message_definition(name) for name in LAYOUTS}
+    texts |= {"json_schema": json.dumps(json_schema()), "layouts": json.dumps(layout_table())}
+    texts |= {f"json {index}": each.model_dump_json() for index, each in enumerate(FLIGHTS)}
+    return {
+        "reasons": reasons(),
+        "payloads": [payload.hex() for payload in REAL],
+        "hashes": {name: type_hash(name) for name in LAYOUTS},
+        "dtype": [list(map(str, each)) for each in DTYPE.descr],
+        "texts": {name: sha256(text.encode()).hexdigest() for name, text in texts.items()},
+    }
+
+
+@pytest.mark.parametrize("part", ["reasons", "payloads", "hashes", "dtype", "texts"])
+def test_nothing_of_the_first_message_changed(part: str) -> None:
+    """Payloads, hashes, dtype, JSON Schema, definitions and the words of every error are what they were."""
+    assert contract()[part] == json.loads(KEPT.read_text())[part]

@@ -1,0 +1,1 @@
+"""Definitions and layouts of messages."""

@@ -1,0 +1,120 @@
+"""The layout table, compared with the documents that the project started from, and conversion between layouts."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from pydantic import ValidationError
+
+from nedbus_msgs import VehicleLocalPosition, field_type
+from tests.flights.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
+from tests.nedbus_msgs.strategies import DATA, bits, messages
+
+SEEDS = json.loads((DATA / "seeds.json").read_text())
+SHARED = Path(__file__).parents[4] / "shared" / "seeds"
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_layout_is_the_documents(name: str) -> None:
+    """Names, order and types of each document's message definition are those of the table."""
+    layout = LAYOUTS[name]
+    assert [[field, str(kind)] for field, kind in layout.types.items()] == SEEDS[name]["fields"]
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_fixture_is_the_documents(name: str) -> None:
+    """tests/data/seeds.json has the fields of the documents."""
+    path = SHARED / SEEDS[name]["seed"]
+    if not path.exists():
+        pytest.skip(f"the document is not here: {path.name}")
+    rows = re.findall(
+        r"^(uint64|uint8|bool|float32(?:\[2\])?|float64)\s+(\w+)\s*(?=#|$)", path.read_text(), re.MULTILINE
+    )
+    assert [[field, kind] for kind, field in rows] == SEEDS[name]["fields"]
+
+
+def test_table_has_px4s_layouts() -> None:
+    """Five layouts, with PX4's numbers of fields; two are used on the wire; publishers send it as JSON."""
+    table = json.loads(json.dumps(layout_table()))
+    assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
+        ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),
+    ]  # fmt: skip
+    assert {layout.name: layout.wire for layout in LAYOUTS.values() if layout.wire is not None} == {"V0": 0, "1.16": 1}
+    assert [row["name"] for row in table] == list(LAYOUTS)
+    assert CURRENT.fields == tuple(FIELD_TYPES)
+    assert all(len(set(layout.fields)) == len(layout.fields) for layout in LAYOUTS.values())
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layout_is_found_from_names_in_any_order(name: str) -> None:
+    """A ULog sorts fields by size; the names alone determine the layout."""
+    assert find_layout(reversed(LAYOUTS[name].fields)) is LAYOUTS[name]
+    assert find_layout(LAYOUTS[name].fields[1:]) is None
+
+
+@given(messages())
+def test_downgrade_then_upgrade_keeps_what_the_layout_has(message: VehicleLocalPosition) -> None:
+    """Every field that both layouts have survives to the bit; hagl_max follows PX4's translation."""
+    for name, layout in LAYOUTS.items():
+        older = downgrade(message, name)
+        assert tuple(older) == layout.fields
+        back = upgrade(older)
+        lost = {field: getattr(back, field) for field in FIELD_TYPES if field not in older}
+        provided = message.model_copy(update=lost)
+        assert bits(back) == bits(provided)
+        if "hagl_max" in older:
+            assert repr(older["hagl_max"]) == repr(message.hagl_max_z)
+            assert repr(lost.pop("hagl_max_z")) == repr(lost.pop("hagl_max_xy")) == repr(message.hagl_max_z)
+            assert {"hagl_max_z", "hagl_max_xy"} <= back.model_fields_set
+        assert not set(lost) & back.model_fields_set
+
+
+def test_not_provided_fields_of_an_old_layout() -> None:
+    """Fields that 1.13 lacks are NaN, false or 0 and not in model_fields_set."""
+    older = downgrade(VehicleLocalPosition(timestamp=7, dead_reckoning=True, tilt_var=1.0, hagl_max_z=5.0), "1.13")
+    message = upgrade(older)
+    assert (message.dead_reckoning, message.dist_bottom_reset_counter) == (False, 0)
+    assert math.isnan(message.tilt_var)
+    assert (message.hagl_max_z, message.hagl_max_xy) == (5.0, 5.0)
+
+
+def test_yaw_of_1_11_is_heading() -> None:
+    """1.11 and before have yaw; 2016 logs have 24 fields: known fields are used, the rest is not provided."""
+    message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
+    assert (message.heading, message.x) == (0.5, 1.0)
+    assert message.model_fields_set == {"timestamp", "x", "heading"}
+
+
+def test_upgrade_keeps_the_rules() -> None:
+    """Old layouts are validated like the current one."""
+    with pytest.raises(ValidationError, match="xy_valid"):
+        upgrade({"timestamp": 1, "xy_valid": True})
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "fitted"),
+    [
+        ("uint8", 255, 255), ("uint8", 256, None), ("uint8", -1, None), ("uint8", 6.0, 6), ("uint8", 6.5, None),
+        ("uint8", math.nan, None), ("uint8", True, 1), ("int64", 2**63, None), ("uint64", -1, None),
+        ("bool", 1, True), ("bool", 2, None), ("float32", 16_777_216, 16_777_216.0), ("float32", 16_777_217, None),
+        ("float32", 0.1, None), ("float32", 1e39, None), ("float32", math.inf, math.inf), ("float64", 2**53 + 1, None),
+        ("uint8[2]", (1, 2.0), (1, 2)), ("uint8[2]", (1, 256), None), ("uint8[3]", (1, 2), (1, 2, 0)),
+        ("uint8[1]", (1, 2), None), ("uint8", (1,), None), ("uint8[1]", 1, None),
+    ],
+)  # fmt: skip
+def test_number_fits_only_if_it_keeps_its_value(kind: str, value: object, fitted: object) -> None:
+    """A number of another type, or an array of fewer of them, is converted exactly, or not at all."""
+    found = field_type(kind).fit(value)
+    assert found == fitted
+    assert type(found) is type(fitted)
+
+
+def test_not_a_number_fits_any_float() -> None:
+    """NaN is kept, and a shorter array is filled up with it."""
+    assert math.isnan(field_type("float32").fit(math.nan))
+    assert repr(field_type("float32[3]").fit((1, math.nan))) == "(1.0, nan, nan)"

@@ -1,0 +1,1 @@
+"""Names, types and definitions of ROS 2."""

@@ -1,0 +1,152 @@
+"""PX4's .msg files: what they define, their hashes as a real PX4 sent them, and what is said of those that are none."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import suppress
+
+import pytest
+from pydantic import ValidationError
+
+from nedbus_msgs import MESSAGES, MsgError, define_msg, definition_text, hash_of, hash_of_msg, read_msg, ros2_type
+from tests.flights.first_message import decode, encode
+from tests.nedbus_msgs.strategies import DATA
+
+TRIPLET_HASH = "RIHS01_e05aa5eb29374ce845899062b5810cc8487743bb95a976094821c1d0312e45aa"
+"""Of the key on which PX4 main of 2026-05 sent it."""
+WITHIN = "\n" + "=" * 80 + "\nMSG: px4_msgs/"
+MANY = "".join(f"uint8 f{number}\n" for number in range(300))
+TRIPLET = (
+    (DATA / "msg" / "PositionSetpointTriplet.msg").read_text()
+    + f"{WITHIN}PositionSetpoint\n"
+    + (DATA / "msg" / "PositionSetpoint.msg").read_text()
+)
+
+
+@pytest.mark.parametrize("name", list(MESSAGES))
+def test_definitions_of_ours_are_read_back(name: str) -> None:
+    """The .msg text of each message is one again: the same fields, and the same hash."""
+    definition = MESSAGES[name]
+    for layout in definition.layouts.values():
+        text = definition_text(definition, layout)
+        assert {field.name: field.type for field in read_msg(text)} == layout.types
+        assert hash_of_msg(name, text) == hash_of(layout, ros2_type(definition))
+
+
+def test_messages_within_a_message_are_fields_and_part_of_the_hash() -> None:
+    """PositionSetpointTriplet has three times the 20 fields of a PositionSetpoint; the hash is the one a PX4 sent."""
+    assert hash_of_msg("PositionSetpointTriplet", TRIPLET) == TRIPLET_HASH
+    definition = define_msg("PositionSetpointTriplet", TRIPLET)
+    assert len(definition.types) == 61
+    assert list(definition.types)[:4] == ["timestamp", "previous_timestamp", "previous_valid", "previous_type"]
+    many = define_msg("Many", f"uint64 timestamp\nPart[2] parts{WITHIN}Part\nuint8[3] of\nbool is\n")
+    assert list(many.types) == ["timestamp", "parts_0_of", "parts_0_is", "parts_1_of", "parts_1_is"]
+
+
+def test_annotations_are_rules() -> None:
+    """@range bounds a value or each element of an array; @invalid is what stands for "not known"; units are kept."""
+    text = """
+        # A comment
+        uint64 timestamp        # [us] time since system start
+        uint8 KIND_A = 1
+        float32 share           # [-] @range 0, 1 @invalid -1 how much
+        float32[2] pair         # @range 0.1,
+        char[3] letters
+    """
+    definition = define_msg("Ranged", text)
+    assert {name: str(kind) for name, kind in definition.types.items()} == {
+        "timestamp": "uint64", "share": "float32", "pair": "float32[2]", "letters": "char[3]",
+    }  # fmt: skip
+    assert definition.meaning("timestamp") == "[us] time since system start"
+    for share in (0.0, 1.0, -1.0, float("nan")):
+        definition.model.model_validate({"timestamp": 1, "share": share})
+    definition.model.model_validate({"timestamp": 1, "pair": (0.1, 5.0)})
+    for wrong in ({"share": 1.5}, {"share": -0.5}, {"pair": (0.2, 0.05)}, {"letters": "long"}):
+        with pytest.raises(ValidationError):
+            definition.model.model_validate({"timestamp": 1, **wrong})
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", r"line 1, column 1: it lacks the field 'uint64 timestamp'"),
+        ("uint64 timestamp\nfloat32 x y\n", r"line 2, column 1: expected a field"),
+        ("uint64 timestamp\n  float16 x\n", r"line 2, column 3: 'float16' is not a type"),
+        ("uint64 timestamp\nfloat32[] x\n", r"line 2, column 1: 'float32\[\]' is not a type"),
+        ("uint64 timestamp\nfloat32[<=4] x\n", r"line 2, column 1: expected a field, such as"),
+        ("uint64 timestamp\nstring name\n", r"line 2, column 1: 'string' is not a type"),
+        ("uint64 timestamp\nfloat32[100000] x\n", r"line 2, column 1: an array of 100000: expected 1 to 1024"),
+        ("uint64 timestamp\nbool x\nuint8  x\n", r"line 3, column 8: a second field 'x'"),
+        ("uint64 timestamp\nOther other\n", r"line 2, column 1: 'Other' is not a type"),
+        (f"uint64 timestamp\nSelf a{WITHIN}Self\nSelf a\n", r"line 5, column 1: 'Self' is not a type"),
+        ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: a constant of type 'Other'"),
+        ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: a field cannot be called 'Upper'"),
+        ("uint64 timestamp\nfloat32 copy\n", r"cannot be called 'copy': a message has a method of that name"),
+        (f"uint64 timestamp\nfloat32 a_b\nBar a{WITHIN}Bar\nfloat32 b\n", r"two fields are called 'a_b'"),
+        (
+            f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nC[999] c{WITHIN}C\n",
+            r"line 8, .* 'C' is not a type",
+        ),
+        (f"uint64 timestamp\n{MANY}", r"301 fields, more than the 256"),
+        ("uint64 timestamp\nfloat64[1000] x\n", r"bytes, more than the 4096"),
+        ("uint8 timestamp\n", r"lacks the field 'uint64 timestamp'"),
+        ("#" * 300_000, r"300000 characters, more than the limit of 262144"),
+        ("PNG\x00\xff\n", r"line 1, column 1: expected a field"),
+    ],
+)
+def test_text_that_is_no_message_says_where(text: str, reason: str) -> None:
+    """The error has line and column, and what is wrong there."""
+    with pytest.raises(MsgError, match=reason):
+        define_msg("Wrong", text)
+
+
+def test_unknown_value_is_one_as_it_is_sent_too() -> None:
+    """The value that `@invalid` names passes before and after it is rounded to float32; bounds may be infinite."""
+    text = "uint64 timestamp\nfloat32 a # @range 1, 5 @invalid 0.1\nfloat32 b # @range 1, 5 @invalid inf\n"
+    definition = define_msg("Gauge", text)
+    message = definition.model.model_validate({"timestamp": 1, "a": 0.1, "b": math.inf})
+    assert decode(encode(message), definition.model) == message
+
+
+def test_messages_within_messages_are_bounded() -> None:
+    """A text of some lines that stands for a million fields is refused."""
+    text = f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nuint8 c\n"
+    with pytest.raises(MsgError, match="more than 1000 fields"):
+        define_msg("Large", text)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "float32 angle 1.5", "float32 angle -.5e3 # the default", "float32[2] angle [1, 2]", "bool angle true",
+        'string FRAME="map"\nfloat32 angle', "string A = 'a # b'\nfloat32 angle", "float32 angle # \f form feed",
+        "float32 angle # \u2028 line separator", "float32 angle # \x85 next line", "float32 angle\r\n",
+    ],
+)  # fmt: skip
+def test_text_of_ros2_is_accepted(line: str) -> None:
+    """Defaults, constants of strings, a byte order mark, and separators of lines in Unicode, which end no line."""
+    fields = read_msg(f"\ufeffuint64 timestamp\n{line}\nuint8 mode\n")
+    assert [field.name for field in fields] == ["timestamp", "angle", "mode"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "".join(f"uint8 f{number}\n" for number in range(19_000)),
+        "uint8 a # @range" + " " * 200_000,
+        "uint8 a # @range " + "9" * 200_000,
+        f"A[999] a{WITHIN}A\nuint8 b #" + "@range " * 30_000,
+        f"A[999] a{WITHIN}A\nB[999] b{WITHIN}B\n" + "".join(f"C[0] c{i}\n" for i in range(9000)) + f"{WITHIN}C\nbool d",
+        "A[999] " + "a" * 200_000 + f"{WITHIN}A\nuint8 b",
+    ],
+    ids=["fields", "spaces", "digits", "comment", "empty arrays", "long name"],
+)
+def test_parsing_takes_linear_time(text: str) -> None:
+    """No text of 200,000 characters takes more than a fraction of a second, whatever it stands for."""
+    begin = time.process_time()
+    with suppress(MsgError):
+        define_msg("Long", f"uint64 timestamp\n{text}")
+    with suppress(MsgError):
+        hash_of_msg("Long", f"uint64 timestamp\n{text}")
+    assert time.process_time() - begin < 10

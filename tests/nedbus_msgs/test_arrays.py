@@ -1,0 +1,162 @@
+"""Arrays of any length: the same messages, and the same ones valid, as one by one."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nedbus_msgs import DecodeError, VehicleLocalPosition
+from nedbus_msgs.arrays import DTYPE, mask_invalid, to_array
+from nedbus_msgs.messages import HomePosition, VehicleAttitude
+from tests.flights.first_message import (
+    PAYLOAD_SIZE,
+    decode_array,
+    decode_cdr_array,
+    decode_row,
+    encode_array,
+    encode_cdr,
+    encode_row,
+    to_row,
+    valid_mask,
+)
+from tests.nedbus_msgs.strategies import (
+    BREAKING,
+    BROKEN,
+    FLAG_FIELDS,
+    FLIGHTS,
+    KEEPING,
+    REAL,
+    messages,
+    pack_full_width,
+)
+
+# On both sides of each length at which arrays are decoded, encoded or validated in another way.
+SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
+Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and what is broken in it
+CASES = st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4)
+
+
+def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
+    try:
+        return decode_row(payload)
+    except DecodeError:
+        return None
+
+
+@given(st.sampled_from(SIZES), CASES, st.randoms(use_true_random=False))
+def test_array_of_any_length_is_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
+    """Valid and invalid messages among each other: each is what it is alone, whatever the length of the array."""
+    choices = [*REAL, *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases)]
+    payloads = order.choices(choices, k=size)
+    rows = {payload: row_or_none(payload) for payload in choices}
+    array, valid = decode_array(b"".join(payloads))
+    assert array.dtype == DTYPE
+    assert valid.tolist() == [rows[payload] is not None for payload in payloads]
+    assert array[valid].tobytes() == np.array([row for payload in payloads if (row := rows[payload])], DTYPE).tobytes()
+    assert encode_array(array) == b"".join(payloads)
+    assert valid_mask(array).tolist() == valid.tolist()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("changes", "expected"), [(BREAKING, False), (KEEPING, True)], ids=["breaking", "keeping"])
+def test_each_rule_holds_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
+    """A message that breaks any one rule is invalid, one that just keeps it is valid, and its neighbours always are."""
+    for change in changes:
+        payload = pack_full_width({**FLIGHTS[0].model_dump(), **change})
+        assert (row_or_none(payload) is not None) == expected, change
+        payloads = [REAL[index % len(REAL)] for index in range(size)]
+        payloads[size // 2] = payload
+        _, valid = decode_array(b"".join(payloads))
+        assert valid[size // 2] == expected, change
+        assert np.count_nonzero(~valid) == (not expected), change
+
+
+@given(st.sampled_from(SIZES), st.integers(0, PAYLOAD_SIZE - 1), st.integers(0, 255), st.sampled_from(REAL))
+def test_damage_of_one_payload_stays_in_it(size: int, offset: int, byte: int, flight: bytes) -> None:
+    """A payload of which one byte has become another is valid only if it decodes; all others are as they were."""
+    damaged = bytearray(flight)
+    damaged[offset] = byte
+    payloads = [flight] * size
+    payloads[size // 2] = bytes(damaged)
+    array, valid = decode_array(b"".join(payloads))
+    row = row_or_none(payloads[size // 2])
+    if valid[size // 2]:
+        assert row is not None
+        assert repr(to_row(array[size // 2])) == repr(tuple(row))  # as text, NaN equals NaN
+    elif row is not None:  # in another width than `encode` writes
+        assert encode_row(row) != payloads[size // 2]
+    others = np.arange(size) != size // 2
+    assert valid[others].all()
+    assert array[others].tobytes() == np.array([decode_row(flight)] * (size - 1), DTYPE).tobytes()
+    for name in DTYPE.names or ():
+        if DTYPE[name] == np.bool_:
+            assert array[name].view(np.uint8).max() <= 1, "a bool with another byte than 0 and 1 is undefined"
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_array_belongs_to_its_reader(size: int) -> None:
+    """The array can be written, and writing to it leaves the payloads as they are."""
+    payloads = REAL[0] * size
+    array, _ = decode_array(payloads)
+    array["x"] = 5.0
+    array["xy_valid"] = False
+    assert payloads == REAL[0] * size
+    assert decode_row(encode_array(array)[-PAYLOAD_SIZE:]).x == 5.0
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("step", [-1, 2])
+def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> None:
+    """All backwards, or every second message, need no copy first."""
+    payloads = [REAL[index % len(REAL)] for index in range(size * abs(step))]
+    part = decode_array(b"".join(payloads))[0][::step]
+    assert encode_array(part) == b"".join(payloads[::step])
+    part["eph"][size // 2] = -1.0
+    assert np.flatnonzero(~valid_mask(part)).tolist() == [size // 2]
+
+
+@pytest.mark.parametrize("excess", [-1, 1])
+def test_part_of_a_payload_is_an_error(excess: int) -> None:
+    """Bytes that are no whole number of payloads are not cut silently."""
+    with pytest.raises(ValueError, match="reshape"):
+        decode_array(bytes(2 * PAYLOAD_SIZE + excess))
+
+
+def test_cdr_that_is_not_certain_is_not_valid() -> None:
+    """A bool that is neither 0 nor 1, another length or another encapsulation is not valid in an array."""
+    payload = encode_cdr(FLIGHTS[0].model_dump(), layout="1.16")
+    first_bool = 4 + 16
+    assert payload[first_bool] == 1
+    others = [payload[:first_bool] + bytes([byte]) + payload[first_bool + 1 :] for byte in (2, 3, 255)]
+    others += [payload[:-1], payload + bytes(4), b"\x00\x00" + payload[2:]]
+    array, valid = decode_cdr_array([payload, *others, payload])
+    assert valid.tolist() == [True, *[False] * len(others), True]
+    assert array[0] == array[-1] == to_array(FLIGHTS[:1])[0]
+
+
+@given(st.lists(messages(), max_size=5))
+def test_invalid_fields_are_masked(sent: list[VehicleLocalPosition]) -> None:
+    """A column is NaN exactly where its flag is false; all others are unchanged, and so is the array itself."""
+    array = to_array(sent)
+    before, masked = array.tobytes(), mask_invalid(array)
+    assert array.tobytes() == before
+    assert masked.dtype == array.dtype
+    flag_of = {name: flag for flag, names in FLAG_FIELDS.items() for name in names}
+    for name in DTYPE.names or ():
+        known = array[flag_of[name]] if name in flag_of else np.ones(len(array), bool)
+        assert masked[name][known].tobytes() == array[name][known].tobytes()
+        assert np.isnan(masked[name][~known]).all()
+
+
+def test_flags_of_any_message_are_masked() -> None:
+    """The flags are those of the message in the array; one without flags is copied as it is."""
+    home = mask_invalid(to_array([HomePosition(timestamp=1, lat=0.0, lon=0.0, x=1.0, y=2.0, z=3.0, valid_lpos=True)]))
+    assert np.isnan([home["lat"], home["lon"]]).all()
+    assert [home[name].tolist() for name in "xyz"] == [[1.0], [2.0], [3.0]]
+    attitudes = to_array([VehicleAttitude(timestamp=1, q=(1.0, 0.0, 0.0, 0.0))])
+    assert mask_invalid(attitudes).tobytes() == attitudes.tobytes()

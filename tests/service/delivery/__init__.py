@@ -1,1 +1,0 @@
-"""Tests of recovery, downsampling, slow readers and heartbeats."""
