@@ -36,10 +36,10 @@ docs: $(DEV)  ## the site with its reference, in build/site; a link that leads n
 quick: $(DEV)  ## the tests of rules alone, without routers and processes: under half a minute
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
-test: check behaviour  ## lint, types, and all tests that prove behaviour: three to four minutes on two cores
+test: check behaviour  ## lint, types, and all tests that prove behaviour: under three minutes on two cores
 
 behaviour: $(DEV)
-	$(BIN)/pytest -q -n 4 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
+	$(BIN)/pytest -q -n 6 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
 
 slow: $(DEV)  ## the slow tests, and the properties of `make test` with four times as many examples
 	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not compose" --hypothesis-profile=all --junitxml=build/slow-tests.xml

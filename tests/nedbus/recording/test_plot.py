@@ -216,6 +216,7 @@ def test_events_of_several_vehicles_have_their_own_rows() -> None:
     assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 3.0), (0.0, 5.0)])
 
 
+@pytest.mark.slow
 def test_command_marks_events(tmp_path: Path) -> None:
     """`nedbus plot` marks what happens in the loss of GPS of a simulated flight, recorded; no file but that."""
     flight = tmp_path / "flight.mcap"
@@ -257,6 +258,7 @@ def test_texts_of_real_flights_do_not_overlap(path: Path) -> None:
 
 
 @pytest.mark.logs
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL, reason="no real logs")
 def test_real_loss_of_gps_is_marked() -> None:
     """The loss of GPS of a real simulation of PX4: what was not valid is bad, from 32.3 s to 48.1 s. Real: its log."""

@@ -217,10 +217,17 @@ def test_address_of_a_recording_names_its_moment(recording: Recording) -> None:
     assert other.address == page.address
     for part in ("tool", "nums", "why", "list"):
         assert other.part(part) == page.part(part)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("clock")
+def test_any_time_in_an_address_is_survived(recording: Recording) -> None:
+    """A time that is none, or before or after the recording, opens a moment of it."""
     for asked in ("time=nan", "time=1e300", "time=-5", "time=99:99", "time=inf", "time=x"):
         assert 0 <= open_page(recording, asked=asked).player.time <= recording.length
 
 
+@pytest.mark.slow  # test_viewer.py has the same for a live page
 @pytest.mark.usefixtures("clock")
 def test_whatever_a_browser_says_of_a_recording_is_survived(recording: Recording) -> None:
     """No action, index or time of a browser stops the page, nor leaves the recording."""

@@ -233,5 +233,10 @@ def test_plot_of_another_topic_says_why_not(tmp_path: Path) -> None:
     plot = run_command("plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png"))
     assert plot.exit_code == 2
     assert "vehicle_attitude has no track" in plot.err
+
+
+@pytest.mark.slow
+def test_plot_of_all_topics_has_the_positions(tmp_path: Path) -> None:
+    """Of all topics of a log, `nedbus plot` draws those that have a track."""
     drawn = run_command("plot", str(LOGS.parent / "px4" / "twelve_messages.ulg"), "-t", "*", "-o", f"{tmp_path}/a.png")
     assert drawn.exit_code == 0, drawn.err
