@@ -1,0 +1,41 @@
+"""The table of the kinds of events, with hand-made messages."""
+
+import pytest
+
+from nedbus.events import KINDS, Event, Kind, spans_of, state_at, stories_of
+
+from .flight import Flight
+
+
+def test_every_kind_is_known() -> None:
+    """Each kind that may explain another one is a kind of event itself."""
+    for name, kind in KINDS.items():
+        assert set(kind.causes) <= set(KINDS), name
+
+
+def test_kind_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of the table is all that a flag needs to be an event, a state, a cause, and a story."""
+    row = Kind(
+        "freefall", "bad", "VehicleLandDetected", ("gps_fix_lost",), fault=True, flags={"freefall": "freefall"},
+        begin="free fall", end="caught again",
+    )  # fmt: skip
+    monkeypatch.setitem(KINDS, "freefall", row)
+    flight = Flight()
+    flight.send()
+    flight.send("vehicle_land_detected", landed=False, freefall=False)
+    flight.gps(fix_type=3)
+    flight.wait(1.0).gps(fix_type=0)
+    [begun] = flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=True)
+    assert (begun.kind, begun.severity, begun.text) == ("freefall", "bad", "free fall")
+    assert [each.kind for each in begun.evidence] == ["gps_fix_lost"]
+    assert flight.account.state("1", flight.now).text == "free fall"
+    flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=False)
+    [story] = [each for each in stories_of(flight.account.events) if each.what == "free fall"]
+    assert [each.kind for each in story.before] == ["gps_fix_lost"]
+
+
+def test_kind_of_a_newer_service_is_an_event() -> None:
+    """An event of a kind that is not in the table, as a newer service reports it, is shown as it is."""
+    begun = Event("1", "lightning", "begin", "watch", "struck", 1.0)
+    assert [each.text for each in spans_of([begun])] == ["struck"]
+    assert state_at(spans_of([begun]), 2.0).text == "struck"

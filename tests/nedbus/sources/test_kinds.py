@@ -1,0 +1,51 @@
+"""Sources as texts and as tables of TOML."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from nedbus.errors import ConfigError
+from nedbus.settings import load_settings
+from nedbus.sources import parse_source
+
+
+@pytest.mark.parametrize(
+    ("sources", "texts"),
+    [
+        ('[{ kind = "sim" }]', ["sim:"]),
+        ('[{ kind = "sim", vehicle = 7, wait = true, duration = 2.5 }]', ["sim:?vehicle=7&wait=1&duration=2.5"]),
+        ('[{ kind = "ulog", file = "a?b 100%.ulg", speed = "max" }]', ["ulog:a%3Fb 100%25.ulg?speed=max"]),
+        (
+            '[{ kind = "mavlink", link = "udpin::1", vehicles = { 1 = "a", 2 = "b" } }]',
+            ["mavlink:udpin::1?vehicles=1:a,2:b"],
+        ),
+        ('[{ kind = "px4-zenoh", vehicles = { left = "a", right = "b" } }]', ["px4-zenoh:?vehicles=left:a,right:b"]),
+        ('[{ kind = "px4-zenoh", endpoint = "tcp/b:7447", domain = 5 }]', ["px4-zenoh:tcp/b:7447?domain=5"]),
+        ('["sim:", { kind = "sim", vehicle = 2 }]', ["sim:", "sim:?vehicle=2"]),
+    ],
+)
+def test_source_as_a_table_is_the_same_as_its_text(tmp_path: Path, sources: str, texts: list[str]) -> None:
+    """Both forms give the same options, and may be mixed; the text is how status and metrics name the source."""
+    (tmp_path / "nedbus.toml").write_text(f"source = {sources}")
+    specs = [parse_source(source) for source in load_settings().source]
+    assert [spec.text for spec in specs] == texts
+    assert specs == [parse_source(text) for text in texts]
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ({}, "kind is missing: choose from sim, ulog"),
+        ({"kind": "ulg"}, "there is no kind 'ulg': choose from sim, ulog"),
+        ({"kind": 5}, "there is no kind 5"),
+        ({"kind": "ulog"}, 'it needs file = "..."'),
+        ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
+        ({"kind": "sim", "speed": 0}, "speed=0 is invalid: expected a factor from 0.001"),
+        ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
+    ],
+)
+def test_wrong_table_is_explained(source: dict[str, object], reason: str) -> None:
+    """As a wrong text is."""
+    with pytest.raises(ConfigError, match=re.escape(reason)):
+        parse_source(source)
