@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Error, Page, sync_playwright
 
 from tests.waits import wait_for
 
@@ -169,8 +169,13 @@ class Tab:
 
     @property
     def listed(self) -> list[dict[str, Any]]:
-        """The rows of the list, in its order: vehicle, grade, state, and whether it is chosen."""
-        found: list[dict[str, Any]] = self.page.locator(VEHICLE).evaluate_all(_ROWS)
+        """The rows of the list, in its order: vehicle, grade, state, and whether it is chosen; none while it loads."""
+        try:
+            found: list[dict[str, Any]] = self.page.locator(VEHICLE).evaluate_all(_ROWS)
+        except Error as exc:
+            if "because of a navigation" not in str(exc):
+                raise
+            return []
         return found
 
     @property

@@ -28,7 +28,7 @@ from tests.peers.processes import Process, Start
 from tests.peers.prometheus import ALERTS, PACKAGING, Prometheus, start_promtool
 from tests.waits import repeating, wait_for
 
-PEER = str(Path(__file__).parents[1] / "sources" / "mavlink_peer.py")
+PEER = str(Path(__file__).parents[1] / "sources" / "mavlink" / "mavlink_peer.py")
 ROW = {
     "x": 1.5, "y": -2.25, "z": -10.0, "vx": 0.5, "vy": -0.25, "vz": 0.125, "heading": -1.0, "eph": 0.5, "epv": 0.75,
     "ref_lat": 47.3977418, "ref_lon": 8.5455939, "ref_alt": 487.957, "dist_bottom": 10.5,
