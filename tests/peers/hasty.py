@@ -1,4 +1,4 @@
-"""`nedbus` in a process of its own, with shorter times than it has, where a test would only wait for them."""
+"""`nedbus` in a process of its own with other timings: shorter where a test would wait, longer on a busy machine."""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ import pytest
 import nedbus
 from nedbus.client import LogStreamStatus
 from nedbus.recording import Flight
+from nedbus.timings import Timings
 from tests.peers.command_line import run_command
+from tests.peers.hasty import start_hasty
 from tests.peers.http_pages import Pages
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
@@ -29,12 +31,13 @@ def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
 
 
 @pytest.mark.process
-def test_stream_in_another_process(run_nedbus: Start, tmp_path: Path) -> None:
+def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
     """The stream arrives in full at a subscriber; `info`, /metrics and the saved log have the same totals."""
     link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), Pages(free_port())
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
-    service = run_nedbus("serve", "--listen", endpoint, "--http", pages.where, "--source", source)
+    patient = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # of a busy machine
+    service = start_hasty(start, patient, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,
