@@ -180,7 +180,7 @@ def test_stuck_reader_disturbs_nobody(make_stack: StartStack, record: Record) ->
         told = json.loads(publisher.out)
         assert told["count"] > 10_000
         assert told["blocked"] < 1.0, "of 60 s: a reader that holds it back does so for most of them"
-        wait_for(lambda: len(healthy.samples) == told["count"], what="the last message")
-        assert [sample.message.timestamp for sample in healthy.samples] == list(range(1, told["count"] + 1))
+        wait_for(lambda: healthy.samples[-1].message.timestamp == told["count"], what="the last message")
         assert healthy.subscription.counts == nedbus.Counts(received=told["count"])
+        assert [sample.message.timestamp for sample in healthy.samples] == list(range(1, told["count"] + 1))
     assert stuck.popen.poll() is None
