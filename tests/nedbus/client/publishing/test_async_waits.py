@@ -131,7 +131,10 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus
 
     with answering(raw, f"nedbus/*/{VLP}/@ack", asked.append):
         asyncio.run(scenario())
-    assert not {each.name for each in threading.enumerate() if each.name.startswith("nedbus-close_")}
+    wait_for(
+        lambda: not any(each.name.startswith("nedbus-close_") for each in threading.enumerate()),
+        what="the end of its thread",
+    )
 
 
 def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(client: nedbus.Bus, raw: Session) -> None:
