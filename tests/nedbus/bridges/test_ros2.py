@@ -270,7 +270,7 @@ def test_vehicle_that_is_back_brings_nothing_late(
     put(2, late)
     wait_for(lambda: "1 old message held back, up to" in caplog.text, what="the report")
     current = count(3)
-    with repeating(lambda: put(next(current), raw.new_timestamp().get_time())):  # a busy machine may hold some back
+    with repeating(lambda: put(next(current), raw.new_timestamp().get_time())):  # on a busy machine some are late
         assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] != 2
     token.undeclare()
 

@@ -105,7 +105,7 @@ def test_pages_of_an_exporter(
     bus: nedbus.Bus, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An exporter sees what is published, lost and invalid, and how long messages take."""
-    timings.retransmit_timeout = 0.1  # nobody keeps what is missing
+    timings.retransmit_timeout = 0.1  # no publisher caches what is missing
     publisher = raw.declare_publisher(f"nedbus/7/{VLP}")
     numbers = [1, 2, 3, 6, 7]  # 4 and 5 were lost before they came to the router
     of_stream = {"vehicle": "7", "topic": VLP}

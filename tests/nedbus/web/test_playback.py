@@ -222,7 +222,7 @@ def test_address_of_a_recording_names_its_moment(recording: Recording) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("clock")
 def test_any_time_in_an_address_is_survived(recording: Recording) -> None:
-    """A time that is none, or before or after the recording, opens a moment of it."""
+    """An invalid time, or one outside the recording, opens the page at a moment within it."""
     for asked in ("time=nan", "time=1e300", "time=-5", "time=99:99", "time=inf", "time=x"):
         assert 0 <= open_page(recording, asked=asked).player.time <= recording.length
 
