@@ -27,7 +27,7 @@ HEAD: Final = (
 
 BYTES: Final = {  # of a payload of the default flight, with a timestamp in ns, without what the transport adds
     "raw": 244, "batches": 244, "rows": 244, "models": 244, "fields_in": 244, "straightforward": 916,
-    "msgspec_array": 356, "pyzmq": 916, "rose": 953, "zrm": 250, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
+    "msgspec_array": 356, "pyzmq": 916, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
     "mavsdk_telemetry": 40, "rclpy_odometry": 708,
 }  # fmt: skip
 
