@@ -30,7 +30,7 @@ def page(definition: Definition[Any]) -> str:
     parts.append(section("Rules", table(["fields", "rule"], rules)))
     parts.append(section("Properties", table(["property", "value", "None"], list(_properties(definition)))))
     older = [
-        [f"`{old.name}`", " and ".join(map(_place, old.places)) + ", in other units" * bool(old.up)]
+        [f"`{old.name}`", " and ".join(map(_place, old.targets)) + ", in other units" * bool(old.up)]
         for old in definition.older.values()
     ]
     parts.append(section("Older names", table(["older field", "now"], older)))

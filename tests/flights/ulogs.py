@@ -10,7 +10,7 @@ from pathlib import Path
 from nedbus.sources import FileAccount, read_account
 from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
 from nedbus_msgs import VehicleLocalPosition
-from tests.flights.first_message import FIELD_TYPES, LAYOUTS, downgrade
+from tests.flights.local_position import FIELD_TYPES, LAYOUTS, downgrade
 
 LOGS = Path(__file__).parents[3] / "shared" / "data" / "ulog"
 """Real flight logs, which tests marked `logs` read where they are."""

@@ -13,7 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from nedbus_msgs import VehicleLocalPosition
-from tests.flights.first_message import FIELD_TYPES, encode
+from tests.flights.local_position import FIELD_TYPES, encode
 
 DATA = Path(__file__).parents[1] / "data"
 FLIGHTS = [VehicleLocalPosition(**each["fields"]) for each in json.loads((DATA / "flights.json").read_text()).values()]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from nedbus_msgs import DecodeError, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, mask_invalid, to_array
 from nedbus_msgs.messages import HomePosition, VehicleAttitude
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     PAYLOAD_SIZE,
     decode_array,
     decode_cdr_array,

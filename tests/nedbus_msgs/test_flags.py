@@ -20,7 +20,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
-from tests.flights.first_message import row_of
+from tests.flights.local_position import row_of
 
 from .strategies import FLAG_FIELDS, messages
 

@@ -30,7 +30,7 @@ from nedbus_msgs.frames import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
-from tests.flights.first_message import row_of
+from tests.flights.local_position import row_of
 from tests.flights.ulogs import LOGS
 
 RADIUS = 6_371_000.0

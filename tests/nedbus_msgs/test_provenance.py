@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nedbus_msgs import ArgumentError, Provenance
-from tests.flights.first_message import ENCODING, FIELD_TYPES, encoding_of, provenance_of
+from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, provenance_of
 
 
 @given(st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True), st.sets(st.sampled_from(list(FIELD_TYPES))))

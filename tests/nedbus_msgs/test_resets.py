@@ -12,7 +12,7 @@ import pytest
 
 from nedbus_msgs import Continuous, ResetTracker, VehicleLocalPosition
 from nedbus_msgs.frames import MapProjection
-from tests.flights.first_message import upgrade
+from tests.flights.local_position import upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS

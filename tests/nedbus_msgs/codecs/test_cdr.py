@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from nedbus_msgs import DecodeError, EncodeError, VehicleLocalPosition
-from tests.flights.first_message import LAYOUTS, decode_cdr, downgrade, encode_cdr
+from tests.flights.local_position import LAYOUTS, decode_cdr, downgrade, encode_cdr
 from tests.nedbus_msgs.strategies import DATA, messages
 
 VECTORS = DATA / "cdr_vectors.jsonl"

@@ -43,8 +43,8 @@ from nedbus_msgs import (
     upgrade_fields,
 )
 from nedbus_msgs.arrays import arrays_of
-from nedbus_msgs.ros2.types import described, type_hash
-from tests.flights.first_message import decode_cdr, encode_cdr
+from nedbus_msgs.ros2.types import describe_field, type_hash
+from tests.flights.local_position import decode_cdr, encode_cdr
 from tests.flights.ulogs import UlogWriter
 from tests.nedbus_msgs.strategies import DATA
 from tests.peers.processes import Start
@@ -105,7 +105,7 @@ def test_vectors_of_rosbags_are_decoded_and_encoded_to_the_bit() -> None:
 
 def test_text_has_the_bytes_and_the_hash_of_ros_2() -> None:
     """A char of a .msg file is a uint8: the hash is that of std_msgs/msg/Char as ROS 2 Jazzy generates it."""
-    char = ("std_msgs/msg/Char", [described("data", field_type("char"))])
+    char = ("std_msgs/msg/Char", [describe_field("data", field_type("char"))])
     assert type_hash(char) == "RIHS01_3ad2d04dd29ba19d04b16659afa3ccaedd691914b02a64e82e252f2fa6a586a9"
     layout = MESSAGES["LogMessage"].current
     assert hash_of(layout, "px4_msgs/msg/LogMessage") == hash_of_msg("LogMessage", LOG_MESSAGE)

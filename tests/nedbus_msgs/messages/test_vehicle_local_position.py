@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs import InvalidMessageError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_array
-from tests.flights.first_message import FIELD_TYPES, describe, encode, encode_fields, json_schema
+from tests.flights.local_position import FIELD_TYPES, describe, encode, encode_fields, json_schema
 from tests.nedbus_msgs.strategies import BREAKING, KEEPING, WITHIN, bits, fields, messages
 
 FLOATS = [name for name, kind in FIELD_TYPES.items() if kind == "float32"]

@@ -12,7 +12,7 @@ from hypothesis import given
 from pydantic import ValidationError
 
 from nedbus_msgs import VehicleLocalPosition, field_type
-from tests.flights.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
+from tests.flights.local_position import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
 from tests.nedbus_msgs.strategies import DATA, bits, messages
 
 SEEDS = json.loads((DATA / "seeds.json").read_text())

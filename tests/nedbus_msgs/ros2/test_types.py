@@ -16,7 +16,7 @@ from nedbus_msgs import (
     ros2_types,
     split_ros2_topic,
 )
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     ROS2_TYPE,
     decode_cdr,
     downgrade,

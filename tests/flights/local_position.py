@@ -31,7 +31,7 @@ from nedbus_msgs import describe as _describe
 from nedbus_msgs import encoding_of as _encoding_of
 from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
-from nedbus_msgs.codecs.msgpack import Newer
+from nedbus_msgs.codecs.msgpack import NewerLayouts
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 LAYOUTS: Final = DEFAULT.layouts
@@ -78,7 +78,7 @@ def encode(message: Message) -> bytes:
     return codec_of(message.DEFINITION).encode(message)
 
 
-def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
+def decode(payload: bytes, message: type[M] = _FIRST, *, newer: NewerLayouts | None = None) -> M:
     """Return the validated message of a payload.
 
     `newer`: field names of layouts unknown to this version, by number on the wire; fields with known names are decoded,
@@ -103,7 +103,7 @@ def encode_row(values: Sequence[object] | Message, message: type[M] = _FIRST) ->
     return codec_of(definition_of(message)).encode_row(cast("Sequence[object]", values))
 
 
-def decode_row(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
+def decode_row(payload: bytes, message: type[M] = _FIRST, *, newer: NewerLayouts | None = None) -> M:
     """Return the message of a payload as a named tuple, a Row, validated by the same types and rules as in `decode`."""
     return codec_of(definition_of(message)).decode_row(payload, newer=newer)
 

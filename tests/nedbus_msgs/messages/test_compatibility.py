@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs import NedbusError, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     LAYOUTS,
     decode_row,
     describe,
@@ -26,7 +26,7 @@ from tests.flights.first_message import (
     message_definition,
     type_hash,
 )
-from tests.flights.first_message import decode as decode_payload
+from tests.flights.local_position import decode as decode_payload
 from tests.nedbus_msgs.strategies import DATA, FLIGHTS, REAL
 
 KEPT: Final = DATA / "vehicle_local_position.json"
