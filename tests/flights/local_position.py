@@ -1,4 +1,4 @@
-"""The facts of VehicleLocalPosition, which most tests send, and its forms as functions."""
+"""Codecs, layouts and schema of a message as plain functions, by default of VehicleLocalPosition."""
 
 from __future__ import annotations
 
@@ -52,135 +52,107 @@ def encode_cdr_array(array: MessageArray) -> npt.NDArray[np.void]:
 
 
 def decode_cdr_array(payloads: Sequence[bytes]) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-    """Return the messages of CDR payloads of the current layout, and a mask of those that are valid."""
+    """Decode CDR payloads of the current layout; return the messages and a mask of the valid ones."""
     return arrays_of(DEFAULT).decode_cdr(payloads, CURRENT)
 
 
 def row_of(message: VehicleLocalPosition) -> VehicleLocalPosition:
-    """Return a message as a row, which is the message itself for type checkers."""
+    """Return a message as a Row, typed as the message."""
     return cast("VehicleLocalPosition", tuple.__new__(DEFAULT.row, message.__dict__.values()))
 
 
 def layout_of_type_hash(text: str) -> str | None:
-    """Return the name of the layout with this hash."""
+    """Return the name of the layout with this hash, or None."""
     found = message_of_type_hash(text)
     return found[1].name if found else None
 
 
-_FIRST: Any = VehicleLocalPosition
+_DEFAULT: Any = VehicleLocalPosition
 
 
 def encode(message: Message) -> bytes:
-    """Return the payload of a message; float32 fields are rounded.
-
-    Raises EncodeError if values do not fit their fields, in a message whose validation was bypassed.
-    """
+    """Return the payload of a message; raise EncodeError if its validation was bypassed and a value does not fit."""
     return codec_of(message.DEFINITION).encode(message)
 
 
-def decode(payload: bytes, message: type[M] = _FIRST, *, newer: NewerLayouts | None = None) -> M:
-    """Return the validated message of a payload.
+def decode(payload: bytes, message: type[M] = _DEFAULT, *, newer: NewerLayouts | None = None) -> M:
+    """Return the validated message of a payload; raise DecodeError if it is invalid.
 
-    `newer`: field names of layouts unknown to this version, by number on the wire; fields with known names are decoded,
-    others ignored.
-
-    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
-    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
+    `newer`: field names of layouts unknown to this version, by layout number; unknown fields are ignored.
     """
     return codec_of(definition_of(message)).decode(payload, newer=newer)
 
 
-def encode_fields(fields: Mapping[str, object], message: type[M] = _FIRST) -> bytes:
+def encode_fields(fields: Mapping[str, object], message: type[M] = _DEFAULT) -> bytes:
     """Return the payload of a message with these fields, validated; raise InvalidMessageError if it is invalid."""
     return codec_of(definition_of(message)).encode_fields(fields)
 
 
-def encode_row(values: Sequence[object] | Message, message: type[M] = _FIRST) -> bytes:
+def encode_row(values: Sequence[object] | Message, message: type[M] = _DEFAULT) -> bytes:
     """Return the payload of a message with these values of all fields, validated.
 
-    Raises EncodeError for another number of values, InvalidMessageError for an invalid message.
+    Raises EncodeError for a wrong number of values, InvalidMessageError for an invalid message.
     """
     return codec_of(definition_of(message)).encode_row(cast("Sequence[object]", values))
 
 
-def decode_row(payload: bytes, message: type[M] = _FIRST, *, newer: NewerLayouts | None = None) -> M:
-    """Return the message of a payload as a named tuple, a Row, validated by the same types and rules as in `decode`."""
+def decode_row(payload: bytes, message: type[M] = _DEFAULT, *, newer: NewerLayouts | None = None) -> M:
+    """Return the message of a payload as a Row, validated as by `decode`."""
     return codec_of(definition_of(message)).decode_row(payload, newer=newer)
 
 
-def describe(error: ValidationError, message: type[Message] | str = _FIRST) -> str:
-    """Return a validation error in one line: each field, the reason, and its value."""
+def describe(error: ValidationError, message: type[Message] | str = _DEFAULT) -> str:
+    """Format a validation error as one line: each field with the reason and its value."""
     return _describe(error, definition_of(message))
 
 
-def upgrade(fields: Mapping[str, object], message: type[M] = _FIRST) -> M:
-    """Return the message with these fields of any PX4 release; arrays are tuples.
-
-    All known fields are used, by their present name, and unknown names are ignored.
-    A missing field is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
-
-    Raises pydantic.ValidationError for an invalid message.
-    """
+def upgrade(fields: Mapping[str, object], message: type[M] = _DEFAULT) -> M:
+    """Build a message from the fields of any PX4 release; raise pydantic.ValidationError if it is invalid."""
     return upgrade_with(definition_of(message), fields)
 
 
 def downgrade(message: Message, layout: str) -> dict[str, object]:
-    """Return a message as the fields of an older layout, in that layout's order; what the layout lacks is dropped."""
+    """Return the fields of a message in an older layout, in that layout's order."""
     return message.DEFINITION.downgrade(message.__dict__, message.DEFINITION.layouts[layout])
 
 
-def find_layout(names: Iterable[str], message: type[Message] | str = _FIRST) -> Layout | None:
+def find_layout(names: Iterable[str], message: type[Message] | str = _DEFAULT) -> Layout | None:
     """Return the layout with exactly these field names, in any order, or None."""
     return definition_of(message).find_layout(names)
 
 
-def decode_cdr(payload: bytes, *, layout: str, message: type[Message] | str = _FIRST) -> dict[str, object]:
-    """Return the fields of a CDR payload, in the order of the layout; arrays are tuples; `upgrade` validates them.
-
-    `layout` is the name of a layout, or the RIHS01 hash of a ROS 2 type, which says which message it is.
-    Padding is ignored, and so are the bytes that PX4 appends.
-
-    Raises DecodeError for another encapsulation than little-endian XCDR1, for missing or too many bytes and for a bool
-    that is neither 0 nor 1; LayoutError for an unknown layout.
-    """
+def decode_cdr(payload: bytes, *, layout: str, message: type[Message] | str = _DEFAULT) -> dict[str, object]:
+    """Decode a CDR payload to fields, in layout order; `layout`: a layout name, or the RIHS01 hash of a ROS 2 type."""
     definition, found = _layout(layout, message)
     return decode_with(definition, payload, found)
 
 
-def encode_cdr(fields: Mapping[str, object], *, layout: str, message: type[Message] | str = _FIRST) -> bytes:
-    """Return the CDR payload of the fields of a layout, such as `downgrade` returns, with zeros in its padding.
-
-    `layout` is that of `decode_cdr`. Floats are rounded to the nearest float32 where PX4 has one.
-
-    Raises EncodeError for a value that its type cannot hold.
-    """
+def encode_cdr(fields: Mapping[str, object], *, layout: str, message: type[Message] | str = _DEFAULT) -> bytes:
+    """Encode the fields of a layout, as returned by `downgrade`, as CDR; `layout` is that of `decode_cdr`."""
     definition, found = _layout(layout, message)
     return encode_with(definition, fields, found)
 
 
-def type_hash(layout: str, *, message: type[Message] | str = _FIRST, name: str | None = None) -> str:
-    """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016), `RIHS01_` and 64 hex digits.
-
-    `name` is the type, if it is not px4_msgs' own.
-    """
+def type_hash(layout: str, *, message: type[Message] | str = _DEFAULT, name: str | None = None) -> str:
+    """Return the RIHS01 hash of a ROS 2 type with the fields of a layout; `name`: the type, if not that of px4_msgs."""
     definition = definition_of(message)
     return hash_of(definition.layouts[layout], name or ros2_type(definition))
 
 
-def message_definition(layout: str, message: type[Message] | str = _FIRST) -> str:
-    """Return the .msg file of a layout, with unit and meaning of each field."""
+def message_definition(layout: str, message: type[Message] | str = _DEFAULT) -> str:
+    """Return the .msg definition of a layout, with unit and meaning of each field."""
     definition = definition_of(message)
     return definition_text(definition, definition.layouts[layout])
 
 
-def json_schema(message: type[Message] | str = _FIRST) -> dict[str, object]:
-    """Return the JSON Schema (2020-12) of a message as JSON; NaN and infinities are the strings of those names."""
+def json_schema(message: type[Message] | str = _DEFAULT) -> dict[str, object]:
+    """Return the JSON Schema (2020-12) of a message."""
     schema: dict[str, object] = definition_of(message).schema()["json_schema"]
     return schema
 
 
-def layout_table(message: type[Message] | str = _FIRST) -> list[dict[str, object]]:
-    """Return every layout as name, number on the wire (or None), and its fields in order, each with name and type."""
+def layout_table(message: type[Message] | str = _DEFAULT) -> list[dict[str, object]]:
+    """Return name, layout number (or None), and fields with name and type, of every layout."""
     layouts: list[dict[str, object]] = definition_of(message).schema()["layouts"]
     return layouts
 
@@ -194,20 +166,17 @@ def _layout(text: str, message: type[Message] | str) -> tuple[Definition[Any], L
 
 
 def valid_mask(array: MessageArray, message: type[Message] | str = DEFAULT.model) -> npt.NDArray[np.bool_]:
-    """Return a mask of the messages that pass the rules between fields."""
+    """Return a mask of the messages that pass the rules."""
     return arrays_of(definition_of(message)).valid_mask(array)
 
 
 def decode_array(
     payloads: bytes, message: type[Message] | str = DEFAULT.model
 ) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-    """Return the messages of concatenated payloads of full width, and a mask of those that are valid.
-
-    A payload that is False in the mask may still be valid: `decode` decides.
-    """
+    """Decode concatenated full-width payloads; return the messages and a mask of the valid ones."""
     return arrays_of(definition_of(message)).decode(payloads)
 
 
 def encode_array(array: MessageArray, message: type[Message] | str = DEFAULT.model) -> bytes:
-    """Return the concatenated payloads of messages, without validating them."""
+    """Encode messages as concatenated payloads, without validating them."""
     return arrays_of(definition_of(message)).encode(array)
