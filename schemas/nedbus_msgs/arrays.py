@@ -202,7 +202,7 @@ def to_array(messages: Sequence[M]) -> MessageArray:
     return arrays_of(messages[0].DEFINITION if messages else DEFAULT).of(messages)
 
 
-def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # M has this default
+def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # default of M
     """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
     return arrays_of(definition_of(message)).to_message(element)
 

@@ -5,8 +5,7 @@
 
 `hash` identifies the definition, as builds of PX4 may differ (see `short_hash`); the twelve messages of the first
 version of nedbus omit it.
-`missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; it is omitted if no
-field is missing.
+`missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; omitted if 0.
 Encoding and parsing are cached, as almost all messages of a publisher have the same encoding.
 """
 

@@ -86,7 +86,6 @@ class Address:
 
     @property
     def _order(self) -> tuple[str, str, int]:
-        """Sort key; -1 for no instance."""
         return self.vehicle, self.topic, -1 if self.instance is None else self.instance
 
     def __str__(self) -> str:
@@ -220,7 +219,7 @@ def vehicle_name(vehicle: str | int) -> str:
 
 
 def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
-    """Return the topic of a message: a name as given, or for a class `topic`, by default its first one.
+    """Return the topic of a message: a name as given; for a class, `topic` or its first topic.
 
     Raises AddressError for a topic of another message, and for a class that declares no topics.
     """

@@ -10,8 +10,7 @@ class FailsafeFlags(Message):
     Bit n (1 << n) of a mode_req_ mask is mode n of VehicleStatus.NAVIGATION_STATE_.
     An unmet requirement blocks a mode: for example, its bit in mode_req_local_position with local_position_invalid.
     Flags are false without a fault; remote_id_unhealthy and the like are also set if no such system is installed.
-    primary_geofence_breached (1.14) is now geofence_breached, local_position_accuracy_low (up to 1.16) is now
-    position_accuracy_low.
+    primary_geofence_breached (1.14) and local_position_accuracy_low (up to 1.16) have their current names here.
     """
 
     TOPICS = (Topic("failsafe_flags", 2.0, "the commander", on_change=True),)

@@ -209,7 +209,6 @@ class Definition(Generic[M_co]):
         return attrgetter("DEFINITION"), (self.model,)
 
     def _types_of(self, text: str) -> Mapping[str, FieldType]:
-        """Parse the text of a layout."""
         base, *changes = (part.strip() for part in text.split(","))
         same = next((layout for layout in self.model.LAYOUTS if layout.name == base), None)
         if same or base == "*":

@@ -94,7 +94,7 @@ class FieldType(str):
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
         value = str if self.is_text else bool if self.base == "bool" else float if self.is_float else int
-        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one element type per value
+        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one per value
         return Annotated[python, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:
