@@ -1,4 +1,4 @@
-"""All messages: vectors and hashes of rosbags, all codecs, and an additional message that is only a file."""
+"""All messages: vectors and hashes of rosbags, all codecs, and a message added as a single file."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def any_fields(draw: st.DrawFn) -> tuple[Definition[Any], dict[str, object]]:
 
 
 @given(any_fields())
-def test_all_forms_of_all_messages_agree(case: tuple[Definition[Any], dict[str, object]]) -> None:
+def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[str, object]]) -> None:
     """Model, fields, rows and arrays accept the same messages, write the same bytes, and read the same values."""
     definition, fields = case
     codec, arrays = codec_of(definition), arrays_of(definition)
