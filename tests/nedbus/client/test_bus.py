@@ -27,7 +27,7 @@ from nedbus.timings import Timings
 from nedbus.transport import Session, alive_tokens, open_router
 from nedbus.transport.queries import Answers
 from nedbus_msgs import DEFAULT, Address
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import Link, wait_for_demand
 from tests.nedbus.client.numbered import publish, take, wait_for_subscriber

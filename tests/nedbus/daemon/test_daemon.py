@@ -23,7 +23,7 @@ from nedbus.events import Account
 from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition
-from tests.flights.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
+from tests.flights.local_position import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS, UlogWriter, write_log

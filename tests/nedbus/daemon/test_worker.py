@@ -19,7 +19,7 @@ from nedbus.sources import Rejection, ReplayRun, ReplaySource, Source, SourceMes
 from nedbus.sources.options import RecordedOptions
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition
-from tests.flights.first_message import decode, encode_fields
+from tests.flights.local_position import decode, encode_fields
 from tests.flights.messages import VLP
 
 ONE, TWO = Address("1", VLP), Address("2", VLP)

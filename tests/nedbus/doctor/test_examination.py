@@ -29,7 +29,7 @@ from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router
 from nedbus_msgs import dds_type, status_key
-from tests.flights.first_message import ROS2_TYPE, encode
+from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
 from tests.peers.certificates import files_of, pki, secure_endpoint, tls_of, write_config

@@ -23,7 +23,7 @@ from nedbus.timings import Timings
 from nedbus.transport import Session, open_client, open_router
 from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import take
 from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_demand

@@ -18,7 +18,7 @@ import zenoh
 
 import nedbus
 from nedbus.transport import Session, open_client
-from tests.flights.first_message import decode, encode
+from tests.flights.local_position import decode, encode
 from tests.flights.messages import VLP, message
 from tests.peers.certificates import flags_of, pki, secure_endpoint, tls_of, write_config
 from tests.peers.command_line import run_command

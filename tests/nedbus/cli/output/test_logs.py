@@ -23,7 +23,7 @@ from nedbus.log_event import EVENTS, about
 from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import Address
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.command_line import run_command
