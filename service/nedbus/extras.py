@@ -10,7 +10,7 @@ EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pk
 """The extras of this package, as in `pip install ".[mcap]"` in a clone."""
 
 
-def needs(extra: str, module: str) -> Any:
+def import_optional(extra: str, module: str) -> Any:
     """Import and return a module that requires an extra or another package.
 
     Raises ConfigError, with the package to install, if a dependency of the module is missing.
@@ -34,6 +34,6 @@ def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callab
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         extra, module = modules[name]
-        return getattr(needs(extra, f"{package}.{module}"), name)
+        return getattr(import_optional(extra, f"{package}.{module}"), name)
 
     return get

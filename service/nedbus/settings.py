@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 DEFAULT_FILE: Final = Path("nedbus.toml")
 _MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters from which a variable counts as the beginning of a setting's name
 
-_Place = tuple[int | None, int | None]  # line and column, counted from 1; None if unknown
+_Position = tuple[int | None, int | None]  # line and column, counted from 1; None if unknown
 
 
 def split_sources(value: object) -> object:
@@ -288,13 +288,13 @@ def _read_toml(path: Path) -> dict[str, object]:
         raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
 
 
-def _find_key(text: str, name: str) -> _Place:
+def _find_key(text: str, name: str) -> _Position:
     """Return line and column of a key or a table, which TOML parsers do not keep."""
     found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
-    return place_at(text, found.start(1)) if found else (None, None)
+    return position_at(text, found.start(1)) if found else (None, None)
 
 
-def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Place:
+def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Position:
     """Return line and column of the source with this index, a table or a text in a list, or of one of its options."""
     source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
@@ -302,16 +302,16 @@ def _find_source(text: str, sources: Sequence[object], index: int, key: str = ""
         start = headers[index].start(1)
         end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
         option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
-        return place_at(text, start + option.start(1) if option else start)
+        return position_at(text, start + option.start(1) if option else start)
     if isinstance(source, str):
         found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
         before = sources[:index].count(source)
         if before < len(found):
-            return place_at(text, found[before])
+            return position_at(text, found[before])
     return _find_key(text, "source")
 
 
-def place_at(text: str, start: int) -> _Place:
+def position_at(text: str, start: int) -> _Position:
     """Return line and column of an index into a text; unknown for a negative index, as from `str.find`."""
     if start < 0:
         return None, None

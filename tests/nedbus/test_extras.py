@@ -7,7 +7,7 @@ import gc
 import pytest
 
 from nedbus.errors import ConfigError
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ from nedbus.extras import needs
 def test_missing_package_is_named_with_its_cure(extra: str, command: str) -> None:
     """An extra is never installed by the name of nedbus alone, which is not ours on PyPI; another package is."""
     with pytest.raises(ConfigError) as caught:
-        needs(extra, "gone")
+        import_optional(extra, "gone")
     assert str(caught.value) == f"gone: not installed: {command}"
 
 
@@ -31,7 +31,7 @@ def test_import_leaves_garbage_collection_alone(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr("nedbus.extras.import_module", import_slowly)
     try:
-        needs("web", "slow")
+        import_optional("web", "slow")
         assert (seen, gc.isenabled()) == ([True], False)
     finally:
         gc.enable()

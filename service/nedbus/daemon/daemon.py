@@ -268,7 +268,7 @@ class Daemon:
                 return open_client(self.endpoints, timeout=1.0, tls=settings.tls, stop=self._stop)
             except ConnectError as exc:
                 if not logged:
-                    _log.warning("%s; still trying", exc, extra=about("link-broken"))
+                    _log.warning("%s; still trying", exc, extra=about("link_lost"))
                 logged = True
         return None
 

@@ -157,8 +157,8 @@ class SourceOutput:
         stream = self._streams.get(address)
         publisher = stream.publisher if stream is not None else None
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
-            back = stream is not None and stream.heard is not None
-            if not back and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
+            resumed = stream is not None and stream.heard is not None
+            if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
                 reason = f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"
                 self.reject(Rejection("vehicles", reason), rule=TOO_MANY)
                 return
@@ -167,8 +167,9 @@ class SourceOutput:
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
-            event = "back" if back else "published"
-            _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
+            text = f"{address} is published{' again' if resumed else ''}"
+            event = "stream_resumed" if resumed else "published"
+            _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
             self._bring_back(message)
             stream = self._streams[address]
         stream.heard, stream.last = self._now(), message
@@ -228,7 +229,7 @@ class SourceOutput:
         if new := [address for address in absence.silent if address not in self._silent]:
             self._silent.update(new)
             text = f"announced, but no message arrives: {', '.join(new)}; see 'nedbus doctor'"
-            _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
+            _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
         """Republish the topics without a rate of a vehicle that is back, as it will not, unless it rebooted since."""
@@ -247,7 +248,8 @@ class SourceOutput:
                 continue
             with suppress(AddressInUseError):
                 self.claim(address, last.definition)
-                _log.info("%s: %s is back", self._name, address, extra=about("back", address, source=self._name))
+                extra = about("stream_resumed", address, source=self._name)
+                _log.info("%s: %s is published again", self._name, address, extra=extra)
                 self.publish(replace(last, lost=0))
 
     def _now_ns(self) -> int:

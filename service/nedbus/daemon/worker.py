@@ -194,7 +194,7 @@ class Worker:
     def _run_replay(self, source: ReplaySource) -> None:
         run, last, speed = source.open(), self._run, source.options.speed
         if last is None or last.summary != run.summary:
-            _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
+            _log.info("%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name))
             self._warned.clear()
         else:
             run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that come later
@@ -202,7 +202,7 @@ class Worker:
         self._run, self._done = run, 0
         if source.options.wait and last is None:
             self._state = "waiting"
-            _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
+            _log.info("%s: waiting for a subscriber", self._name, extra=about("replay_waiting", source=self._name))
             while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
                 pass
         self._output.release(keep=run.addresses)
@@ -213,7 +213,7 @@ class Worker:
             if speed is not None:
                 early = start + message.due / speed - self._clock.now()
                 if early < -_MAX_DELAY:
-                    extra = about("late", source=self._name)
+                    extra = about("replay_late", source=self._name)
                     _log.warning("%s: %.1f s late, shifting the schedule", self._name, -early, extra=extra)
                     start -= early
                 elif early > 0:

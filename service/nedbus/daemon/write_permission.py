@@ -18,7 +18,7 @@ from nedbus.errors import ConnectError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, while_open
+from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
@@ -110,10 +110,10 @@ class WritePermission:
                 " %s is its certificate ('nedbus pki rules', docs/security.md); checking again",
                 _name(new),
                 self._tls.certificate,
-                extra=about("refused"),
+                extra=about("access_denied"),
             )
         if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router accepts %s now", _name(mended), extra=about("accepted"))
+            _log.info("the router accepts %s now", _name(mended), extra=about("access_granted"))
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
@@ -138,7 +138,7 @@ class WritePermission:
 
 def _routers_of(session: Session) -> set[str]:
     try:
-        with while_open():
+        with translate_zenoh_errors():
             return {str(zid) for zid in session.info.routers_zid()}
     except NedbusError:
         return set()

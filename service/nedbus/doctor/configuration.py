@@ -9,7 +9,7 @@ from pathlib import Path
 from nedbus.daemon import Planned, plan_sources
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, place_at
+from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, position_at
 from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
 from nedbus.transport import check_endpoints, read_router_config, router_endpoints, split_endpoint
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -74,7 +74,7 @@ def check_router_file(
         reason = _reason(check_pem_file(name, file, "it is"))
         found.append((str(file), reason and f"{name}: {reason}"))
     text = path.read_text(errors="replace")
-    located = ((reason, place_at(text, text.find(value))) for value, reason in found if reason)
+    located = ((reason, position_at(text, text.find(value))) for value, reason in found if reason)
     return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
 
 

@@ -25,7 +25,7 @@ from nedbus.transport import (
     ask_routers,
     px4_publishers_key_expr,
     query,
-    while_open,
+    translate_zenoh_errors,
 )
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
 
@@ -130,7 +130,7 @@ class Observation:
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
     """Return a function that drains received samples, at most one full ring; deleting it ends the subscription."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
-    with while_open():
+    with translate_zenoh_errors():
         subscriber = session.declare_subscriber(key_expr, channel)
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 

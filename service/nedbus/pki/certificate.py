@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 from nedbus_msgs import AddressError, check_vehicle
 
 DAYS: Final = 825  # days of validity of a certificate
@@ -45,7 +45,7 @@ class Certificate:
 
         Raises ValueError for anything else, ConfigError (also a ValueError) without the extra `pki`.
         """
-        x509 = needs("pki", "cryptography.x509")
+        x509 = import_optional("pki", "cryptography.x509")
         try:
             found = x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
             names = [each.value for each in found.extensions if each.oid == x509.OID_SUBJECT_ALTERNATIVE_NAME]

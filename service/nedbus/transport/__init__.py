@@ -26,7 +26,7 @@ from .session import (
     open_client,
     require_unforked,
     translate_error,
-    while_open,
+    translate_zenoh_errors,
 )
 from .tls import UNKNOWN_AUTHORITY, Tls, check_pem
 from .write_probe import Verdict, probe_writes

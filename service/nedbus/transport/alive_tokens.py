@@ -13,7 +13,7 @@ from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
 from .queries import MAX_ANSWER_BYTES, MAX_ANSWERS, Answers, wait_for_answers, zenoh_timeout
-from .session import Session, while_open
+from .session import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class AliveTokens:
         return [change for change in changes if self._note(*change)]
 
     def _subscribe(self) -> None:
-        with while_open():
+        with translate_zenoh_errors():
             declare = self._session.liveliness().declare_subscriber
             self._subscriber = declare(self._key_expr, zenoh.handlers.RingChannel(_MAX_CHANGES), history=True)
         self._probe, self._unseen, self._retry = self._ask_probe(), self._keys.copy(), math.inf
@@ -109,6 +109,6 @@ class AliveTokens:
 def _ask(session: Session, key_expr: str, timeout: float) -> Answers:
     """Query matching tokens and return at once; each answer without an error holds one token."""
     timeout = zenoh_timeout(timeout)
-    with while_open():
+    with translate_zenoh_errors():
         answers = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_WAITING), timeout=timeout)
     return Answers(answers, timeout=timeout)

@@ -14,7 +14,7 @@ import zenoh
 
 from nedbus.log_event import about
 
-from .session import RawSample, Session, while_open
+from .session import RawSample, Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def ask(session: Session, selector: str, *, timeout: float, room: int = _MAX_WAI
     """
     timeout = zenoh_timeout(timeout)
     options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
-    with while_open():
+    with translate_zenoh_errors():
         answers = session.get(selector, zenoh.handlers.FifoChannel(room), timeout=timeout, **options)
     return Answers(answers, timeout=timeout)
 

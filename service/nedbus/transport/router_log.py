@@ -71,11 +71,11 @@ class Uplinks:
             self._states[name] = is_up, since if was_up is None else self._now()
             if is_up:
                 text = f"joined {name}" if was_up is None else f"the link to {name} is up, after {lasted:.0f} s"
-                _log.info("%s", text, extra=about("link-back"))
+                _log.info("%s", text, extra=about("link_up"))
             elif was_up:
-                _log.warning("the link to %s is lost: still trying", name, extra=about("link-broken"))
+                _log.warning("the link to %s is lost: still trying", name, extra=about("link_lost"))
             else:
-                _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link-broken"))
+                _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link_lost"))
 
     def _is_linked(self, endpoint: str, dialled: Sequence[str]) -> bool:
         """Return whether one of these is the endpoint; hosts only matter if several endpoints have its port."""
@@ -124,7 +124,7 @@ def _filter(read: int, stdout: int) -> None:
             found = _REFUSED.search(_COLOUR.sub("", line.decode(errors="replace")))
             if found is not None:
                 reason = next((text for part, text in _REASONS.items() if part in found[1]), found[1])
-                _log.warning("a client is refused: %s", reason, extra=about("client-refused", reason=reason))
+                _log.warning("a client is refused: %s", reason, extra=about("client_refused", reason=reason))
                 continue
             with suppress(OSError):  # the reader of stdout is gone
                 os.write(stdout, line)

@@ -134,7 +134,7 @@ def entity_name(entity: zenoh.EntityGlobalId) -> str:
 
 
 @contextmanager
-def while_open() -> Iterator[None]:
+def translate_zenoh_errors() -> Iterator[None]:
     """Translate Zenoh's errors: to ClosedError if the session was closed, else to NedbusError with Zenoh's reason."""
     try:
         yield
@@ -143,7 +143,7 @@ def while_open() -> Iterator[None]:
 
 
 def translate_error(error: zenoh.ZError) -> NedbusError:
-    """Return the error that `while_open` raises for an error of Zenoh's.
+    """Return the error that `translate_zenoh_errors` raises for an error of Zenoh's.
 
     Decides by the text: `Session.is_closed` would wait for a lock of Zenoh's without releasing the GIL.
     """

@@ -13,7 +13,7 @@ import zenoh
 
 from nedbus_msgs import ANY
 
-from .session import Session, while_open
+from .session import Session, translate_zenoh_errors
 
 Verdict = Literal["allowed", "denied", "unknown"]
 
@@ -38,7 +38,7 @@ def probe_writes(
             missing.pop(str(sample.key_expr), None)
         return not missing
 
-    with while_open():
+    with translate_zenoh_errors():
         room = len(keys) + _SPARE
         subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(room))
         # Dropped rather than undeclared: `undeclare` waits without releasing the GIL.

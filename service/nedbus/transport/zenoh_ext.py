@@ -14,7 +14,7 @@ from typing import Final
 import zenoh
 
 from .queries import MAX_ANSWERS, ask
-from .session import RawSample, Session, entity_name, while_open
+from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
 Heartbeats = dict[tuple[str, str], int]  # newest sequence number, by key of a stream and name of its publisher
 
@@ -37,7 +37,7 @@ def heartbeat_payload(published: int) -> bytes:
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
     """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
-    with while_open():
+    with translate_zenoh_errors():
         key = f"{key_expr}/@adv/pub/**"
         subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_MAX_HEARTBEATS))
 

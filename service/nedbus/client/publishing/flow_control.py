@@ -135,7 +135,7 @@ class FlowControl:
         if self._wait(published, self._window, read=True, timeout=_TRICKLE_PERIOD):
             return
         if not self._logged:
-            _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow-reader"))
+            _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow_reader"))
         self._logged = True
         self._wait(published, _MAX_UNACKNOWLEDGED, read=True, timeout=math.inf)
 

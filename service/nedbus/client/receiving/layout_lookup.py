@@ -175,7 +175,7 @@ class LayoutLookup:
             return False
         self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
         text = "%s is not installed here: using the publisher's description"
-        _log.info(text, name, extra=about("described", reason=f"hash {identity}"))
+        _log.info(text, name, extra=about("runtime_definition", reason=f"hash {identity}"))
         return True
 
     def _make_room(self, size: int) -> bool:
@@ -195,7 +195,7 @@ class LayoutLookup:
             return False
         self._newer[name] = {**newer, number: tuple(fields)}
         ignored = ", ".join(field for field in fields if field not in definition.types)[:_MAX_TEXT] or "nothing"
-        extra = about("newer-layout")
+        extra = about("newer_layout")
         _log.warning("layout %d of %s is newer than this reader; not read: %s", number, name, ignored, extra=extra)
         return True
 
