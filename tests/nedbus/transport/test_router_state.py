@@ -289,7 +289,7 @@ def test_client_of_a_full_router(tmp_path: Path) -> None:
     unicast = {"unicast": {"max_sessions": 1}}
     with open_router(config_file=write_config(tmp_path, endpoint, transport=unicast)):
         with open_client([endpoint], timeout=5.0):
-            with pytest.raises(nedbus.ConnectError, match=r"no room for more sessions .*'nedbus doctor'"):
+            with pytest.raises(nedbus.ConnectError, match=r"at its session limit .*'nedbus doctor'"):
                 nedbus.connect(endpoint, timeout=0.1)
             *_, finding = check_endpoint(endpoint, None)
             assert (finding.state, "max_sessions" in finding.advice) == ("wrong", True)
