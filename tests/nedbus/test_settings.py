@@ -193,12 +193,12 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("ca", "certificate", "key", "reason"),
     [
-        ("wing.key", "wing.crt", "wing.key", "wing.key holds a private key, where a certificate is needed: check"),
-        ("ca.crt", "wing.key", "wing.crt", "wing.key holds a private key, where a certificate is needed: check"),
-        ("ca.crt", "wing.crt", "ca.crt", "ca.crt holds a certificate, where a private key is needed: check"),
+        ("wing.key", "wing.crt", "wing.key", "wing.key contains a private key, but a certificate is required: check"),
+        ("ca.crt", "wing.key", "wing.crt", "wing.key contains a private key, but a certificate is required: check"),
+        ("ca.crt", "wing.crt", "ca.crt", "ca.crt contains a certificate, but a private key is required: check"),
         ("ca.crt", "wing.crt", "tail.key", "tail.key is not the key of "),
-        ("ca.crt", "empty", "wing.key", "empty holds nothing, where a certificate is needed: 'nedbus pki' makes"),
-        ("text", "wing.crt", "wing.key", "text holds no PEM, where a certificate is needed"),
+        ("ca.crt", "empty", "wing.key", "empty is empty, but a certificate is required: create one with 'nedbus pki'"),
+        ("text", "wing.crt", "wing.key", "text is not PEM, but a certificate is required"),
         ("ca.crt", "cut", "wing.key", "is damaged, or the key has a password"),
         ("gone", "wing.crt", "wing.key", "gone cannot be read"),
         ("ca.crt", ".", "wing.key", "cannot be read"),
@@ -218,12 +218,12 @@ def test_certificate_that_is_refused_is_explained(keys: Path, tmp_path: Path) ->
     tls = Tls(keys / "ca.crt", keys / "wing.crt", keys / "wing.key")
     assert tls.explain() is None
     assert Tls(keys / "ca.crt").explain() is None
-    assert "not the certificate of an authority" in str(Tls(keys / "wing.crt").explain())
+    assert "not a CA certificate" in str(Tls(keys / "wing.crt").explain())
     old = Tls(keys / "ca.crt", keys / "old.crt", keys / "old.key")
-    wait_for(lambda: "old.crt or its authority has expired" in str(old.explain()), what="its end")
+    wait_for(lambda: "old.crt or its CA has expired" in str(old.explain()), what="its end")
     foreign = Tls(other / "ca.crt", keys / "wing.crt", keys / "wing.key")
-    assert "wing.crt is not signed by the authority in tls_ca" in str(foreign.explain())
-    with pytest.raises(ConnectError, match=r"wing\.crt is not signed by the authority"):
+    assert "wing.crt is not signed by the CA in tls_ca" in str(foreign.explain())
+    with pytest.raises(ConnectError, match=r"wing\.crt is not signed by the CA"):
         nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=foreign)
 
 

@@ -1,4 +1,4 @@
-"""The transport on Zenoh: sessions, routers, TLS, queries, and the keys of rmw_zenoh."""
+"""Zenoh transport: sessions, routers, TLS, queries, liveliness tokens, and the keys of rmw_zenoh."""
 
 from .alive_tokens import AliveTokens, alive_keys
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint

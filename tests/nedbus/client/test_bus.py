@@ -321,7 +321,7 @@ def test_answers_that_are_too_many_are_left_out(
     many = {f"evil{number:02}": status for number in range(50)}
     with answering(raw, "nedbus/@service/*/status", services_of(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
-    assert "nedbus/@service/*/status: 40 answers left out, beyond the limits of a query" in caplog.messages
+    assert "nedbus/@service/*/status: dropped 40 replies beyond the limits of a query" in caplog.messages
 
 
 def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) -> None:

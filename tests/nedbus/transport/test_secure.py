@@ -299,8 +299,8 @@ def test_refused_clients_are_logged(
     assert "refused" not in router.err
 
     for name, ca, reason, advice in (
-        ("foreign/reader", "ca.crt", "its certificate is signed by another authority", "is not signed by the autho"),
-        ("expired", "ca.crt", "its certificate has expired", "expired.crt or its authority has expired"),
+        ("foreign/reader", "ca.crt", "its certificate is signed by another CA", "is not signed by the CA"),
+        ("expired", "ca.crt", "its certificate has expired", "expired.crt or its CA has expired"),
         (None, "ca.crt", "it sent no certificate", "no certificate given: "),
         ("reader", "foreign/ca.crt", "it does not accept the certificate of this router", "is not signed by"),
     ):
