@@ -224,8 +224,8 @@ def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path) -> N
     before = sorted(pki.iterdir())
     (tmp_path / "taken").mkdir()
     for vehicle, output, router, error, reason in (
-        ("7", tmp_path / "taken", routers[0], nedbus.errors.PkiError, "exists: it is not overwritten"),
-        ("1", tmp_path / "new", routers[0], nedbus.errors.PkiError, "exists: it is not overwritten"),
+        ("7", tmp_path / "taken", routers[0], nedbus.errors.PkiError, "exists and is not overwritten"),
+        ("1", tmp_path / "new", routers[0], nedbus.errors.PkiError, "exists and is not overwritten"),
         ("7", Path("/proc/nowhere/new"), routers[0], nedbus.errors.PkiError, "cannot create"),
         ("7", tmp_path / "new", "tcp/10.0.0.1:7447", nedbus.ConfigError, "does not use TLS"),
         ("../7", tmp_path / "new", routers[0], AddressError, "vehicle"),
@@ -247,7 +247,7 @@ def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path) -> N
     assert not list(tmp_path.glob(".*"))
     again = run_command("pki", "enroll", str(pki), "7", "--router", routers[0], "-o", str(tmp_path / "other"))
     assert again.exit_code == 1
-    assert "vehicle-7.crt exists: it is not overwritten" in again.err
+    assert "vehicle-7.crt exists and is not overwritten" in again.err
 
 
 def test_renewed_certificate_works_beside_the_old_one(run_router: RunRouter, file: Path, pki: Path, join: Join) -> None:
@@ -444,7 +444,7 @@ def test_rules_are_written_from_a_list(file: Path, pki: Path, tmp_path: Path) ->
             write_access_rules(file, vehicles, prefix=prefix)
     assert file.read_bytes() == before
     file.write_text(CONFIG.read_text().replace("// END vehicles", "", 1))
-    for path, reason in ((file, "2 of 3 pairs of lines"), (Path("gone.json5"), "cannot be read")):
+    for path, reason in ((file, "2 of 3 pairs of marker lines"), (Path("gone.json5"), "cannot be read")):
         with pytest.raises(nedbus.ConfigError, match=reason):
             write_access_rules(path, ["1"])
 

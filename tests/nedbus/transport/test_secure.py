@@ -268,7 +268,7 @@ def test_pki_commands_never_overwrite(tmp_path: Path) -> None:
         assert "PRIVATE" not in made.out + made.err
         again = run_command("pki", *arguments)
         assert again.exit_code == 1
-        assert "it is not overwritten" in again.err
+        assert "is not overwritten" in again.err
         assert key.read_bytes() == before
     assert run_command("pki", "cert", str(folder), "../evil").exit_code == 1
 
@@ -454,7 +454,7 @@ def test_only_access_rules_are_a_refusal(
 ) -> None:
     """A router with older rules, without any, that is away, or that is frozen, refuses nobody."""
     timings.probe_open, timings.probe = 0.1, 0.5
-    monkeypatch.setattr(f"{PERMISSION}_BELIEVED", 1)
+    monkeypatch.setattr(f"{PERMISSION}_CONFIRMED", 1)
     file, endpoint = configured
     shipped = file.read_text()
     file.write_text(shipped.replace("@doctor", "@probe"))
