@@ -320,7 +320,7 @@ def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixtu
 
 
 def test_live_stream_is_published_until_stale() -> None:
-    """A vehicle is published from its first message, withdrawn after 3 s of silence, and republished when it returns."""
+    """A vehicle is published from its first message, withdrawn after 3 s of silence, and republished on return."""
     clock = FakeClock(stop_at=100.0)
     source = FakeLive(clock, [at(0.0), 1.0, at(0.0, TWO), 3.5, at(0.0), 1.0])
     harness = run(source, clock)
