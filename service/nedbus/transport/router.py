@@ -105,7 +105,7 @@ def allow_sessions(sessions: int) -> None:
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < sessions + _OTHER_FILES:
         text = (
-            "the limit of %s open files has room for about %s sessions, but max_sessions is %s:"
+            "the limit of %s open files allows about %s sessions, but max_sessions is %s:"
             " raise the limit (ulimit -n, LimitNOFILE=)"
         )
         _log.warning(text, soft, max(0, soft - _OTHER_FILES), sessions, extra=about("router"))
