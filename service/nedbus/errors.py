@@ -60,9 +60,8 @@ class AddressInUseError(NedbusError, ValueError):
 
 
 class ConfigError(NedbusError, ValueError):
-    """Raised for an invalid setting.
+    """Raised for an invalid setting; `where` is the flag, the environment variable, or file, line and column.
 
-    `where`: the flag, the environment variable, or file, line and column.
     `key`: the invalid option, if the setting is a source.
     """
 

@@ -241,7 +241,6 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
 
 
 def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
-    """Return the origin of a setting: the name of the flag, the environment variable or the file."""
     if name in flags:
         return name
     return _variable(name) if _from_environment(name) else str(path or name)

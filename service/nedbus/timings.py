@@ -59,4 +59,3 @@ class Timings:
 
 
 TIMINGS: Final = Timings()
-"""The timings of this process."""

@@ -239,7 +239,6 @@ class Daemon:
         return len(ordered) - len(new)
 
     def _make_plan(self, settings: Settings) -> list[Planned]:
-        """Open the sources of these settings; raise the first ConfigError, with its location."""
         plan, mistakes = plan_sources(settings, self.endpoints)
         if mistakes:
             raise mistakes[0]

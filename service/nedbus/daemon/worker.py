@@ -95,14 +95,14 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._turn: float | None = None  # start of the current message; None while waiting
+        self._message_start: float | None = None  # of publishing the current one; None while waiting
         self._release = False
         self._warned: set[str] = set()
 
     @property
     def busy(self) -> float:
         """Time spent on the current message [s]; 0 while opening a source or waiting for the next message."""
-        since = self._turn
+        since = self._message_start
         return 0.0 if since is None else self._clock.now() - since
 
     @property
@@ -182,7 +182,7 @@ class Worker:
                 self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
                 continue
             finally:
-                self._turn = None
+                self._message_start = None
             if not self._retry:
                 self._end("failed", self._error)
                 return
@@ -221,9 +221,9 @@ class Worker:
             if self._clock.is_set():
                 return
             # A lossless publisher may wait for its readers.
-            self._turn = None if speed is None else self._clock.now()
+            self._message_start = None if speed is None else self._clock.now()
             self._output.publish_replay(message, lossless=speed is None)
-            self._turn = None
+            self._message_start = None
             self._done += 1
         self._warn(run)
         self._error = run.damage
@@ -239,7 +239,7 @@ class Worker:
         with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # live sources are generators
             next_poll = 0.0
             for item in items:
-                now = self._turn = self._clock.now()
+                now = self._message_start = self._clock.now()
                 if self._clock.is_set():
                     return
                 if isinstance(item, Rejection):

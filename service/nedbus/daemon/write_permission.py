@@ -1,8 +1,7 @@
 """Write permission at the router, whose access rules drop messages without an error at the sender.
 
 Only services with a certificate are checked, because access rules refer to certificates. Each check briefly opens a
-second session: shortly after the link is up or a new vehicle appears, then every 10 minutes, as rules change only when
-a router restarts.
+second session: soon after the link is up or a vehicle appears, then rarely, as rules change only at a router restart.
 """
 
 from __future__ import annotations

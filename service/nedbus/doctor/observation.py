@@ -22,9 +22,9 @@ from nedbus.transport import (
     Session,
     Verdict,
     alive_keys,
-    ask_routers,
     px4_publishers_key_expr,
     query,
+    query_routers,
     translate_zenoh_errors,
 )
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
@@ -80,7 +80,7 @@ class Observation:
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-        self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
+        self.routers = query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
         self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2

@@ -12,21 +12,21 @@ import zenoh
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
-from .queries import MAX_ANSWER_BYTES, MAX_ANSWERS, Answers, wait_for_answers, zenoh_timeout
+from .queries import MAX_QUERY_BYTES, MAX_REPLIES, Replies, wait_for_replies, zenoh_timeout
 from .session import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 131_072  # replies; large, as Zenoh holds its session lock while it waits for a free slot
 _MAX_CHANGES: Final = 16_384  # queued changes, more than the tokens that are kept
-_MAX_KEY_LENGTH: Final = MAX_ANSWER_BYTES // MAX_ANSWERS
+_MAX_KEY_LENGTH: Final = MAX_QUERY_BYTES // MAX_REPLIES
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
-    replies = wait_for_answers([_ask(session, key_expr, timeout)])
-    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_ANSWERS]
+    replies = wait_for_replies([_query_tokens(session, key_expr, timeout)])
+    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_REPLIES]
 
 
 class AliveTokens:
@@ -43,7 +43,7 @@ class AliveTokens:
         self._keys: set[str] = set()
         self._unseen: set[str] = set()  # tokens of the previous subscription, not yet listed by this one
         self._retry = math.inf  # monotonic time from which tokens beyond the limit are listed [s]
-        self._probe: Answers | None = None
+        self._probe: Replies | None = None
         self._subscribe()
 
     @property
@@ -67,12 +67,12 @@ class AliveTokens:
             self._probe.take()
             is_listed = self._probe.ended and not self._probe.failed
             if self._probe.ended:
-                self._probe = self._ask_probe() if self._probe.failed else None
+                self._probe = self._send_probe() if self._probe.failed else None
         changes: list[tuple[str, bool]] = []
         with suppress(zenoh.ZError):  # the session is closed
             while len(changes) < _MAX_CHANGES and (sample := self._subscriber.handler.try_recv()) is not None:
                 changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-        is_retry_due = len(self._keys) < MAX_ANSWERS and time.monotonic() >= self._retry
+        is_retry_due = len(self._keys) < MAX_REPLIES and time.monotonic() >= self._retry
         if len(changes) == _MAX_CHANGES or is_retry_due:  # changes were dropped
             self.undeclare()
             self._subscribe()
@@ -86,29 +86,29 @@ class AliveTokens:
         with translate_zenoh_errors():
             declare = self._session.liveliness().declare_subscriber
             self._subscriber = declare(self._key_expr, zenoh.handlers.RingChannel(_MAX_CHANGES), history=True)
-        self._probe, self._unseen, self._retry = self._ask_probe(), self._keys.copy(), math.inf
+        self._probe, self._unseen, self._retry = self._send_probe(), self._keys.copy(), math.inf
 
-    def _ask_probe(self) -> Answers:
+    def _send_probe(self) -> Replies:
         key = re.sub(r"\*\*|\$?\*", "-", self._key_expr)  # access rules that allow the expression allow this key
-        return _ask(self._session, key, _PROBE_TIMEOUT)
+        return _query_tokens(self._session, key, _PROBE_TIMEOUT)
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""
         if (key in self._keys) == alive or len(key) > _MAX_KEY_LENGTH:
             return False
-        if alive and len(self._keys) >= MAX_ANSWERS:
+        if alive and len(self._keys) >= MAX_REPLIES:
             if self._retry == math.inf:
                 text = "%s: more than %d liveliness tokens: some vehicles are missing"
-                _log.warning(text, self._key_expr, MAX_ANSWERS, extra=about("incomplete"))
+                _log.warning(text, self._key_expr, MAX_REPLIES, extra=about("incomplete"))
             self._retry = time.monotonic() + TIMINGS.tokens_retry
             return False
         (self._keys.add if alive else self._keys.remove)(key)
         return True
 
 
-def _ask(session: Session, key_expr: str, timeout: float) -> Answers:
+def _query_tokens(session: Session, key_expr: str, timeout: float) -> Replies:
     """Query matching tokens without waiting; each successful reply is one token."""
     timeout = zenoh_timeout(timeout)
     with translate_zenoh_errors():
-        answers = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_PENDING), timeout=timeout)
-    return Answers(answers, timeout=timeout)
+        replies = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_PENDING), timeout=timeout)
+    return Replies(replies, timeout=timeout)

@@ -18,18 +18,17 @@ from .session import RawSample, Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-MAX_ANSWERS: Final = 10_000
+MAX_REPLIES: Final = 10_000
 """Replies accepted per query; well-behaved peers send fewer."""
 
-MAX_ANSWER_BYTES: Final = 2**26
+MAX_QUERY_BYTES: Final = 2**26
 """Payload and key bytes accepted per query."""
 
-_MAX_PENDING: Final = 1024  # replies in the channel
 _GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
 _PAUSES: Final = (0.0005, 0.01)  # s between polls for replies: first and longest pause
 
 
-class Answers:
+class Replies:
     """The replies to one query, polled by the thread that sent it."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
@@ -42,7 +41,7 @@ class Answers:
         """Return the replies received since the last call."""
         taken: list[zenoh.Reply] = []
         try:
-            while len(taken) < MAX_ANSWERS and (reply := self._handler.try_recv()) is not None:
+            while len(taken) < MAX_REPLIES and (reply := self._handler.try_recv()) is not None:
                 taken.append(reply)
                 self.failed |= reply.ok is None
             if time.monotonic() > self._end:
@@ -52,16 +51,16 @@ class Answers:
         return taken
 
 
-def ask(session: Session, selector: str, *, timeout: float, room: int = _MAX_PENDING, **options: Any) -> Answers:
-    """Send a query to all matching queryables without waiting; the session blocks while `room` replies are pending.
+def send_query(session: Session, selector: str, *, timeout: float, capacity: int = 1024, **options: Any) -> Replies:
+    """Query all matching queryables without waiting; the session blocks while `capacity` replies are pending.
 
     `options`: further arguments of `zenoh.Session.get`, such as `priority`.
     """
     timeout = zenoh_timeout(timeout)
     options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
     with translate_zenoh_errors():
-        answers = session.get(selector, zenoh.handlers.FifoChannel(room), timeout=timeout, **options)
-    return Answers(answers, timeout=timeout)
+        replies = session.get(selector, zenoh.handlers.FifoChannel(capacity), timeout=timeout, **options)
+    return Replies(replies, timeout=timeout)
 
 
 def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]:
@@ -71,9 +70,10 @@ def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]
     """
     kept: list[RawSample] = []
     size = dropped = 0
-    for sample in filter(None, (reply.ok for reply in wait_for_answers([ask(session, selector, timeout=timeout)]))):
+    replies = wait_for_replies([send_query(session, selector, timeout=timeout)])
+    for sample in filter(None, (reply.ok for reply in replies)):
         size += len(sample.payload) + len(str(sample.key_expr))
-        if size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
+        if size > MAX_QUERY_BYTES or len(kept) >= MAX_REPLIES:
             dropped += 1
         else:
             kept.append(sample)
@@ -83,11 +83,11 @@ def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]
     return kept
 
 
-def wait_for_answers(queries: Sequence[Answers]) -> Iterator[zenoh.Reply]:
+def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:
     """Yield replies as they arrive, until all queries have ended."""
     pause, longest = _PAUSES
-    while pending := [answers for answers in queries if not answers.ended]:
-        taken = [reply for answers in pending for reply in answers.take()]
+    while pending := [replies for replies in queries if not replies.ended]:
+        taken = [reply for replies in pending for reply in replies.take()]
         yield from taken
         if not taken:
             time.sleep(pause)

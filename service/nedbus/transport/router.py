@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 _OTHER_FILES: Final = 100  # open files other than sessions: 21 of a router, plus sources and HTTP clients of a service
 _ADMIN_KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
-_MAX_ANSWER_BYTES: Final = 2**20  # a reply with about 5,700 sessions
+_MAX_STATE_BYTES: Final = 2**20  # a reply with about 5,700 sessions
 _MAX_SESSIONS: Final = 2**32  # largest limit accepted from a router
 _MAX_ROUTERS: Final = 1000  # routers returned, as any peer may claim to be one
 
@@ -205,15 +205,15 @@ class RouterState:
         return None if self.max_sessions is None else self.sessions / self.max_sessions
 
 
-def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
+def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     """Return the state of each router that replies within `timeout` seconds, sorted by id.
 
     A router is missing if its admin space is off or denied, or if its reply exceeds the message size of this session:
     2**18 bytes for a client, about 1,400 sessions.
     """
-    answers = query(session, "@/*/router", timeout=timeout)
-    small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
-    states = filter(None, (read_state(str(answer.key_expr), answer.payload.to_bytes()) for answer in small))
+    replies = query(session, "@/*/router", timeout=timeout)
+    small = (reply for reply in replies if len(reply.payload) <= _MAX_STATE_BYTES)
+    states = filter(None, (read_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small))
     by_zid = {state.zid: state for state in states}
     return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
 
@@ -222,13 +222,13 @@ def read_state(key: str, payload: bytes) -> RouterState | None:
     """Parse a reply of the admin space; return None if it is malformed, as any peer may reply."""
     found = _ADMIN_KEY.fullmatch(key)
     try:
-        answer = json.loads(payload)
+        state = json.loads(payload)
     except (ValueError, RecursionError):
         return None
-    sessions = answer.get("sessions") if isinstance(answer, dict) else None
+    sessions = state.get("sessions") if isinstance(state, dict) else None
     if found is None or not isinstance(sessions, list):
         return None
-    metadata = answer.get("metadata")
+    metadata = state.get("metadata")
     limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
     is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # not a bool
     return RouterState(found[1], len(sessions), limit if is_limit else None)

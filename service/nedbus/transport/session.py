@@ -106,10 +106,10 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # For most failures Zenoh reports only "Unable to connect".
-    known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
-    if not known and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
-        known = "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
-    raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
+    cause = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
+    if not cause and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
+        cause = "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
+    raise ConnectError(endpoints, timeout, cause or ("" if "Unable to connect" in reason else reason))
 
 
 def random_backoff() -> dict[str, float]:

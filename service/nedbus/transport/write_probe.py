@@ -39,8 +39,8 @@ def probe_writes(
         return not missing
 
     with translate_zenoh_errors():
-        room = len(keys) + _SPARE
-        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(room))
+        capacity = len(keys) + _SPARE
+        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(capacity))
         # Deleted rather than undeclared, as `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))
         # Zenoh's stubs declare a bool, but it is an object, which is always true.

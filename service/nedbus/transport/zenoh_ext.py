@@ -13,7 +13,7 @@ from typing import Final
 
 import zenoh
 
-from .queries import MAX_ANSWERS, ask
+from .queries import MAX_REPLIES, send_query
 from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
 Heartbeats = dict[tuple[str, str], int]  # newest sequence number by key and publisher
@@ -70,18 +70,19 @@ class RetransmitRequest:
     def __init__(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> None:
         self._key, self._publisher, self._numbers = key, publisher, numbers
         selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
-        room = min(len(numbers), MAX_ANSWERS) + _SPARE
-        self._answers = ask(session, selector, timeout=timeout, room=room, accept_replies=zenoh.ReplyKeyExpr.ANY)
+        capacity = min(len(numbers), MAX_REPLIES) + _SPARE
+        any_key = zenoh.ReplyKeyExpr.ANY
+        self._replies = send_query(session, selector, timeout=timeout, capacity=capacity, accept_replies=any_key)
 
     @property
     def ended(self) -> bool:
         """True once all replies were taken, or the timeout has passed."""
-        return self._answers.ended
+        return self._replies.ended
 
     def take(self) -> dict[int, RawSample]:
         """Return the samples received since the last call, by sequence number."""
         samples: dict[int, RawSample] = {}
-        for sample in filter(None, (reply.ok for reply in self._answers.take())):
+        for sample in filter(None, (reply.ok for reply in self._replies.take())):
             info = sample.source_info
             if info is None or info.source_sn not in self._numbers or str(sample.key_expr) != self._key:
                 continue

@@ -25,7 +25,7 @@ from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
-from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, read_router_config, router
+from nedbus.transport import RouterState, Session, open_client, open_router, query_routers, read_router_config, router
 from nedbus.transport.router import allow_sessions, read_state
 from tests.peers.certificates import CONFIG
 from tests.peers.certificates import write_config as write_shipped
@@ -84,7 +84,7 @@ def router_finding(endpoint: str, seen: str) -> Finding:
 
 def router_states(endpoint: str) -> list[RouterState]:
     with open_client([endpoint], timeout=5.0) as session:
-        return ask_routers(session, timeout=5.0)
+        return query_routers(session, timeout=5.0)
 
 
 def test_every_router_of_a_mesh_reports_its_state(endpoint: str) -> None:
@@ -122,7 +122,7 @@ def test_zenohd_reports_the_limit_of_the_shipped_file(start: Start, tmp_path: Pa
     where = free_endpoint()
     start_zenohd(start, "-c", str(write_shipped(tmp_path, tmp_path / "router.json5", where)))
     with open_client([where], timeout=DEADLINE) as session:
-        assert [(state.sessions, state.max_sessions) for state in ask_routers(session, timeout=5.0)] == [(1, 1000)]
+        assert [(state.sessions, state.max_sessions) for state in query_routers(session, timeout=5.0)] == [(1, 1000)]
 
 
 def test_malformed_router_file_raises(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_invalid_session_limit_is_unknown(limit: object) -> None:
 
 def test_large_and_many_state_replies_are_bounded(endpoint: str, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     """A peer that pretends to be many routers, or one with a huge session list, cannot exhaust memory."""
-    (real,) = ask_routers(raw, timeout=5.0)
+    (real,) = query_routers(raw, timeout=5.0)
 
     def answer(query: zenoh.Query) -> None:
         for number in range(20):
@@ -170,10 +170,10 @@ def test_large_and_many_state_replies_are_bounded(endpoint: str, raw: Session, m
 
     with open_client([endpoint], timeout=DEADLINE) as impostor:
         impostor.declare_queryable("@/*/router", answer)
-        wait_for(lambda: len(ask_routers(raw, timeout=5.0)) == 21, what="the replies of the impostor")
-        assert real.zid in {state.zid for state in ask_routers(raw, timeout=5.0)}
+        wait_for(lambda: len(query_routers(raw, timeout=5.0)) == 21, what="the replies of the impostor")
+        assert real.zid in {state.zid for state in query_routers(raw, timeout=5.0)}
         monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
-        assert len(ask_routers(raw, timeout=5.0)) == 5
+        assert len(query_routers(raw, timeout=5.0)) == 5
 
 
 def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None:
