@@ -2,4 +2,4 @@
 
 from .daemon import Daemon, plan_sources
 from .output import TOO_MANY
-from .worker import STATES, Planned, SourceMeasures
+from .worker import STATES, PlannedSource, SourceMeasures

@@ -19,7 +19,7 @@ from nedbus.sources import ReplaySource, Source, parse_source
 from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
-from .worker import Planned, SourceMeasures, Worker, stop_workers
+from .worker import PlannedSource, SourceMeasures, Worker, stop_workers
 from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
@@ -31,9 +31,9 @@ _RELOADABLE: Final = frozenset({"source", "vehicle"})  # settings that a reload 
 _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 
-def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:
+def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[PlannedSource], list[ConfigError]]:
     """Return the sources of a service with these endpoints, and the configuration errors, at most one per source."""
-    plan: list[Planned] = []
+    plan: list[PlannedSource] = []
     mistakes: list[ConfigError] = []
     if not settings.source and "source" not in settings.left_out:
         reason = "no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"
@@ -54,7 +54,7 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
         except ConfigError as exc:
             mistakes.append(locate_source(settings, index, exc))
         else:
-            plan.append(Planned(index, spec.text, settings.vehicle, source))
+            plan.append(PlannedSource(index, spec.text, settings.vehicle, source))
     if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
         reason = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
         mistakes.append(ConfigError("until_done", reason))
@@ -238,7 +238,7 @@ class Daemon:
         self._workers = ordered
         return len(ordered) - len(new)
 
-    def _make_plan(self, settings: Settings) -> list[Planned]:
+    def _make_plan(self, settings: Settings) -> list[PlannedSource]:
         plan, mistakes = plan_sources(settings, self.endpoints)
         if mistakes:
             raise mistakes[0]

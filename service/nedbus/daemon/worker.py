@@ -32,7 +32,7 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedSource:
     """A configured source, number `index` in the settings; a reload keeps it running if text and vehicle are equal."""
 
     index: int = field(compare=False)
@@ -72,7 +72,7 @@ class Worker:
 
     def __init__(
         self,
-        planned: Planned,
+        planned: PlannedSource,
         registry: PublisherRegistry,
         *,
         router: Session | None = None,

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from nedbus.client import PublisherRegistry
-from nedbus.daemon import Planned
+from nedbus.daemon import PlannedSource
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.events import Account
@@ -142,7 +142,7 @@ class Harness:
         self.ends = 0
         self.registry = FakeRegistry(clock)
         self.worker = Worker(
-            Planned(
+            PlannedSource(
                 0, "ulog:flight.ulg", "1", source.source if isinstance(source, FakeReplay) else cast("Source", source)
             ),
             cast("PublisherRegistry", self.registry),

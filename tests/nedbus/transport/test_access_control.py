@@ -449,7 +449,7 @@ def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timing
         wait_for(lambda: check(permission) == {"1": False, "2": True}, what="the denied vehicle")
 
 
-def test_unreachable_or_open_router_is_no_refusal(
+def test_unreachable_or_open_router_is_not_a_refusal(
     configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """A router with older rules, without access control, stopped or frozen is never reported as a refusal."""
