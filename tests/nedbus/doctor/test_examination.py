@@ -448,7 +448,7 @@ def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timi
     for files, reason in (
         ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
-        ({"tls_certificate": pki / "reader.crt"}, "not the authority to trust"),
+        ({"tls_certificate": pki / "reader.crt"}, "not the CA to trust"),
     ):
         found(look(secure, tls=files), "certificate", "wrong", reason)
 

@@ -153,7 +153,7 @@ class RateLimit(logging.Filter):
         with self._lock:
             for (_, event, _), bucket in self._buckets.items():
                 if bucket.left_out and is_due(bucket):
-                    about, args = About("left-out", count=bucket.left_out, of=event), (bucket.left_out,)
+                    about, args = About("suppressed", count=bucket.left_out, of=event), (bucket.left_out,)
                     reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
                     bucket.left_out = 0
         for report in reports:

@@ -91,7 +91,7 @@ def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
 
 def test_incomplete_list_fails(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A list that lacks a vehicle shows the others, a warning, and exits with 1."""
-    monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 1)
+    monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1
