@@ -66,8 +66,7 @@ class Background:
     def _read_image(self, path: Path) -> None:
         from PIL import Image
 
-        suffixes = _WORLD_FILES[path.suffix.lower()], ".wld"  # GDAL writes .wld
-        worlds = [path.with_suffix(suffix) for suffix in suffixes]
+        worlds = [path.with_suffix(each) for each in (_WORLD_FILES[path.suffix.lower()], ".wld")]  # GDAL writes .wld
         world = next((each for each in worlds if each.exists()), None)
         if world is None:
             raise ValueError(f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES")

@@ -69,8 +69,7 @@ class Map:
             frame = [[middle - half, middle + half] for middle in focused[0][1][:2]]
         replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
         labels = self._labels(placed, chosen, frame)
-        marks = [self._mark(each, position, labels.get(each.vehicle)) for each, position in placed]
-        replace(self.marks, marks)
+        replace(self.marks, [self._mark(each, position, labels.get(each.vehicle)) for each, position in placed])
         self.shown = [each.vehicle for each, _ in placed]
         ephs = [each.main.stream.last.message.eph for each, _ in focused if each.main.stream.last is not None]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0

@@ -307,7 +307,7 @@ def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
             wait_for(
-                lambda: " s late: ROS 2 would take them for the current estimate" in bridge.err, what="the recovery"
+                lambda: " s late: ROS 2 nodes would use them as current" in bridge.err, what="the recovery"
             )
             last = len(published)
             wait_for(lambda: has_received(last), what="what is current")
@@ -346,7 +346,7 @@ def test_topic_of_another_node_is_left_to_it(
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
-    left, published = f"left to node px4_0001, which already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
+    left, published = f"is not published: node px4_0001 already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
     run_bridge(layout="1.14")
     wait_for(lambda: left in caplog.text, what="the warning")
     assert published not in caplog.text

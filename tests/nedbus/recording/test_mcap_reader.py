@@ -80,14 +80,14 @@ def test_own_fields_of_a_bag_are_left_out_and_named(tmp_path: Path, where: str) 
         rest, text = second.split("\n", 1)
         text = f"{first}uint64 timestamp_sample{rest}\n{own}{text}"
         path = write_bag(tmp_path / "a.mcap", definition=text, change=add_in_middle)
-    left_out = f"{TOPIC}: wind_east, wind_north left out: not in any VehicleLocalPosition that nedbus knows"
+    left_out = f"{TOPIC}: wind_east, wind_north left out: unknown to nedbus in VehicleLocalPosition"
     assert_whole(path, warnings=(left_out,))
 
 
 def test_definition_of_another_message_is_refused(tmp_path: Path) -> None:
     """A definition that lacks fields of every release, or has them with other types, names these fields."""
     text = message_definition("1.16").replace("float32 x ", "float64 x ").replace("float32 y ", "float32 y2 ")
-    with pytest.raises(SourceError, match=r"its definition of x, y is not that of any PX4 release"):
+    with pytest.raises(SourceError, match=r"its definition of x, y matches no PX4 release"):
         nedbus.read(write_bag(tmp_path / "a.mcap", definition=text))
 
 
@@ -212,10 +212,10 @@ def bag_in_sqlite(path: Path) -> None:
     [
         (lambda path: path.write_bytes(b"ULogKey\x01" + bytes(100)), "an encrypted log: decrypt it"),
         (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "a zip archive: unpack it"),
-        (lambda path: path.write_bytes(b"\x1f\x8b" + bytes(100)), "compressed by gzip: unpack it"),
+        (lambda path: path.write_bytes(b"\x1f\x8b" + bytes(100)), "a gzip file: unpack it"),
         (lambda path: path.write_bytes(b""), "an empty file"),
-        (lfs, "a pointer of Git LFS .* 'git lfs pull'"),
-        (bag_in_sqlite, "a bag in SQLite: convert it to MCAP with 'ros2 bag convert'"),
+        (lfs, "a Git LFS pointer .* 'git lfs pull'"),
+        (bag_in_sqlite, "an SQLite bag: convert it to MCAP with 'ros2 bag convert'"),
     ],
 )
 def test_files_of_other_kinds_are_named(
@@ -278,16 +278,16 @@ def test_split_bags_are_one_recording(tmp_path: Path, suffix: str) -> None:
     assert run_command("events", str(folder)).exit_code == 0
     (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}    - bag_11.mcap\n")
     assert open_replay(f"mcap:{folder}").damage == (
-        f"{folder}: messages lost to damage: bag_11.mcap of this bag is not there"
+        f"{folder}: messages lost to damage: bag_11.mcap of this bag is missing"
     )
 
 
 def test_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     """A folder has to have MCAP files; one with a bag in SQLite says what to do."""
-    with pytest.raises(SourceError, match=r"no \.mcap file is in this folder"):
+    with pytest.raises(SourceError, match=r"no \.mcap file in this folder"):
         nedbus.read(tmp_path)
     bag_in_sqlite(tmp_path / "a_0.db3")
-    with pytest.raises(SourceError, match="a bag in SQLite: convert it"):
+    with pytest.raises(SourceError, match="an SQLite bag: convert it"):
         nedbus.read(tmp_path)
 
 

@@ -190,7 +190,7 @@ def empty_recording() -> bytes:
         (b"not mcap", "not a readable MCAP file"),
         (b"\x89MCAP0\r\n" + bytes(100), "no message can be read"),
         (bytes(10_000), "not a readable MCAP file"),
-        (empty_recording(), "no messages of PX4 topics: nothing in it is of px4_msgs"),
+        (empty_recording(), "no messages of PX4 topics: no channel has a type of px4_msgs"),
         (None, "no such file"),
     ],
 )

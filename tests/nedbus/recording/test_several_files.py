@@ -90,7 +90,7 @@ def test_file_without_utc_has_no_place_among_others(tmp_path: Path, swarm: list[
     ended = run_command("events", *swarm, str(path))
     assert ended.exit_code == 1
     assert f"nedbus: {path}: no message gives UTC" in ended.err
-    with pytest.raises(SourceError, match=r"d\.ulg: no message gives UTC"):
+    with pytest.raises(SourceError, match=r"d\.ulg: no message provides UTC"):
         nedbus.read([*swarm, path], [VLP])
     assert run_command("events", str(path)).exit_code == 0
 
