@@ -244,9 +244,8 @@ def _check_host(handler: RequestHandler, options: PageOptions) -> None:
     origin = headers.get("Origin", f"//{host}").partition("//")[2]  # "Origin: null" has no host
     is_own = host in options.origins or leads_here(host, local=is_loopback(options.host))
     if not is_own or origin not in (host, *options.origins):
-        raise HTTPError(
-            403, reason=f"host name {(origin if is_own else host)[:100]} is not allowed: add it with --origin"
-        )
+        name = (origin if is_own else host)[:100]
+        raise HTTPError(403, reason=f"host name {name} is not allowed: add it with --origin")
     if headers.get("Sec-Fetch-Site") == "cross-site" and headers.get("Sec-Fetch-Dest") != "document":
         raise HTTPError(403, reason="cross-site request")
 
