@@ -48,7 +48,7 @@ class FoxgloveServer:
 
     Fields are encoded only for channels with a subscriber. A slow client misses the oldest messages.
 
-    Raises ListenError when it cannot listen on the address.
+    Raises ListenError if the address is not available.
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
@@ -71,10 +71,7 @@ class FoxgloveServer:
         self.url = f"ws://{host}:{self._server.port}"
 
     def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
-        """Serve the selected addresses, by default all, until `stop` is set.
-
-        Raises ClosedError if the bus is closed.
-        """
+        """Serve the selected addresses, by default all, until `stop` is set; raise ClosedError if the bus is closed."""
         with self._bus.subscribe_to(selection or Selection()) as subscription:
             next_poll = time.monotonic() + TIMINGS.bridge_poll
             while not stop.is_set():

@@ -46,7 +46,7 @@ class LateFilter:
         self._clocks.pop(address, None)
 
     def report(self) -> str | None:
-        """Return a text about the samples held back since the last report, None without any."""
+        """Return a summary of the samples held back since the last report, or None."""
         if not self._held:
             return None
         first, *others = sorted(self._held)

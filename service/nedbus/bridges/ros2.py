@@ -99,8 +99,7 @@ class Ros2Bridge:
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
 
-        Raises ClosedError if the bus or the session is closed, NedbusError if access control hides the bridge from
-        the observer.
+        Raises ClosedError if the bus or the session is closed, NedbusError if access control hides the bridge.
         """
         key = transport.node_token(self._domain, self._zid, self._node)
         with transport.while_open():

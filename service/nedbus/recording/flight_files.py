@@ -57,10 +57,7 @@ def open_flight(path: Path) -> BinaryIO:
 
 
 def recording_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return the MCAP files of a recording or of a ROS 2 bag folder, in order, and the names of missing files.
-
-    Raises SourceError for a folder without MCAP files.
-    """
+    """Return the MCAP files of a recording or bag folder, in order, and missing ones; raise SourceError without any."""
     if not path.is_dir():
         return [path], []
     found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
@@ -113,7 +110,7 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
 def single_match(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
     """Return the single selected address of a file in a list; raise AddressError for none or more than one.
 
-    The first instance of a topic that only the file defines has an address without instance, which the topic selects.
+    Of a topic that only the file defines, the first instance has no instance number; the plain topic selects it.
     """
     found = matching(path, addresses, selection)
     plain = [address for address in found if address.instance is None]

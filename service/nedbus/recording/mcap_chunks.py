@@ -169,7 +169,7 @@ class ChunkFile:
 
 
 def _own_length(opcode: int, body: bytes, length: int) -> int:
-    """Return the record length that its fields imply, `length` for record types without length fields."""
+    """Return the record length implied by the lengths of its fields; `length` for types without such fields."""
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:

@@ -128,14 +128,14 @@ class _RecordedFile:
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
-        self._left = _MAX_DEFINITIONS
+        self._definition_budget = _MAX_DEFINITIONS
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
         self.counts: Mapping[RecordedStream, int]
         for record in sorted(self.chunks.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
             # A summary may repeat channels without schemas; the schemas are in the chunks then.
             if not isinstance(record, Channel) or record.schema_id in {0, *self._schemas}:
-                self._learn(record)
+                self._register(record)
             if isinstance(record, Statistics):
                 totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
@@ -155,7 +155,7 @@ class _RecordedFile:
             try:
                 for record in records_of(part):
                     if not isinstance(record, Message):
-                        self._learn(record)
+                        self._register(record)
                         continue
                     if (number := record.channel_id) not in self._streams:
                         self._streams[number] = None
@@ -173,7 +173,7 @@ class _RecordedFile:
         streams = self._streams.items()
         return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
-    def _learn(self, record: McapRecord) -> None:
+    def _register(self, record: McapRecord) -> None:
         """Register a schema or channel; later ones with the same id are ignored."""
         if isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
@@ -210,11 +210,11 @@ class _RecordedFile:
     def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:
         """Return the definition and layout of a schema; raise ValueError if they do not match the message."""
         if schema.id not in self._layouts:
-            if self._left < 0:
+            if self._definition_budget < 0:
                 raise ValueError("the definitions in this file exceed the limit, which is that of 250 PX4 topics")
-            self._left -= len(schema.data) // 256
+            self._definition_budget -= len(schema.data) // 256
             known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
-            self._left -= 32 + len(read_msg(text))
+            self._definition_budget -= 32 + len(read_msg(text))
             definition = known or define_msg(schema.name.rpartition("/")[2], text)
             types = {field.name: field.type for field in read_msg(text)} if known else definition.types
             same = (each for each in definition.layouts.values() if [*each.types.items()] == [*types.items()])

@@ -63,7 +63,7 @@ class EventTimeline:
             self.start, self.unit = (boot if utc is None else utc) - time, unit_of("boot" if utc is None else "vehicle")
 
     def moment(self, seconds: float) -> str:
-        """Format a time of the account in the clock of the time axes."""
+        """Format a time of the account on the clock of the time axes."""
         return to_clock(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
 
     def clock(self, seconds: float) -> str:

@@ -86,12 +86,12 @@ class Recording:
 class Player:
     """Playback of a recording for one viewer; `fleet` shows the playback position.
 
-    `on_jump`: called after each seek; `controls`: play button, speed menu and slider of the page.
+    `on_seek`: called after each seek; `controls`: play button, speed menu and slider of the page.
     """
 
     def __init__(self, recording: Recording) -> None:
         self.fleet = Fleet(recording.overview.origin)
-        self.on_jump: Callable[[], object] = lambda: None
+        self.on_seek: Callable[[], object] = lambda: None
         self.time = 0.0
         self.recording = recording
         self._monitor = Monitor()
@@ -103,7 +103,7 @@ class Player:
         self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
         self.controls = self._play, self._speed, self._slider
         self._play.on_change("active", lambda _, __, active: self._play.update(label="pause" if active else "play"))
-        self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
+        self._slider.on_change("value_throttled", lambda _, __, value: self.seek(value))
 
     def tick(self) -> None:
         """Advance the playback position by the elapsed time."""
@@ -121,7 +121,7 @@ class Player:
         """Toggle between play and pause; with `pause`, pause."""
         self._play.active = not (pause or self._play.active)
 
-    def jump(self, seconds: float) -> None:
+    def seek(self, seconds: float) -> None:
         """Seek to a time, limited to the part read so far, and load the minute before it."""
         self._shown = self._slider.value
         self.fleet.clear()
@@ -136,7 +136,7 @@ class Player:
             if stream.valid is None and overview is not None:
                 (stream.valid,) = overview.positions_at([self.time])
         self._feed()
-        self.on_jump()
+        self.on_seek()
 
     def _feed(self) -> None:
         end = bisect_right(self.recording.dues, self.time)

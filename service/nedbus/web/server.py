@@ -167,7 +167,7 @@ class WebServer:
         tornado = BokehTornado(
             {"/": Application(FunctionHandler(open_or_refuse))},
             extra_websocket_origins=["*"], auth_provider=_HostCheck(options),
-            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's own job drops sessions amid a message
+            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's own job drops sessions during a message
             unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
             websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
             extra_patterns=[(path, _TextHandler, {"make": make, "options": options}) for path, make in pages.items()],

@@ -99,7 +99,7 @@ class Viewer:
         document.add_root(self._lay_out(sheets))
         document.add_periodic_callback(self.update, _TICK)
         if player is not None:
-            player.on_jump = self._show_now
+            player.on_seek = self._show_now
 
     def update(self) -> None:
         """Send changes: the map each time, the rest twice a second; do nothing while the browser falls behind."""
@@ -143,7 +143,7 @@ class Viewer:
         if self._player is None:
             self.pinned = seconds
         elif seconds is not None:
-            self._player.jump(seconds)
+            self._player.seek(seconds)
 
     def _go_to_requested(self) -> None:
         """Show the moment in the URL once the recording has been read that far."""
@@ -256,7 +256,7 @@ class Viewer:
             case "next" | "previous":
                 self._show_next(is_later=name == "next")
             case "play" | "left" | "right" | "LEFT" | "RIGHT" if player is not None:
-                player.toggle() if name == "play" else player.jump(player.time + _STEPS[name])
+                player.toggle() if name == "play" else player.seek(player.time + _STEPS[name])
         self._show_now()
 
     def _choose_next(self, step: int) -> None:

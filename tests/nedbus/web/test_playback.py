@@ -100,17 +100,17 @@ def test_seek_shows_the_same_as_playing_there(recording: Recording, clock: Simpl
     """After a seek, back or forward, the page is the same as if the recording had been played up to that time."""
     player = Player(recording)
     run(player, clock, target)
-    jumped = Player(recording)
-    run(jumped, clock, 30)
-    play, _, slider = controls_of(jumped)
+    sought = Player(recording)
+    run(sought, clock, 30)
+    play, _, slider = controls_of(sought)
     play.active = False
-    jumps: list[float] = []
-    jumped.on_jump = lambda: jumps.append(1.0)
+    seeks: list[float] = []
+    sought.on_seek = lambda: seeks.append(1.0)
     for place in (179.0, 0.0, player.fleet.snapshot.time):
         slider.trigger("value_throttled", None, place)
-        jumped.tick()
-    assert len(jumps) == 3
-    assert shown(jumped) == shown(player)
+        sought.tick()
+    assert len(seeks) == 3
+    assert shown(sought) == shown(player)
 
 
 @pytest.mark.parametrize("value", ["inf", "nan", "-5", "1e300", "fast"])
@@ -295,7 +295,7 @@ def test_seek_keeps_silent_vehicles(tmp_path: Path, clock: SimpleNamespace) -> N
     recording = Recording(file)
     wait_for(lambda: recording.is_read, what="the recording")
     player = Player(recording)
-    player.jump(119.0)
+    player.seek(119.0)
     rows = {row.vehicle: row for row in player.fleet.snapshot.vehicles}
     assert {name: row.grade for name, row in rows.items()} == {"here": "bad", "silent": "bad"}
     assert rows["silent"].state.text.startswith("silent")
