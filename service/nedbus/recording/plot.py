@@ -252,7 +252,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
-    """Mark the begin of bad and watch events on the track and on the time axes of altitude and speed."""
+    """Mark the start of bad and watch events on the track and on the time axes of altitude and speed."""
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():

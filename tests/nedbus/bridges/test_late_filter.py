@@ -70,7 +70,7 @@ def test_retained_sample_is_held_back() -> None:
 
 
 def test_clock_set_back_is_accepted_within_two_minutes() -> None:
-    """A lateness that lasts two minutes is treated as a clock offset."""
+    """A lateness that persists for two minutes is treated as a clock offset."""
     late = LateFilter()
     admitted(late, *((each / 10, each / 10) for each in range(20)))
     steps = admitted(late, *((each / 10 - 3600, each / 10) for each in range(20, 2_000)))

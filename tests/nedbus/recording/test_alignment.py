@@ -151,7 +151,7 @@ def test_rate_covers_the_flight() -> None:
 
 @pytest.mark.parametrize("form", ["ULG", "MCAP"])
 def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
-    """PX4 logs the last message of a slow topic with its old time: this adds no empty rows at the begin."""
+    """PX4 logs the last message of a slow topic with its old time: this adds no empty rows at the start."""
     log = tmp_path / "a.ULG"
     times = range(300_000_000, 310_000_000, 20_000)
     writer = UlogWriter()

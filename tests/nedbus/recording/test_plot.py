@@ -54,7 +54,7 @@ def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) 
 
 
 def events_of(path: Path) -> list[Event]:
-    """Return the events of a log, and the begin of its initial conditions."""
+    """Return the events of a log, including the start of its initial conditions."""
     account = account_of(path).account
     held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
     return [*held, *account.events_since(0)[0]]
@@ -129,7 +129,7 @@ def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
 
 
 def test_events_are_marked_by_severity() -> None:
-    """A condition is a bar from begin to end; the shape of a mark is its severity."""
+    """A condition is a bar from start to end; the shape of a mark is its severity."""
     lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix 3D to none")
     events = [
         event_of("mode", "once", "info", 2.0, names=("Hold", "Mission")),

@@ -217,7 +217,7 @@ def test_ros2_bag_is_replayed(tmp_path: Path, layout: str) -> None:
         writer.start("ros2")
         schema = writer.register_schema(ROS2_TYPE, "ros2msg", definition.encode())
         other = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
-        topics = ("/fmu/out/vehicle_local_position", "/px4_1/fmu/out/estimator_local_position_1", "/somebody")
+        topics = ("/fmu/out/vehicle_local_position", "/px4_1/fmu/out/estimator_local_position_1", "/other")
         for topic in topics:
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, 1, encode_cdr(downgrade(sent, layout), layout=layout), 1)

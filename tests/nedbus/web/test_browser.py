@@ -344,7 +344,7 @@ def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly:
 # Recordings
 
 
-def test_recording_can_be_played_paused_and_sought(web: Web, tab: Open, tmp_path: Path) -> None:
+def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_path: Path) -> None:
     """Slider, pause, speed, seeking, keys and events work, and the page shows the state at the playback position."""
     port = free_port()
     web(port, str(write_flight(tmp_path, {VLP: lambda time: {"x": time, "xy_valid": time < 60}}, seconds=120)))

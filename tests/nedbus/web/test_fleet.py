@@ -107,8 +107,8 @@ def test_overloaded_page_reports_no_vehicle_as_silent(sim: SimulatedFleet) -> No
     assert sim.vehicle(alive=[]).state.text.startswith("gone: ")
 
 
-def test_since_is_the_begin_of_the_state(sim: SimulatedFleet) -> None:
-    """`since` is the begin of a state; for a silent or gone vehicle it is the time of the last message."""
+def test_since_is_the_start_of_the_state(sim: SimulatedFleet) -> None:
+    """`since` is the start of a state; for a silent or gone vehicle it is the time of the last message."""
     sim.fly(3)
     assert (sim.vehicle().state.text, sim.vehicle().state.since) == ("ok", None)
     sim.fly(0.1, dead_reckoning=True)
@@ -134,7 +134,7 @@ def test_since_is_the_begin_of_the_state(sim: SimulatedFleet) -> None:
 
 
 def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:
-    """Without a link vehicles keep their last state, have no current position, and the snapshot says why."""
+    """Without a link vehicles keep their last state, have no current position, and the snapshot has an alarm."""
     sim.fly(3)
     sim.time += 60
     row = sim.vehicle(alive=[], link="no link to tcp/ground:7447")

@@ -356,7 +356,7 @@ def test_selection_survives_reordering(sim: SimulatedFleet) -> None:
     page = Page(sim)
     assert page.chosen == "quad"
     for action, value, chosen in (
-        ("vehicle", "nobody", "quad"), ("vehicle", "wing", "wing"), ("down", "", "quad"), ("up", "", "wing"),
+        ("vehicle", "unknown", "quad"), ("vehicle", "wing", "wing"), ("down", "", "quad"), ("up", "", "wing"),
         ("up", "", "quad"), ("down", "", "wing"),
     ):  # fmt: skip
         page.send(action, value)
@@ -686,7 +686,7 @@ def test_url_restores_the_page(flown: SimulatedFleet, event: str | None) -> None
 
 QUERIES = (
     "vehicle=&view=&time=&theme=", "time=nan", "time=inf", "time=-1e300", "time=99:99:99", "time=25:61",
-    "time=1e18", "vehicle=nobody&view=__class__&time=0", f"vehicle={'x' * 5000}&time={'9' * 5000}",
+    "time=1e18", "vehicle=unknown&view=__class__&time=0", f"vehicle={'x' * 5000}&time={'9' * 5000}",
     "time=%00&vehicle=%FF%00",
 )  # fmt: skip
 
@@ -857,12 +857,12 @@ def test_page_survives_a_router_restart() -> None:
     ):
         until(lambda: page.grades == {"wing": "ok"}, "the vehicle")
         router.close()
-        until(lambda: f"no link to {where}" in page.part("head"), "the words")
+        until(lambda: f"no link to {where}" in page.part("head"), "the alarm")
         assert page.grades == {"wing": "ok"}
         assert page.marks["wing"]["fill"] == DARK.ground
         router = open_router(listen=(where,))
         until(lambda: page.marks["wing"]["fill"] != DARK.ground, "the vehicle again")
-        until(lambda: "no link to" not in page.part("head"), "the header to say so")
+        until(lambda: "no link to" not in page.part("head"), "the alarm to end")
         texts = [
             event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"
         ]
