@@ -270,8 +270,8 @@ def test_value_that_does_not_fit_is_named_once(tmp_path: Path) -> None:
     assert [fields.get("cell_count") for fields in batteries] == [6, None, None, 7]
     assert run.damage is None
     assert sorted(run.warnings) == [
-        "battery_status: left out cell_count where it is not a uint8, such as -1",
-        "battery_status: left out temperature where it is not a float32, such as 0.1",
+        "battery_status: cell_count left out where its value is not a uint8, such as -1",
+        "battery_status: temperature left out where its value is not a float32, such as 0.1",
     ]
     table = nedbus.read(path, "battery_status", dataframe="pandas")
     assert table["cell_count"].isna().tolist() == [False, True, True, False]

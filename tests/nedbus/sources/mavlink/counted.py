@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from nedbus.sources.mavlink.log_reassembly import Piece, Reassembly, Verdict
+from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly, Verdict
 
 
 class CountedReassembly(Reassembly):
@@ -16,12 +16,12 @@ class CountedReassembly(Reassembly):
         self.counts = Counter[Verdict]()
         self.lost = self.bytes = self.skipped = 0
 
-    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Piece:
+    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:
         """Take the fields of the next message."""
-        piece = super().add(sequence, length, first_message_offset, data)
-        self.counts[piece.verdict] += 1
-        self.lost += piece.lost
-        self.bytes += len(piece.data)
-        if piece.verdict in ("delivered", "unsynchronised"):
-            self.skipped += length - len(piece.data)
-        return piece
+        chunk = super().add(sequence, length, first_message_offset, data)
+        self.counts[chunk.verdict] += 1
+        self.lost += chunk.lost
+        self.bytes += len(chunk.data)
+        if chunk.verdict in ("delivered", "unsynchronised"):
+            self.skipped += length - len(chunk.data)
+        return chunk

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus.sources.mavlink.log_reassembly import Piece
+from nedbus.sources.mavlink.log_reassembly import Chunk
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
 
 from .counted import CountedReassembly
@@ -28,7 +28,7 @@ needs_recordings = [
 ]
 
 
-def add(reassembly: CountedReassembly, message: Message) -> Piece:
+def add(reassembly: CountedReassembly, message: Message) -> Chunk:
     return reassembly.add(message.sequence, len(message.data), message.offset, message.data)
 
 
@@ -45,10 +45,10 @@ def test_first_message_begins_a_stream_and_its_repetition_does_not() -> None:
     """Sequence 0 with ULog's magic begins a stream; the same bytes again are a repetition, others a new stream."""
     reassembly = CountedReassembly()
     begin(reassembly, b"a")
-    assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Piece("duplicate")
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Chunk("duplicate")
     add(reassembly, plain(1))
-    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Piece("delivered", HEADER + b"b", begins=True)
-    assert add(reassembly, plain(1)) == Piece("delivered", b"data")
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Chunk("delivered", HEADER + b"b", begins=True)
+    assert add(reassembly, plain(1)) == Chunk("delivered", b"data")
     assert reassembly.lost == 0
 
 
@@ -64,7 +64,7 @@ def test_stream_joined_in_the_middle_has_no_definitions() -> None:
     """Without its header a stream cannot be decoded: nothing is delivered or counted as lost until one begins."""
     reassembly = CountedReassembly()
     for sequence in (0, 70, 3):
-        assert add(reassembly, plain(sequence)) == Piece("no_definitions")
+        assert add(reassembly, plain(sequence)) == Chunk("no_definitions")
     assert (reassembly.lost, reassembly.counts["no_definitions"]) == (0, 3)
     begin(reassembly)
 
@@ -81,10 +81,10 @@ def test_gap_delivers_from_the_next_record_on() -> None:
     """After a gap, bytes before the first record are skipped, and messages in which none begins."""
     reassembly = CountedReassembly()
     begin(reassembly)
-    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised", lost=2)
-    assert add(reassembly, plain(4, offset=255)) == Piece("unsynchronised")
-    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Piece("delivered", b"begin", lost=1)
-    assert add(reassembly, plain(7, offset=255)) == Piece("delivered", b"data")
+    assert add(reassembly, plain(3, offset=255)) == Chunk("unsynchronised", lost=2)
+    assert add(reassembly, plain(4, offset=255)) == Chunk("unsynchronised")
+    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Chunk("delivered", b"begin", lost=1)
+    assert add(reassembly, plain(7, offset=255)) == Chunk("delivered", b"data")
     assert (reassembly.lost, reassembly.skipped, reassembly.bytes) == (3, 12, SIZE + 9)
 
 
@@ -93,7 +93,7 @@ def test_empty_message_after_a_gap_does_not_synchronise() -> None:
     reassembly = CountedReassembly()
     begin(reassembly)
     add(reassembly, plain(2, b"", offset=255))
-    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised")
+    assert add(reassembly, plain(3, offset=255)) == Chunk("unsynchronised")
 
 
 def test_late_message_is_lost_and_not_used() -> None:
@@ -101,8 +101,8 @@ def test_late_message_is_lost_and_not_used() -> None:
     reassembly = CountedReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2)).lost == 1
-    assert add(reassembly, plain(1)) == Piece("duplicate")
-    assert add(reassembly, plain(2)) == Piece("duplicate")
+    assert add(reassembly, plain(1)) == Chunk("duplicate")
+    assert add(reassembly, plain(2)) == Chunk("duplicate")
     assert reassembly.lost == 1
 
 
@@ -111,7 +111,7 @@ def test_malformed_message_is_rejected(length: int, offset: int) -> None:
     """A length or an offset that cannot be is counted, and leaves a gap."""
     reassembly = CountedReassembly()
     begin(reassembly)
-    assert reassembly.add(1, length, offset, bytes(SIZE)) == Piece("malformed")
+    assert reassembly.add(1, length, offset, bytes(SIZE)) == Chunk("malformed")
     assert add(reassembly, plain(2)).lost == 1
 
 
@@ -121,7 +121,7 @@ def test_sequence_wraps() -> None:
     begin(reassembly)
     for sequence in range(1, 2**16):
         assert not add(reassembly, plain(sequence)).lost
-    assert add(reassembly, plain(0)) == Piece("delivered", b"data")
+    assert add(reassembly, plain(0)) == Chunk("delivered", b"data")
     assert add(reassembly, plain(2)).lost == 1
     assert reassembly.counts.total() == 2**16 + 2
 
@@ -133,18 +133,18 @@ def test_jump_counts_at_most_half_of_the_sequence() -> None:
     assert add(reassembly, plain(2**15)).lost == 2**15 - 1
     reassembly = CountedReassembly()
     begin(reassembly)
-    assert add(reassembly, plain(2**15 + 1)) == Piece("duplicate")
+    assert add(reassembly, plain(2**15 + 1)) == Chunk("duplicate")
 
 
 def test_stream_resumes_after_an_outage_of_more_than_half_of_the_sequence() -> None:
     """A long run of successive old numbers is the stream itself, which went on meanwhile: all between is lost."""
     reassembly = CountedReassembly()
     begin(reassembly)
-    pieces = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
-    first = next(index for index, piece in enumerate(pieces) if piece.verdict == "delivered")
+    chunks = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
+    first = next(index for index, chunk in enumerate(chunks) if chunk.verdict == "delivered")
     assert first < 256
-    assert pieces[first].lost == reassembly.lost == 40_000 + first - 1
-    assert all(piece == Piece("delivered", b"data") for piece in pieces[first + 1 :])
+    assert chunks[first].lost == reassembly.lost == 40_000 + first - 1
+    assert all(chunk == Chunk("delivered", b"data") for chunk in chunks[first + 1 :])
 
 
 def to_messages(records: Iterable[bytes], size: int = SIZE) -> list[Message]:
@@ -166,10 +166,10 @@ def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], Count
     reassembly, data = CountedReassembly(), bytearray()
     records: list[tuple[str, bytes]] = []
     for message in messages:
-        piece = add(reassembly, message)
-        if piece.lost or piece.begins:
+        chunk = add(reassembly, message)
+        if chunk.lost or chunk.begins:
             data.clear()
-        data += piece.data[16:] if piece.begins else piece.data
+        data += chunk.data[16:] if chunk.begins else chunk.data
         records += split_records(data)
     return records, reassembly
 

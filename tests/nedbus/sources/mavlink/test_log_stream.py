@@ -21,11 +21,11 @@ from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import reader
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Piece
+from nedbus.sources.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings
-from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
+from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from tests.flights.ulogs import said_in, write_raw_log
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
@@ -87,7 +87,7 @@ class Received:
                     self.reasons.add(item.reason)
                     if is_end:
                         break
-        data = [each for each in self.messages if each.address.topic != SPOKEN.name]
+        data = [each for each in self.messages if each.address.topic != LOG_MESSAGE.name]
         self.stream = [each for each in data if each.source]
         self.converted = [each for each in data if not each.source]
 
@@ -119,7 +119,7 @@ def sent_messages() -> list[tuple[str, str]]:
     recording = read_recording(SHORT)
     plain = [each.content for each in recording.entries if not isinstance(each.content, bytes)]
     records = UlogParser(verify=True).feed(b"".join(each.data for each in (*recording.header, *plain)))
-    records = list(Texts().merge(records))
+    records = list(LogMessageBuilder().merge(records))
     return [
         (each.subscription.name, repr(each.subscription.layout.decode(each.payload)))
         for each in records
@@ -274,7 +274,7 @@ def test_hostile_vehicle_harms_no_other() -> None:
 
         received = Received("log=armed", attack=attack)
     ours = [each for each in received.stream if each.address.vehicle == "1"]
-    sent_data = [topic for topic, _ in sent_messages() if topic != SPOKEN.name]
+    sent_data = [topic for topic, _ in sent_messages() if topic != LOG_MESSAGE.name]
     assert len(ours) == len(received.stream) == len(sent_data), received.reasons
     reasons = {(each.where, each.reason) for each in received.rejections}
     assert sent[str(START)]
@@ -292,10 +292,10 @@ def test_stream_of_an_old_release_is_converted(tmp_path: Path) -> None:
     data = path.read_bytes() + struct.pack("<HBH", 2, ord("O"), 1500) + struct.pack("<HBHQi", 14, ord("D"), 0, 9, 8)
     client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming")))
     stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
-    found = list(stream.add(Piece("delivered", data, begins=True), 0.0))
+    found = list(stream.add(Chunk("delivered", data, begins=True), 0.0))
     messages = [each for each in found if isinstance(each, SourceMessage)]
     assert [each.fields.get("cell_count") for each in messages] == [6, None, None, 7, 8]
     assert [each.dropout for each in messages] == [0.0, 0.0, 0.0, 0.0, 1.5]
     [rejection] = [each for each in found if isinstance(each, Rejection)]
-    assert rejection.reason == "battery_status: left out cell_count where it is not a uint8, such as 300"
+    assert rejection.reason == "battery_status: cell_count left out where its value is not a uint8, such as 300"
     assert rejection.count == 0

@@ -106,8 +106,8 @@ class Link:
                 self.rejected += 1
                 return []
             fields = message.sequence, message.length, message.first_message_offset, message.data
-            piece = self.reassembly.add(*fields)
-            return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=piece.begins)
+            chunk = self.reassembly.add(*fields)
+            return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=chunk.begins)
         if (ms := getattr(message, "time_boot_ms", None)) is not None:
             if ms < self._boot - 1000:
                 client.on_reboot()

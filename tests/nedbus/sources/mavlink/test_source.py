@@ -299,7 +299,7 @@ def test_messages_of_others_are_ignored(listener: Listener, port: int) -> None:
     assert late.reason == "out of order: 1500 ms since boot, after 2000 ms"
     link = f"udpin:127.0.0.1:{port}"
     assert [each.where for each in ignored] == [f"{link} system 0 component 1", f"{link} system 9 component 0"]
-    assert all("id 0 addresses all and is no sender's" in each.reason for each in ignored)
+    assert all("id 0 is for broadcast only" in each.reason for each in ignored)
 
 
 def test_two_senders_of_one_system_are_named(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
@@ -319,7 +319,7 @@ def test_two_senders_of_one_system_are_named(listener: Listener, port: int, capl
 
 
 def test_broken_tcp_link_is_an_error() -> None:
-    """A message in pieces is whole again; a link that is closed is an error, and can be reopened while it is there."""
+    """A message in chunks is whole again; a link that is closed is an error, and can be reopened while it is there."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = f"tcp:127.0.0.1:{server.getsockname()[1]}"
         for ms in (1000, 2000):

@@ -67,7 +67,7 @@ def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) 
 
     That is neither a loss nor a reboot.
     """
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     assert send(streams, stream, 7, 100.1) == (0, False)
     streams.add_publisher(px4("b"), 100.2)
@@ -86,7 +86,7 @@ def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: Stre
 
     The key is free at once.
     """
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     for session in ("a", "b"):
         streams.add_publisher(px4(session), 0.0)
     assert not streams.remove_publisher(px4("a"), 10.0)
@@ -99,7 +99,7 @@ def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: Stre
 
 def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
     """Two publishers in one session, or two sessions with different topics, are the same vehicle."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
         streams.add_publisher(token, 100.0)
     assert send(streams, stream, 1, 100.1) == (0, False)
@@ -107,7 +107,7 @@ def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
 
 def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistry) -> None:
     """A publisher silent for 3 s does not block its successor, as a router detects a dead link only after 10 s."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)
     streams.add_publisher(px4("b"), 103.0)
@@ -118,7 +118,7 @@ def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistr
 
 def test_ros_2_nodes_of_one_name_are_distinguished_by_their_gids(streams: StreamRegistry) -> None:
     """The first one is published; messages of the second are rejected while both exist."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     assert send(streams, stream, 1, 100.0, b"a" * 16) == (0, False)
     streams.add_publisher(node("b"), 100.0)
@@ -129,7 +129,7 @@ def test_ros_2_nodes_of_one_name_are_distinguished_by_their_gids(streams: Stream
 
 def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegistry) -> None:
     """The new token shows that the old publisher has gone: a reboot without losses."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)
     streams.remove_publisher(node("a"), 100.1)
@@ -141,8 +141,8 @@ def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegist
 def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
     """A reboot counts once per vehicle, whichever topic shows it first, and so does the next one."""
     topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
-    vehicle = [streams.hear(str(key(topic)), 0.0) for topic in topics]
-    other = streams.hear(str(key(domain=1)), 0.0)
+    vehicle = [streams.on_message(str(key(topic)), 0.0) for topic in topics]
+    other = streams.on_message(str(key(domain=1)), 0.0)
     for now in (100.0, 110.0, 120.0):
         sequence = round(50 - now / 10)
         reboots = [send(streams, stream, sequence, now)[1] for stream in [*vehicle, other]]
@@ -156,7 +156,7 @@ def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
     tokens = [node(str(number)) for number in range(100)]
     for token in tokens:
         streams.add_publisher(token, 0.0)
-    assert len(streams.hear(str(key()), 0.0).tokens) == 64
+    assert len(streams.on_message(str(key()), 0.0).tokens) == 64
     for token in tokens:
         streams.remove_publisher(token, 0.0)
     streams.report(1.0)
@@ -168,11 +168,11 @@ def test_keys_are_bounded(monkeypatch: pytest.MonkeyPatch, streams: StreamRegist
     monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
     streams.add_publisher(px4("a"), 0.0)
     for domain in (1, 2):
-        streams.hear(str(key(domain=domain)), 0.0)
+        streams.on_message(str(key(domain=domain)), 0.0)
     with pytest.raises(NotAcceptedError, match="more than 3 keys: choose a domain"):
-        streams.hear(str(key(domain=3)), 0.0)
+        streams.on_message(str(key(domain=3)), 0.0)
     streams.report(0.0)
-    streams.hear(str(key(domain=3)), 0.0)
+    streams.on_message(str(key(domain=3)), 0.0)
 
 
 def test_keys_that_come_and_go_are_forgotten(streams: StreamRegistry) -> None:
@@ -181,8 +181,10 @@ def test_keys_that_come_and_go_are_forgotten(streams: StreamRegistry) -> None:
     streams.add_publisher(token, 0.0)
     for number in range(3000):
         now = float(number)
-        came = streams.hear(str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now)
-        streams.form_of(came)
+        came = streams.on_message(
+            str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now
+        )
+        streams.wire_format_of(came)
         send(streams, came, 1, now)
         streams.report(now)
     sizes = len(streams._streams), len(streams._owners), len(streams._reboots)

@@ -46,10 +46,10 @@ def streams() -> StreamRegistry:
 
 def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
     """The first key owns an address until it is silent for 3 s; then another key may have it."""
-    first, second = streams.hear(key(), 100.0), streams.hear(key(layout="V0"), 100.0)
-    assert (streams.hear(key(), 100.0), str(second.address)) == (first, f"1/{VLP}")
+    first, second = streams.on_message(key(), 100.0), streams.on_message(key(layout="V0"), 100.0)
+    assert (streams.on_message(key(), 100.0), str(second.address)) == (first, f"1/{VLP}")
     streams.accept(first, None, 100.0)
-    with pytest.raises(NotAcceptedError, match="already: rename one of them with vehicles="):
+    with pytest.raises(NotAcceptedError, match="rename one of them with vehicles="):
         streams.accept(second, None, 102.9)
     streams.accept(second, None, 103.0)
     with pytest.raises(NotAcceptedError, match="already"):
@@ -58,7 +58,7 @@ def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
 
 def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
     """The first publisher owns a key until it is silent for 3 s; the sequence of the next one starts anywhere."""
-    stream = streams.hear(key(), 100.0)
+    stream = streams.on_message(key(), 100.0)
     streams.accept(stream, Attachment(7, 0, GID), 100.0)
     other = Attachment(500, 0, GID[::-1])
     with pytest.raises(NotAcceptedError, match="two publishers share this key"):
@@ -71,14 +71,14 @@ def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
 )
 def test_gap_in_the_sequence_is_loss(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
     """A gap is that many lost messages, unless it is absurdly large; a step back is a reboot."""
-    stream = streams.hear(key(), 100.0)
+    stream = streams.on_message(key(), 100.0)
     for each, expected in ((10, (0, False)), (sequence, (lost, rebooted)), (sequence + 1, (0, False))):
         assert streams.accept(stream, Attachment(each, 0, GID), 100.0) == expected
 
 
 def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry) -> None:
     """One step back is a reboot; another one within 3 s is a second vehicle with the same gid."""
-    stream = streams.hear(key(), 100.0)
+    stream = streams.on_message(key(), 100.0)
     for sequence, now in ((10, 100.0), (1, 100.1), (20, 100.2)):
         streams.accept(stream, Attachment(sequence, 0, GID), now)
     with pytest.raises(NotAcceptedError, match="sequence numbers go back and forth"):
@@ -91,7 +91,7 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
 @pytest.mark.parametrize("namespace", ["", "px4_1"])
 def test_input_belongs_to_its_vehicle(streams: StreamRegistry, namespace: str) -> None:
     """/fmu/in/... has the vehicle of /fmu/out/...; a companion that restarts is not a reboot of the vehicle."""
-    stream = streams.hear(key(namespace=namespace, way="in"), 100.0)
+    stream = streams.on_message(key(namespace=namespace, way="in"), 100.0)
     assert (str(stream.address), stream.is_input) == (f"{namespace or 1}/{VLP}", True)
     for sequence in (10, 1):
         assert streams.accept(stream, Attachment(sequence, 0, GID), 100.0) == (0, False)

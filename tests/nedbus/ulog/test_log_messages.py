@@ -14,7 +14,7 @@ from pyulog import ULog
 from pyulog.px4_events import PX4Events
 
 import nedbus
-from nedbus.ulog import Texts, to_statement
+from nedbus.ulog import LogMessageBuilder, to_log_text
 from tests.flights.ulogs import LOGS, UlogWriter, said_in
 
 REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
@@ -89,7 +89,7 @@ class Log(UlogWriter):
         """Add a vehicle_status."""
         self.put("D", struct.pack("<HQB", 2, 0, nav_state))
 
-    def said(self, texts: Texts | None = None) -> list[tuple[int, int, str]]:
+    def said(self, texts: LogMessageBuilder | None = None) -> list[tuple[int, int, str]]:
         """Return timestamp, severity and text of each message."""
         return said_in(bytes(self.data), texts)
 
@@ -108,7 +108,7 @@ def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
         left.remove(one)
     unpaired = 0
     for each in logged:
-        statement = (each.timestamp, int(chr(each.log_level)), to_statement(each.message))
+        statement = (each.timestamp, int(chr(each.log_level)), to_log_text(each.message))
         if statement in left:
             left.remove(statement)
         else:
@@ -219,12 +219,12 @@ def test_second_metadata_are_ignored() -> None:
 def test_texts_are_one_printable_line_and_bounded_in_number() -> None:
     """Controls, escapes of terminals and bidirectional marks go; 10,000 texts a second are counted, not published."""
     hostile = "a\nb\r\x1b[2Jc\x00\x07\x9b31m\u202ed\u2028e" + "\x1b]0;title\x07" + "µ" * 200
-    text = to_statement(hostile)
+    text = to_log_text(hostile)
     assert text.startswith("a b cd31m"[:5])
     assert text.isprintable()
     assert len(text.encode()) <= 127
     assert text.endswith("...")
-    log, texts = Log(), Texts()
+    log, texts = Log(), LogMessageBuilder()
     for number in range(10_000):
         log.text(50_000_000 + 100 * number, b"%d" % number)
     log.text(52_000_000, b"later")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nedbus.sources import Absence
+from nedbus.sources import UnavailableTopics
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import StreamRegistry
 from nedbus.transport import PublisherToken, TopicKey
@@ -26,51 +26,51 @@ def streams() -> StreamRegistry:
     return streams
 
 
-def hear(streams: StreamRegistry, topic: str, now: float, *, session: str = "a") -> Absence:
+def report_after_message(streams: StreamRegistry, topic: str, now: float, *, session: str = "a") -> UnavailableTopics:
     """Return the absent topics after a message has arrived."""
-    assert streams.hear(str(token(topic, session=session).key), now).not_carried is None
+    assert streams.on_message(str(token(topic, session=session).key), now).unsupported is None
     return streams.report(now)
 
 
 def test_topic_is_silent_after_5_s_while_others_arrive(streams: StreamRegistry) -> None:
     """A topic is silent after 5 s, whether it arrived before or not, until it arrives or its token is withdrawn."""
-    assert hear(streams, "vehicle_attitude", 104.9) == Absence()
-    assert hear(streams, "vehicle_attitude", 105.0) == Absence((), ("1/vehicle_odometry",))
-    assert hear(streams, "vehicle_odometry", 105.1) == Absence()
-    assert hear(streams, "vehicle_attitude", 110.2) == Absence((), ("1/vehicle_odometry",))
+    assert report_after_message(streams, "vehicle_attitude", 104.9) == UnavailableTopics()
+    assert report_after_message(streams, "vehicle_attitude", 105.0) == UnavailableTopics((), ("1/vehicle_odometry",))
+    assert report_after_message(streams, "vehicle_odometry", 105.1) == UnavailableTopics()
+    assert report_after_message(streams, "vehicle_attitude", 110.2) == UnavailableTopics((), ("1/vehicle_odometry",))
     streams.remove_publisher(token("vehicle_odometry"), 110.2)
-    assert streams.report(110.2) == Absence()
+    assert streams.report(110.2) == UnavailableTopics()
 
 
 def test_nothing_is_silent_while_nothing_arrives(streams: StreamRegistry) -> None:
     """A vehicle whose link is down has no silent topics; messages of other vehicles make no difference."""
     streams.add_publisher(token("vehicle_status", session="b"), 100.0)
-    assert streams.report(200.0) == Absence()
-    assert hear(streams, "vehicle_status", 200.0, session="b") == Absence()
+    assert streams.report(200.0) == UnavailableTopics()
+    assert report_after_message(streams, "vehicle_status", 200.0, session="b") == UnavailableTopics()
 
 
 def test_topic_on_events_is_never_silent(streams: StreamRegistry) -> None:
     """home_position may be absent for any time."""
     streams.add_publisher(token("home_position"), 100.0)
-    assert streams.report(200.0) == Absence()
-    assert hear(streams, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
+    assert streams.report(200.0) == UnavailableTopics()
+    assert report_after_message(streams, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
 
 
 def test_messages_that_are_not_carried_are_listed(streams: StreamRegistry) -> None:
     """Messages without a definition are listed sorted, once each, while they are announced; their number is bounded."""
     for number, name in enumerate(("Rpm", "Airspeed", "Rpm")):
         streams.add_publisher(token(f"topic_{number}", name), 100.0)
-    assert streams.hear(str(token("topic_0", "Rpm").key), 100.0).not_carried == "Rpm"
-    assert streams.report(100.0) == Absence(("Airspeed", "Rpm"))
+    assert streams.on_message(str(token("topic_0", "Rpm").key), 100.0).unsupported == "Rpm"
+    assert streams.report(100.0) == UnavailableTopics(("Airspeed", "Rpm"))
     streams.remove_publisher(token("topic_1", "Airspeed"), 100.0)
-    assert streams.report(100.0) == Absence(("Rpm",))
+    assert streams.report(100.0) == UnavailableTopics(("Rpm",))
     for number in range(2000):
         streams.add_publisher(token(f"any{number}x", f"Any{number}"), 100.0)
-    assert len(streams.report(100.0).not_carried) == 100
+    assert len(streams.report(100.0).unsupported) == 100
 
 
 def test_topics_that_no_option_asks_for_are_not_listed() -> None:
     """With `topics=` all other topics are ignored silently."""
     streams = StreamRegistry(Px4ZenohOptions.model_validate({"topics": "vehicle_attitude"}), vehicle="1")
     streams.add_publisher(token("rpm", "Rpm"), 100.0)
-    assert streams.report(100.0) == Absence()
+    assert streams.report(100.0) == UnavailableTopics()
