@@ -28,14 +28,13 @@ def account_of(log: Path) -> FileEvents:
     return read_file_events(log)
 
 
-def said_in(log: Path | bytes, texts: LogMessageBuilder | None = None) -> list[tuple[int, int, str]]:
-    """Return timestamp, severity and text of each of PX4's statements in a log."""
+def log_messages_in(log: Path | bytes, texts: LogMessageBuilder | None = None) -> list[tuple[int, int, str]]:
+    """Return timestamp, severity and text of each log message in a log."""
     parser = UlogParser(verify=True)
     records = [*parser.feed(log if isinstance(log, bytes) else log.read_bytes()), *parser.close()]
     messages = (texts or LogMessageBuilder()).merge(records)
-    spoken = (each for each in messages if isinstance(each, Data) and each.subscription is LOG_MESSAGE)
-    found = [LOG_MESSAGE.layout.decode(each.payload) for each in spoken]
-    return [tuple(fields.values()) for fields in found]
+    found = (each for each in messages if isinstance(each, Data) and each.subscription is LOG_MESSAGE)
+    return [tuple(LOG_MESSAGE.layout.decode(each.payload).values()) for each in found]
 
 
 class UlogWriter:

@@ -1,4 +1,4 @@
-"""Reassembly with totals over all streams."""
+"""Reassembly that counts messages over all streams."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly, Verdict
 
 
-class CountedReassembly(Reassembly):
-    """Count messages by verdict, lost messages, delivered bytes, and bytes that are skipped after a gap."""
+class CountingReassembly(Reassembly):
+    """Counts messages by verdict, lost messages, delivered bytes, and bytes skipped after a gap."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -17,7 +17,7 @@ class CountedReassembly(Reassembly):
         self.lost = self.bytes = self.skipped = 0
 
     def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:
-        """Take the fields of the next message."""
+        """Add the next message and count the result."""
         chunk = super().add(sequence, length, first_message_offset, data)
         self.counts[chunk.verdict] += 1
         self.lost += chunk.lost
