@@ -49,7 +49,7 @@ class _EventOptions(RecordedOptions):
 class Flights:
     """The messages of one file, or of several files merged by UTC.
 
-    A vehicle that is in several files is renamed after each file. `ended`: vehicles whose file has ended.
+    A vehicle that is in several files is named after the file in each. `ended`: vehicles whose file has ended.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
@@ -137,7 +137,7 @@ def follow(
             account.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
         if due - checked >= _CHECK_INTERVAL and account.vehicles.keys() <= set(ended):
-            checked = due  # between two files
+            checked = due  # no vehicle is active between two files
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
             update(checked)

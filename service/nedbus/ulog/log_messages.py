@@ -195,7 +195,7 @@ class LogMessageBuilder:
                     yield Data(LOG_MESSAGE, _STRUCT.pack(found.timestamp, found.level, text))
 
     def _read(self, record: Record) -> LoggedText | None:
-        """Return the text that a record completes; None if it is a duplicate, or completes none."""
+        """Return the text that a record completes; None without one, or for a duplicate."""
         if isinstance(record, LoggedText):
             return None if self._is_duplicate(record) else record
         if isinstance(record, Information) and record.key == "metadata_events" and isinstance(record.value, bytes):

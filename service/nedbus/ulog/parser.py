@@ -75,7 +75,7 @@ class UlogParser:
         self._records: list[Record] = []
 
     def feed(self, data: bytes) -> list[Record]:
-        """Return the records that these bytes complete; raise UlogError if it cannot read this ULog."""
+        """Return the records that these bytes complete; raise UlogError if the data is not a readable ULog."""
         self._buffer += data
         return self._parse(is_end=False)
 
@@ -253,7 +253,7 @@ class UlogParser:
         return end
 
     def _emit(self, at: int, inspected: _Inspection) -> int:
-        """Output a record; return the position after it."""
+        """Add a record to the result; return the position after it."""
         kind, reason = self._buffer[at + 2], ""
         if inspected.record is not None:
             try:

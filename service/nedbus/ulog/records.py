@@ -21,7 +21,7 @@ Value = int | float | bool | str | bytes
 
 
 class UlogError(ValueError):
-    """Raised for data that is not a ULog, or has flags with which a parser must reject it."""
+    """Raised for data that is not a ULog, or a ULog with unknown incompatible flags."""
 
 
 class Header(NamedTuple):

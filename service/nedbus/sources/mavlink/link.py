@@ -125,7 +125,7 @@ def ignore_reason(system: int, component: int) -> str:
 
 
 class DuplicateIds:
-    """Detects system ids with two senders: the source address of their messages keeps changing."""
+    """Detects system ids with two senders, whose messages arrive from two addresses in turn."""
 
     def __init__(self) -> None:
         self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(lambda: deque(maxlen=_CHANGES))

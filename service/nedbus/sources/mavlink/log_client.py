@@ -1,4 +1,4 @@
-"""State machine for the ULog stream of one vehicle: events in, commands out; no I/O, times by the caller [s]."""
+"""State machine for one vehicle's ULog stream: events in, commands out; no I/O, callers pass the time [s]."""
 
 import math
 from collections.abc import Mapping, Set
@@ -193,7 +193,7 @@ class LogStreamClient:
         return []
 
     def stop(self, now: float) -> list[Command]:
-        """End this client's stream; go on with `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
+        """End this client's stream; call `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
         is_ours = self.status.state in ("header", "streaming") or self._awaited == "data"
         self._enter("stopping" if is_ours or self._awaited else "stopped", None, now)
         return self._send("stop", now) if is_ours else []

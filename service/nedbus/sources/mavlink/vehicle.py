@@ -1,4 +1,4 @@
-"""State of a MAVLink vehicle: MAVLink in, PX4 messages and requests out; no I/O, monotonic times by the caller [s]."""
+"""State of a MAVLink vehicle: MAVLink in, PX4 messages and requests out; no I/O, callers pass monotonic time [s]."""
 
 import logging
 import math

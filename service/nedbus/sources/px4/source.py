@@ -149,9 +149,9 @@ class Px4ZenohNode:
         try:
             stream = self._streams.on_message(key, now)
             if stream.unsupported is not None:
-                is_unexpected = stream.unsupported and not stream.tokens and not is_bridged  # others are in the report
+                is_unannounced = stream.unsupported and not stream.tokens  # announced ones are in the report
                 reason = f"{stream.unsupported}: not selected by topics= or msg="
-                return Rejection(key, reason) if is_unexpected else None
+                return Rejection(key, reason) if is_unannounced and not is_bridged else None
             if (form := stream.wire_format) is None:
                 form = self._streams.wire_format_of(stream)
                 if form.unknown:

@@ -1,4 +1,4 @@
-"""Map keys of rmw_zenoh to addresses, and detect unavailable topics; no I/O, monotonic times by the caller [s]."""
+"""Map keys of rmw_zenoh to addresses, and detect unavailable topics; no I/O, callers pass monotonic time [s]."""
 
 import math
 from collections.abc import Mapping
@@ -174,7 +174,7 @@ class StreamRegistry:
         if stream.is_input or not restarted:
             return lost, False
         known = self._reboots.get(stream.address.vehicle, 0)
-        is_first = stream.reboots == known  # stream of this vehicle to restart
+        is_first = stream.reboots == known  # of its vehicle's streams to restart
         self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
         return lost, is_first
 
@@ -191,7 +191,7 @@ class StreamRegistry:
         }
         self._reboots = {vehicle: count for vehicle, count in self._reboots.items() if vehicle in known}
         nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
-        # If no topic of a node arrives, its link is down.
+        # A node without any message has a broken link, not silent topics.
         sending = {node for stream, own in nodes if now - stream.last_message < _TIMEOUT for node in own}
         silent = {str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)}
         unsupported = {stream.unsupported for stream, own in nodes if own and stream.unsupported}
