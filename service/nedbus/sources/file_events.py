@@ -68,7 +68,7 @@ class Flights:
         found = []
         for path, run, names in self._files:
             reason = "here, as several files have a vehicle"
-            renamed = [f"vehicle {own} is {name} {reason} {own}" for own, name in names.items() if own != name]
+            renamed = [f"vehicle {own} is named {name} {reason} {own}" for own, name in names.items() if own != name]
             found += [f"{path}: {text}" for text in (*renamed, *run.warnings)]
         return tuple(found)
 

@@ -95,7 +95,7 @@ class RecordedOptions(ReplayOptions):
 class SimulatorOptions(ReplayOptions):
     """Options of `sim:`."""
 
-    seed: int = Field(0, description="an integer; the same seed gives the same flight")
+    seed: int = Field(0, description="an integer; the same seed produces the same flight")
     duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
         None, description="seconds, 0.01 to 1e8 (default: endless)"
     )
@@ -141,11 +141,11 @@ class MavlinkOptions(Options):
         BeforeValidator(lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text),
     ] = Field(
         frozenset(),
-        description="1 to request the ULog stream of each PX4 on the link, armed to start it in the air as well, take"
+        description="1 to request the ULog stream of each PX4 on the link, armed to start it in flight as well, take"
         " to end the stream of another client, or armed,take",
     )
     save: Annotated[str, AfterValidator(_check_save)] = Field(
-        "", description="a folder in which each ULog stream is saved as a .ulg file; it needs log="
+        "", description="a folder in which each ULog stream is saved as a .ulg file; requires log="
     )
 
     @property

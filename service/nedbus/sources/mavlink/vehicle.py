@@ -282,7 +282,7 @@ class _StatusTexts:
             self._finish()
 
     def take(self, now: float) -> dict[str, object]:
-        """Return the fields of the next text; none unless it is complete or timed out."""
+        """Return the fields of the next text that is complete or has timed out, else {}."""
         if self._next and now - self._time > _CHUNK_TIMEOUT:
             self._finish("...")
         return self._waiting.popleft() if self._waiting else {}

@@ -174,7 +174,7 @@ class Px4ZenohNode:
             del fields[name]
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
-            _log.warning("%s: the publisher restarted, as the vehicle rebooted", key, extra=extra)
+            _log.warning("%s: the publisher restarted: the vehicle rebooted", key, extra=extra)
         source = _INPUT if stream.is_input else None
         return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
 
@@ -226,7 +226,7 @@ def _read_definitions(paths: str) -> Definitions:
     for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
         files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
         if not files and path.is_dir():
-            reason = "no .msg file in this folder or its subfolders: use PX4's folder msg"
+            reason = "no .msg file in this folder or its subfolders: use PX4's msg folder"
             raise ConfigError(str(path), reason, key="msg")
         for file in files or [path]:
             try:

@@ -262,7 +262,7 @@ class StreamRegistry:
         hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
         if given:
             hashes = " or ".join(given)
-            reason = f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: use that of this PX4"
+            reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}: use the file of this PX4"
         elif known is None:
             reason = f"{name} with the type hash {key.type_hash} is unknown: {hint}"
         elif key.type_hash != NO_HASH:

@@ -342,9 +342,9 @@ def test_topics_lost_by_default_pubcsv_are_reported_silent(where: str) -> None:
             with changing_timings() as timings:
                 timings.listen = 0.1
                 findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__)
-            uncarried = status_of_source(bus).not_carried
-    assert list(uncarried) == sorted(uncarried)
-    assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(uncarried)
+            unsupported = status_of_source(bus).not_carried
+    assert list(unsupported) == sorted(unsupported)
+    assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(unsupported)
     [loss] = [each for each in findings if "silent while other topics arrive" in each.seen]
     assert (loss.state, "rel=" in loss.advice) == ("warning", True)
     [other] = [each for each in findings if "SensorCombined" in each.seen]
@@ -361,7 +361,7 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
     second = next(number for number, sent in enumerate(lines) if sent.px4 == 1)
     its_first = next(number for number, sent in enumerate(lines) if sent.px4 == 1 and sent.payload)
     # There is no order between two sessions: messages of the first one may have arrived later.
-    meanwhile = lines[second : its_first + 1]
+    overlapping = lines[second : its_first + 1]
     alone = [sent for sent in lines[:second] if sent.payload]
     played = 0
     with (
@@ -371,7 +371,7 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
         Px4(where) as other,
     ):
         later = [sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"]
-        of_both = ([sent for sent in meanwhile if bool(sent.px4) == is_second] for is_second in (True, False))
+        of_both = ([sent for sent in overlapping if bool(sent.px4) == is_second] for is_second in (True, False))
         for part in (lines[:second], *of_both, later):
             played = play(bus, (first, other), part, played)
         received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
@@ -444,9 +444,9 @@ def count_late_flags(name: str, rate: float) -> int:
                 then = truth(1e6 * turn / rate)
                 bits = 2 * then.v_xy_valid | 4 * then.v_z_valid | 24 * then.xy_valid | 32 * then.z_valid
                 vehicle.handle(dialect.MAVLink_estimator_status_message(0, bits, *[0.0] * 6, 1.0, 1.0), now)
-            said = vehicle.handle(position, now)
-            assert isinstance(said, SourceMessage)
-            fields = said.fields
+            converted = vehicle.handle(position, now)
+            assert isinstance(converted, SourceMessage)
+            fields = converted.fields
             late += any(fields.get(flag, False) != getattr(truth(1000 * position.time_boot_ms), flag) for flag in FLAGS)
     return late
 
@@ -455,8 +455,8 @@ def count_late_flags(name: str, rate: float) -> int:
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
 def test_requested_status_rate_reduces_late_flags(name: str) -> None:
     """At 57,600 baud, at most a third as many positions have late flags as with two statuses per second."""
-    often, seldom = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
-    assert 0 < 3 * often <= seldom
+    requested, slow = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
+    assert 0 < 3 * requested <= slow
 
 
 @pytest.mark.slow
