@@ -1,8 +1,6 @@
 """Simulated flight: the estimates and other messages of a vehicle as functions of the time since the start.
 
-The vehicle takes off and flies figures of eight at 20 m.
-
-Every lap of 120 s contains typical events of a real flight:
+The vehicle takes off and flies figures of eight at 20 m; each lap of 120 s has typical events of a real flight:
 
     t = 15 s         heading alignment: a heading reset
     t = 60 to 75 s   GPS outage: dead reckoning, xy invalid after 10 s; resets of xy and vxy at the end

@@ -178,7 +178,7 @@ class LogMessageBuilder:
         self._events: deque[tuple[int, str]] = deque(maxlen=100)  # unmatched events: time, words of a check
         self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log an event twice
         self._failed: dict[str, tuple[int, int]] = {}  # checks in the current report: level, blocked modes
-        self._previous: dict[str, tuple[int, int]] = {}
+        self._earlier: dict[str, tuple[int, int]] = {}
         self._nav_state = -1
 
     def merge(self, records: Iterable[Record]) -> Iterator[Record]:
@@ -190,9 +190,8 @@ class LogMessageBuilder:
             if name not in _TOPICS:
                 continue
             with suppress(LookupError, TypeError, ValueError, struct.error):  # the topic may have other fields
-                if (found := self._read(record)) and self.limit.admits(found.timestamp):
-                    text = to_log_text(found.text).encode()
-                    yield Data(LOG_MESSAGE, _STRUCT.pack(found.timestamp, found.level, text))
+                if (text := self._read(record)) and self.limit.admits(text.timestamp):
+                    yield Data(LOG_MESSAGE, _STRUCT.pack(text.timestamp, text.level, to_log_text(text.text).encode()))
 
     def _read(self, record: Record) -> LoggedText | None:
         """Return the text that a record completes; None without one, or for a duplicate."""
@@ -214,15 +213,14 @@ class LogMessageBuilder:
         self._seen.append((timestamp, *key))
         is_check = event.group in _CHECKS
         if level >= _PROTOCOL and event.group == "arming_check":  # starts a new report
-            self._failed, self._previous = {}, self._failed
+            self._failed, self._earlier = {}, self._failed
         if level >= _PROTOCOL or not (is_check or event.group == "default"):
             return None
         text = event.text
         if is_check:
             modes = _ALL_MODES if event.modes is None else event.modes
-            concerns_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
-            shown = level if concerns_mode else max(level, _INFO)
-            known = self._failed.get(text, self._previous.get(text))
+            affects_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
+            shown, known = level if affects_mode else max(level, _INFO), self._failed.get(text, self._earlier.get(text))
             if len(self._failed) < _MAX_A_SECOND:
                 self._failed[text] = shown, modes if level < _INFO else 0
             if known and known[0] <= shown:

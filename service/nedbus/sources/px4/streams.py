@@ -227,7 +227,6 @@ class StreamRegistry:
             stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
 
     def _unsupported_name(self, key: TopicKey, topic: str) -> str | None:
-        """Return the value of `Px4Stream.unsupported` for a key."""
         options, name = self._options, _message_name(key)
         is_known = key.dds_type in _by_dds_type() or key.dds_type in self._given
         if options.chosen_topics is None:

@@ -19,7 +19,7 @@ OURS: Final = (245, 191)
 OTHERS: Final = (246, 190)
 PX4: Final = dialect.MAV_AUTOPILOT_PX4
 ACCEPTED: Final = dialect.MAV_RESULT_ACCEPTED
-TAKEN: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
+REJECTED: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
 IN_PROGRESS: Final = dialect.MAV_RESULT_IN_PROGRESS
 
 Log = Literal["1", "armed", "take"]
@@ -46,7 +46,7 @@ class Session:
     def acknowledged(self) -> list[int]:
         return [each.sequence for each in self.sent if each.kind == "acknowledge"]
 
-    def take(self, commands: list[Command]) -> None:
+    def add(self, commands: list[Command]) -> None:
         self.sent += commands
         if self.client.status[:2] != self.states[-1]:
             self.states.append(self.client.status[:2])
@@ -57,18 +57,18 @@ class Session:
         for step in range(round(seconds * 10)):
             self.now += 0.1
             if heartbeats and step % 10 == 0:
-                self.take(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
-            self.take(self.client.tick(self.now))
+                self.add(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
+            self.add(self.client.tick(self.now))
 
     def answer(self, command: int, result: int, ids: tuple[int, int] = OURS) -> None:
-        self.take(self.client.on_command_ack(command, result, *ids, self.now))
+        self.add(self.client.on_command_ack(command, result, *ids, self.now))
 
     def receive(self, *, acked: bool = False, begins: bool = False, sequence: int | None = None) -> None:
         """Receive the next message of the stream, or the one with this sequence number."""
         self._next = 0 if begins else self._next
         assert self.client.accepts(*OURS)
         at = self._next if sequence is None else sequence
-        self.take(self.client.on_data(at, self.now, acked=acked, begins=begins))
+        self.add(self.client.on_data(at, self.now, acked=acked, begins=begins))
         self._next += sequence is None
 
     def header(self, messages: int = 274, round_trip: float = 0.004) -> None:
@@ -84,9 +84,9 @@ class Session:
         for step in range(round(seconds / interval)):
             self.now += interval
             if step % max(1, round(1 / interval)) == 0:
-                self.take(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
+                self.add(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
             self.receive()
-            self.take(self.client.tick(self.now))
+            self.add(self.client.tick(self.now))
 
     def start(self) -> None:
         """Start a stream; receive its header and its first second."""
@@ -126,7 +126,7 @@ def test_data_for_other_ids_is_rejected(session: Session) -> None:
 def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
     """A COMMAND_ACK for another client, or for another command, has no effect."""
     session.wait(0.1)
-    session.answer(START, TAKEN, OTHERS)
+    session.answer(START, REJECTED, OTHERS)
     session.answer(STOP, ACCEPTED)
     session.answer(400, ACCEPTED)
     assert session.states[-1] == ("starting", None)
@@ -138,7 +138,7 @@ def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
 @pytest.mark.parametrize(
     ("result", "reason", "retry"),
     [
-        (TAKEN, "taken", TIMINGS.log_retry),
+        (REJECTED, "taken", TIMINGS.log_retry),
         (dialect.MAV_RESULT_DENIED, "bandwidth", TIMINGS.log_slow_retry),
         (dialect.MAV_RESULT_UNSUPPORTED, "unsupported", TIMINGS.log_slow_retry),
         (dialect.MAV_RESULT_FAILED, "failed", TIMINGS.log_retry),
@@ -226,27 +226,27 @@ class TestOwnership:
         """Without log=take a rejected client does not send STOP, not even when it stops."""
         session.wait(0.1)
         for _ in range(4):
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
             session.wait(TIMINGS.log_retry)
-        session.answer(START, TAKEN)
-        session.take(session.client.stop(session.now))
+        session.answer(START, REJECTED)
+        session.add(session.client.stop(session.now))
         assert set(session.commands) == {"start"}
         assert session.client.status.state == "stopped"
 
     def test_owner_of_stream_is_named(self, session: Session) -> None:
         """Data on the same link reveals the ids of the client that owns the stream."""
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         assert "another client has it" in session.client.status.text
         assert not session.client.accepts(255, 190)
         assert "system 255 component 190 has it" in session.client.status.text
         assert session.client.status[:2] == ("refused", "taken")
 
     def test_log_take_takes_over_stream(self) -> None:
-        """log=take sends STOP, waits for acceptance and a pause, then sends START; data is acknowledged all along."""
+        """log=take sends STOP, waits for acceptance and a pause, then sends START, and acknowledges data throughout."""
         session = Session("take")
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.answer(STOP, IN_PROGRESS)
         session.wait(0.2)
         session.receive(acked=True, sequence=70)
@@ -264,11 +264,11 @@ class TestOwnership:
         """A client that is rejected again does not repeat STOP; with SDLOG_BACKEND 1 a takeover has no effect."""
         session = Session("take")
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.answer(STOP, ACCEPTED)
         session.wait(TIMINGS.log_timeout + 0.2)
         for _ in range(5):
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
             session.wait(TIMINGS.log_retry + 0.2)
         assert session.commands.count("stop") == 1
         assert session.states[1:] == [("starting", None), ("refused", "taken")]
@@ -276,14 +276,14 @@ class TestOwnership:
     def test_stream_of_earlier_process_is_restarted(self, session: Session) -> None:
         """A stream to the client's own ids without a header is restarted once with STOP, a pause and START."""
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.receive(sequence=7000)
         assert session.commands == ["start", "stop"]
         session.answer(STOP, ACCEPTED)
         session.receive(sequence=7001)
         session.wait(TIMINGS.log_timeout + 0.2)
         assert session.commands == ["start", "stop", "start"]
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.receive(sequence=7002)
         assert session.commands == ["start", "stop", "start"]
         assert session.client.status.reason == "taken"
@@ -303,7 +303,7 @@ class TestOwnership:
     def test_second_start_does_not_affect_stream(self, session: Session) -> None:
         """A late answer to START, or the rejection of a second START, has no effect."""
         session.start()
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.answer(START, ACCEPTED)
         session.stream()
         assert session.states[-1] == ("streaming", None)
@@ -410,7 +410,7 @@ class TestHeader:
         session.header()
         session.wait(1.5)
         assert session.commands == ["start", "start"]
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         assert session.client.status == ("streaming", None, "")
         assert session.client.header_seconds == pytest.approx(273 * 0.004)
 
@@ -431,7 +431,7 @@ class TestSilence:
         session.start()
         for _ in range(40):
             session.wait(5)
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
             session.receive()
         assert session.states[-1] == ("streaming", None)
         assert session.commands.count("start") < 30
@@ -462,7 +462,7 @@ class TestSilence:
         session.start()
         for _ in range(18):
             session.wait(1)
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
         assert session.states[-1] == ("refused", "taken")
         assert "stop" not in session.commands
 
@@ -487,7 +487,7 @@ class TestSilence:
         session.wait(20)
         session.armed = False
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         assert session.states[-1] == ("streaming", None)
 
     @pytest.mark.parametrize("seconds", [4.0, 60.0, 600.0])
@@ -515,7 +515,7 @@ def test_reboot_triggers_new_start(session: Session) -> None:
     """A reboot ends the stream; START follows the next heartbeat."""
     session.start()
     session.client.on_reboot()
-    session.take([])
+    session.add([])
     assert not session.client.accepts(*OURS)
     session.start()
     assert session.commands == ["start", "start"]
@@ -537,7 +537,7 @@ class TestStop:
     def test_stop_is_repeated_until_accepted(self, session: Session) -> None:
         """STOP is repeated after 1 s; the last messages are acknowledged until PX4 accepts STOP."""
         session.start()
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         session.answer(STOP, IN_PROGRESS)
         session.wait(1.2)
         for _ in range(44):
@@ -553,16 +553,16 @@ class TestStop:
     def test_unanswered_stop_times_out(self, session: Session) -> None:
         """STOP is sent three times to a vehicle that does not answer."""
         session.start()
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         session.wait(3.5)
         assert session.commands == ["start", "stop", "stop", "stop"]
         assert session.client.status.state == "stopped"
 
-    @pytest.mark.parametrize("result", [ACCEPTED, TAKEN, None])
+    @pytest.mark.parametrize("result", [ACCEPTED, REJECTED, None])
     def test_stop_waits_for_pending_start(self, session: Session, result: int | None) -> None:
         """The stream may be another client's, so STOP is sent only if the pending START is accepted."""
         session.wait(0.1)
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         assert session.client.status.state == "stopping"
         session.wait(0.5)
         if result is None:
@@ -573,7 +573,7 @@ class TestStop:
         assert session.client.status.state == ("stopping" if result == ACCEPTED else "stopped")
 
     def test_stop_before_any_start_sends_nothing(self, session: Session) -> None:
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         session.wait(10)
         assert (session.sent, session.client.status.state) == ([], "stopped")
 

@@ -146,7 +146,7 @@ def test_denied_start_is_reported() -> None:
 
 
 def test_stream_of_another_client_is_rejected() -> None:
-    """Its data arrives on the same link."""
+    """Its data is rejected even if it arrives on the same link."""
     with Link().to("default_topics", owner=OTHERS, is_owner_heard=True) as link:
         link.run(lambda: link.rejected > 20)
     assert link.states[1:] == [("starting", None), ("refused", "taken")]
@@ -161,7 +161,7 @@ class TestAbnormalStreams:
         """PX4 sends the message 50 times, and then nothing."""
         with Link(acknowledges=False).to("flight1") as link:
             link.run_to(("starting", None), ("header", None), ("ended", "stalled"))
-            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last ones may come later
+            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last ones may arrive later
         assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
     def test_start_without_data_is_repeated(self) -> None:

@@ -76,7 +76,7 @@ def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRe
             send(streams, stream, number, 100.2 + number)
     streams.remove_publisher(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="the same gid"):
-        send(streams, stream, 900, 201.9)  # what it sent last comes after its token
+        send(streams, stream, 900, 201.9)  # its last messages arrive after its token
     assert send(streams, stream, 30, 202.1) == (0, False)
     assert send(streams, stream, 31, 202.2) == (0, False)
 

@@ -123,7 +123,7 @@ def times(messages: Iterable[SourceMessage]) -> list[object]:
 
 
 def test_message_of_px4_reaches_readers(serve: Callable[[], Process], raw: Session, every: nedbus.Subscription) -> None:
-    """A service publishes it under the vehicle's name; fields that its release lacks are missing."""
+    """A service publishes the message under the vehicle's name; `sample.missing` has the fields its release lacks."""
     serve()
     px4 = Px4(raw, layout="1.14")
     sent = message(1, x=0.1, xy_valid=True, y=-1.0, hagl_max_z=5.0)
@@ -233,11 +233,11 @@ def test_user_definition_adds_a_message(
     wait_for_reader(raw, key)
     token = raw.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
     raw.put(key, b"")
-    wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the list")
+    wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the unsupported message")
     assert status_of_source(bus).rejected == 0
     assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
     token.undeclare()
-    wait_for(lambda: status_of_source(bus).not_carried == (), what="the list to be empty")
+    wait_for(lambda: status_of_source(bus).not_carried == (), what="no unsupported message")
     service.kill()
     run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:?msg={tmp_path}")
     wait_for_reader(raw, key)
@@ -382,7 +382,7 @@ def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, raw: Sessio
     for sequence in range(10):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
         px4.put(100 + sequence, attachment=bytes(Attachment(sequence, 0, GID[::-1])))
-    listener.turn_until(lambda: len(listener.messages) + listener.rejected == 20, what="all")
+    listener.turn_until(lambda: len(listener.messages) + listener.rejected == 20, what="all messages")
     assert times(listener.receive(10)) == list(range(10))
 
 
@@ -414,7 +414,7 @@ def test_ended_source_undeclares_its_subscriber(raw: Session, endpoint: str) -> 
     with plain_session(endpoint) as lent:
         with Listener("px4-zenoh:", router=lent):
             wait_for(lambda: is_read(probe), what="the subscriber")
-        wait_for(lambda: not is_read(probe), what="the subscriber to go")
+        wait_for(lambda: not is_read(probe), what="the subscriber to be undeclared")
 
 
 def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
@@ -431,7 +431,7 @@ def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
 
 
 def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: Path) -> None:
-    """The router may come from a configuration file, or try to connect to another one that is down."""
+    """The service's router may have a configuration file, or also connect to a router that is down."""
     own, down = free_endpoint(), free_endpoint()
     file = tmp_path / "router.json5"
     listen = f'listen: {{endpoints: ["{own}"]}}'
@@ -449,7 +449,7 @@ def test_unreachable_router_is_retried(run_nedbus: Start) -> None:
     endpoint, other = free_endpoint(), free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", f"px4-zenoh:{other}", "-s", "sim:")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(vehicle="7") as subscription:
-        wait_for(lambda: "no Zenoh router answers:" in service.err, what="the first try")
+        wait_for(lambda: "no Zenoh router answers:" in service.err, what="the first attempt")
         run_nedbus("router", "--listen", other)
         with plain_session(other) as vehicle:
             Px4(vehicle, namespace="7").put(1)
@@ -475,7 +475,7 @@ def test_stale_vehicle_is_not_listed(
     assert list(bus.vehicles()) == ["domain1"]
     assert "is stale: no message for 3 s" in service.err
     px4.put(2)
-    wait_for(lambda: status_of_source(bus).stale == (), what="the vehicle to be back")
+    wait_for(lambda: status_of_source(bus).stale == (), what="the vehicle to return")
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
 
 
