@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from nedbus.sources import FileAccount, read_account
+from nedbus.sources import FileEvents, read_events
 from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.first_message import FIELD_TYPES, LAYOUTS, downgrade
@@ -23,9 +23,9 @@ def _type(name: str, field_types: Mapping[str, str]) -> str:
 
 
 @cache
-def account_of(log: Path) -> FileAccount:
-    """Return the account of a real log, read once for all tests of a worker: a large one takes more than a second."""
-    return read_account(log)
+def cached_events(log: Path) -> FileEvents:
+    """Return the events of a real log, read once per test worker: a large log takes more than a second."""
+    return read_events(log)
 
 
 def said_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:

@@ -4,10 +4,10 @@ To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`).
 a detector, too, which yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
 """
 
-from .account import KEPT, MAX_VEHICLES, Account
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State
+from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of

@@ -81,7 +81,7 @@ class ChangeDetector:
     `detect` gets None for fields that were not provided. `context`: names of further fields that it gets.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: its timestamp and that of the one before [us].
-    `pause`: seconds after a message in which further ones are not needed, until `due` by the account's clock.
+    `pause`: seconds after a message in which further ones are not needed, until `due` by the event log's clock.
     """
 
     pause = 0.0

@@ -19,7 +19,7 @@ ALL: Final = "*"
 """Vehicle name of events that concern all vehicles: those of the link and of the reader itself."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
-"""A time by the account's clock [s]; the bounds validate reports of peers."""
+"""A time by the event log's clock [s]; the bounds validate reports of peers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class Event:
     """One event of a vehicle.
 
     `kind`: a key of KINDS. `change`: "begin" or "end" of a condition, or "once".
-    `time`: seconds by the account's clock: the steady clock of this host (live), Unix time (in a report), or since the
+    `time`: on the event log's clock [s]: the steady clock of this host (live), Unix time (in a report), or since the
     start of a file. `boot`: seconds since the vehicle's boot, None if no message has given it.
     `numbers`: values by name, in SI units and NED. `names`: flags, sensors, or the values before and after.
     `lasted`: duration of a condition that ends [s], None if it began before the first message.
@@ -72,7 +72,7 @@ class Event:
 class Condition:
     """A condition of a vehicle.
 
-    `since`: its begin by the account's clock [s]. `begin`: the event that began it.
+    `since`: its begin by the event log's clock [s]. `begin`: the event that began it.
     `initial`: it already held in the first message, so its real begin is unknown.
     """
 

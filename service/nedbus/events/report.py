@@ -1,4 +1,4 @@
-"""The account that a service sends to its peers: recent events, and the state of each vehicle."""
+"""The report that a service sends to its peers: recent events, and the state of each vehicle."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import check_vehicle
 
-from .account import KEPT, MAX_VEHICLES, Account
 from .event import Condition, Event, Seconds
+from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .kinds import KINDS, rank_vehicle
 
 ACCOUNT_PARAMETER: Final = "events"
-"""Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
+"""Parameter of a status query that requests this report in place of the status; its value is the period [s]."""
 
 _MAX_TOPICS: Final = 30  # per vehicle
 _Name = Annotated[str, AfterValidator(check_vehicle)]
@@ -53,7 +53,7 @@ class VehicleReport:
 
 @dataclass(frozen=True, slots=True)
 class AccountReport:
-    """The account of one service; times are seconds since the epoch by the clock of its host."""
+    """The report of one service; times are seconds since the epoch by the clock of its host."""
 
     service: str
     host: str
@@ -75,17 +75,17 @@ _REPORT: Final = TypeAdapter(AccountReport)
 
 
 def report_of(
-    account: Account, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
+    event_log: EventLog, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
 ) -> AccountReport:
     """Return a report of all events kept of the last `within` seconds, and the state of each vehicle.
 
-    `now`: by the account's clock [s]; `to_utc`: what its times need to become Unix time [s].
+    `now`: by the event log's clock [s]; `to_utc`: what its times need to become Unix time [s].
     """
-    events = [event for event in account.events if event.time > now - within]
+    events = [event for event in event_log.events if event.time > now - within]
     reported = {event.identity for event in events}
     vehicles = {}
-    for name, vehicle in list(account.vehicles.items()):
-        state = account.state(name, now)
+    for name, vehicle in list(event_log.vehicles.items()):
+        state = event_log.state(name, now)
         held = list(vehicle.conditions.items())
         flags = {flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if KINDS[kind].validity}
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))

@@ -35,7 +35,7 @@ class Story:
     """One fault of a vehicle.
 
     `spans`: its conditions, the main one first. `what`: their text.
-    `since`, `until`: by the account's clock [s]; `until` is None while it is active.
+    `since`, `until`: by the event log's clock [s]; `until` is None while it is active.
     `begin`: the event that began it, None if it already held in the first message. `end`: the event that ended it.
     `before`: the evidence, oldest first. `meanwhile`: other events until its end. `after`: events at its end.
     `lacking`: topics that could have evidence, but are not in the data.

@@ -24,7 +24,7 @@ CLOCKS: Final[Mapping[str, str]] = {
 class Times:
     """Conversion of event times to UTC, for live data or for a file.
 
-    `is_live`: the account's clock is the clock of this host, `ahead` seconds behind Unix time.
+    `is_live`: the event log's clock is the clock of this host, `ahead` seconds behind Unix time.
     `offsets`: Unix time minus time since boot [s], for each vehicle whose messages contain it.
     """
 
@@ -67,7 +67,7 @@ class Times:
         return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({to_age(lasted)})"
 
     def find(self, text: str, near: Event) -> float:
-        """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the account's time [s].
+        """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the event log's time [s].
 
         `near`: an event of the same vehicle; the closest such time is returned.
 

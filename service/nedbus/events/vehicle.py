@@ -40,7 +40,7 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions that held in the first messages.
     `topics`: the topics that it publishes.
     `main`: the address of the position estimate in use: vehicle_local_position if published, else another estimate.
-    `heard`: time of the last message, by the account's clock [s], or of the last update while it has a publisher.
+    `heard`: time of the last message, by the event log's clock [s], or of the last update while it has a publisher.
     `time`: time of the last message with a detector. `boot`: its time since boot [s].
     `recent`: the most recent events, searched for evidence.
     """

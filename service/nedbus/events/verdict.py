@@ -50,7 +50,7 @@ def verdict_of(
 
     `events`: those of this vehicle and of ALL, in order of time; others are left out. `held`: conditions that are
     active after the last event. `topics`: the topics that it publishes. `unknown`: flags that its position does not
-    provide. `end`: now, or the end of the file, by the account's clock [s]. `at`: the moment in question, None for all.
+    provide. `end`: now, or the end of the file, on the event log's clock [s]. `at`: a moment, None for all.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     stories = stories_of(events, held, topics=topics, at=at)

@@ -100,7 +100,7 @@ class Exporter(Observer):
             "nedbus_messages_invalid": [((), counts.invalid)],
             "nedbus_queue_messages": [((), self.subscription.waiting)],
             "nedbus_limit_reached": [
-                (("vehicles",), self.account.refused), (("streams",), self.monitor.evicted),
+                (("vehicles",), self.event_log.refused), (("streams",), self.monitor.evicted),
                 (("keys",), counts.forgotten),
             ],
             "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
@@ -109,7 +109,7 @@ class Exporter(Observer):
             ],
         })  # fmt: skip
         yield from stream_metrics(streams, messages="nedbus_messages_received")
-        yield from vehicle_metrics(self.account, streams)
+        yield from vehicle_metrics(self.event_log, streams)
 
     def _read(self) -> None:
         for sample in self.subscription.rows():
@@ -142,4 +142,4 @@ class Exporter(Observer):
         if not self._bus.connected:
             return Page.verdict(self._faults(), "")
         host, now = socket.gethostname(), clock.steady()
-        return vehicles_page(report_of(self.account, "export", host, now, within=0.0, to_utc=clock.to_utc()))
+        return vehicles_page(report_of(self.event_log, "export", host, now, within=0.0, to_utc=clock.to_utc()))

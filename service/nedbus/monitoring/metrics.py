@@ -19,7 +19,7 @@ from prometheus_client.registry import Collector
 from nedbus import clock
 from nedbus.client import Health, Histogram, SourceStatus
 from nedbus.daemon import STATES, TOO_MANY, Daemon, SourceMeasures
-from nedbus.events import SEVERITIES, Account
+from nedbus.events import SEVERITIES, EventLog
 
 from .http_server import Page
 
@@ -188,11 +188,11 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
     })  # fmt: skip
 
 
-def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
+def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
     """Yield the vehicle metrics; a vehicle without an active stream has event counts but no state."""
-    now, vehicles = clock.steady(), list(account.vehicles)
+    now, vehicles = clock.steady(), list(event_log.vehicles)
     active = {stream.labels[0] for stream in streams if stream.active}
-    states = {name: account.state(name, now) for name in active if name in vehicles or account.is_full}
+    states = {name: event_log.state(name, now) for name in active if name in vehicles or event_log.is_full}
     kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
     yield from make_metrics({
         "nedbus_vehicle_state": [
@@ -201,7 +201,7 @@ def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iter
         ],
         "nedbus_vehicle_condition": [((name, kind), 1) for name in kinds for kind in kinds[name]],
         "nedbus_vehicle_events": [
-            ((name, severity), account.counts[name, severity]) for name in vehicles for severity in SEVERITIES
+            ((name, severity), event_log.counts[name, severity]) for name in vehicles for severity in SEVERITIES
         ],
     })  # fmt: skip
 
@@ -226,12 +226,12 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
         for each in measures.status.streams
     ]
     yield from stream_metrics(streams, messages="nedbus_messages_published")
-    account = daemon.look(list(sources.values()))
-    yield from vehicle_metrics(account, streams)
+    event_log = daemon.look(list(sources.values()))
+    yield from vehicle_metrics(event_log, streams)
     of = {label: measures.status for label, measures in sources.items()}
     addresses = sum(each.status.rejections.get(TOO_MANY, 0) for each in sources.values())
     yield from make_metrics({
-        "nedbus_limit_reached": [(("vehicles",), account.refused), (("addresses",), addresses)],
+        "nedbus_limit_reached": [(("vehicles",), event_log.refused), (("addresses",), addresses)],
         "nedbus_source_rejected": [((label,), status.rejected) for label, status in of.items()],
         "nedbus_messages_rejected": [
             ((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from nedbus import clock
 from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
-from nedbus.events import RECENT, Account
+from nedbus.events import RECENT, EventLog
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Selection
 
@@ -37,14 +37,14 @@ class Snapshot:
 
 
 class Observer:
-    """Subscribe to a selection and keep an `account` of the events and states of its vehicles, by the steady clock.
+    """Subscribe to a selection and keep an `event_log` of its vehicles on the steady clock.
 
     The thread that reads `subscription` passes each sample to `add`. `poll` and `measure` may be called in any thread;
     call `poll` about twice a second.
     """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
-        self.account = Account()
+        self.event_log = EventLog()
         self.subscription = bus.subscribe_to(selection, mode="every")
         self._bus, self._selection = bus, selection
         self.monitor = Monitor()
@@ -59,7 +59,7 @@ class Observer:
             counts = self.monitor.add(sample)
         if counts:
             missing, now = sample.provenance.missing, clock.steady()
-            self.account.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
+            self.event_log.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
 
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
         """Return the current health and latencies of each stream."""
@@ -68,7 +68,7 @@ class Observer:
             return {address: (health, self.monitor.latencies(address)) for address, health in healths.items()}
 
     def poll(self) -> Snapshot:
-        """Poll streams, rejections and the link, and record changes in the account."""
+        """Poll streams, rejections and the link, and record changes in the event log."""
         now, connected = clock.steady(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
         with self._lock:
@@ -76,30 +76,30 @@ class Observer:
         taken = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
-            self.account.reject(report.address, report.reason, now)
+            self.event_log.reject(report.address, report.reason, now)
         alive = self._bus.publishers(timeout=0.2)
         self._disconnected = self._disconnected if connected else now
         settled = now - self._disconnected > _SETTLING_TIME
         states = {
             main: stream_state(healths[main], publishers=alive[main]).name if settled else "unknown"
-            for main in [vehicle.main for vehicle in list(self.account.vehicles.values())]
+            for main in [vehicle.main for vehicle in list(self.event_log.vehicles.values())]
             if main is not None and (main in healths or not settled)
         }
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"
         paused, self._looked = self._looked is not None and now - self._looked > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
-        self.account.update(
+        self.event_log.update(
             now, states, link=link, dropped=dropped, is_behind=is_behind, present={each.vehicle for each in alive}
         )
         if settled:
             silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
             for age, address in silent:
-                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.account.vehicles):
+                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.event_log.vehicles):
                     del healths[address]
                     with self._lock:
                         self.monitor.forget(address)
         behind = ""
-        if self.account.overload is not None:
+        if self.event_log.overload is not None:
             behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"
         return Snapshot(now, healths, alive, rejected, link, behind)

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from nedbus.events import (
-    Account,
     Condition,
     Event,
+    EventLog,
     Span,
     Story,
     Times,
@@ -27,13 +27,13 @@ _TENTH: Final = 0.1  # s; time resolution of the page's URL
 
 
 class Chronicle:
-    """The events of an account and those `before` it; re-evaluated only after new events.
+    """The events of an event log and those `before` it; re-evaluated only after new events.
 
-    `start`: what to add to times of the account on an axis [s]; `unit`: the name of the clock that this gives.
+    `start`: what to add to times of the event log on an axis [s]; `unit`: the name of the clock that this gives.
     """
 
-    def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
-        self.account = account
+    def __init__(self, event_log: EventLog, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
+        self.event_log = event_log
         self.times = times or Times(is_live=True)
         self.start, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
         self._before = before
@@ -59,15 +59,15 @@ class Chronicle:
     def set_start(self, vehicle: str, boot: float, time: float) -> None:
         """Set the clock of the axis in a recording, from a message `boot` seconds after a vehicle's boot."""
         utc = self.times.utc_of_boot(vehicle, boot)
-        if utc is not None or len(self.account.vehicles) < 2:  # vehicles boot at different times
+        if utc is not None or len(self.event_log.vehicles) < 2:  # vehicles boot at different times
             self.start, self.unit = (boot if utc is None else utc) - time, unit_of("boot" if utc is None else "vehicle")
 
     def moment(self, seconds: float) -> str:
-        """Format a time of the account by the clock of the axis."""
+        """Format a time of the event log by the clock of the axis."""
         return to_clock(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
 
     def clock(self, seconds: float) -> str:
-        """Format a time of the account with the name of its clock and, in a recording, since the start."""
+        """Format a time of the event log with the name of its clock and, in a recording, since the start."""
         since = "" if self.times.is_live or not self.start else f", {seconds:.1f} {unit_of('start')}"
         return f"{self.moment(seconds)} {self.unit}{since}"
 
@@ -112,17 +112,17 @@ class Chronicle:
 
     def _known(self, vehicle: str) -> tuple[list[str], list[Condition]]:
         """Return the topics of a vehicle, and the conditions that began before the first event or are still active."""
-        known = self.account.vehicles.get(vehicle)
+        known = self.event_log.vehicles.get(vehicle)
         return ([], []) if known is None else ([*known.topics], [*known.initial, *known.conditions.values()])
 
     def _read(self) -> None:
-        if self._taken == self.account.reported:
+        if self._taken == self.event_log.reported:
             return
-        events, self._taken = self.account.events_since(0)
+        events, self._taken = self.event_log.events_since(0)
         self._events = sorted([*self._before, *events], key=lambda event: event.time)
         self._tell.cache_clear()
         self._verdicts.clear()
-        vehicles = dict(self.account.vehicles)
+        vehicles = dict(self.event_log.vehicles)
         self._by_vehicle = {name: [] for name in vehicles}
         for event in self._events:
             self._by_vehicle.setdefault(event.vehicle, []).append(event)

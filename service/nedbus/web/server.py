@@ -111,7 +111,7 @@ class LiveFleet(Exporter):
             for event in report.events
             if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
         ]
-        self.chronicle = Chronicle(self.account, before=remembered)
+        self.chronicle = Chronicle(self.event_log, before=remembered)
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample to the metrics and the fleet."""
@@ -120,11 +120,11 @@ class LiveFleet(Exporter):
 
     def poll(self) -> Snapshot:
         """Poll all vehicles, and update the fleet and the clock of the chronicle."""
-        snapshot, account = super().poll(), self.account
+        snapshot, event_log = super().poll(), self.event_log
         ahead = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
         self.chronicle.start, self.chronicle.times = ahead, Times(is_live=True, ahead=ahead)
-        vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
-        states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}
+        vehicles = {*event_log.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
+        states = {vehicle: event_log.state(vehicle, snapshot.time) for vehicle in vehicles}
         self.fleet.update(snapshot, states, self.log_streams)
         return snapshot
 

@@ -1,11 +1,11 @@
-"""A vehicle with hand-made messages, and its account."""
+"""A vehicle with hand-made messages, and its event log."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any, Final
 
-from nedbus.events import Account, Event
+from nedbus.events import Event, EventLog
 from nedbus_msgs import Address, get_topic
 from tests.flights.messages import VALID, VLP, message
 
@@ -20,10 +20,10 @@ DISARMED, ARMED = 1, 2
 
 
 class Flight:
-    """A vehicle and its account; messages arrive when they are sent, in seconds since boot."""
+    """A vehicle and its event log; messages arrive when they are sent, in seconds since boot."""
 
     def __init__(self) -> None:
-        self.account = Account()
+        self.event_log = EventLog()
         self.now = 100.0
         self.booted = 90.0
         self.link = ""
@@ -44,7 +44,7 @@ class Flight:
             values = message(stamp, **(VALID | ORIGIN | fields))
         instance = 0 if instance is None and get_topic(topic).instances else instance
         address = Address(vehicle, topic, instance)
-        self.account.add(address, values, self.now, missing=frozenset(missing), lost=lost)
+        self.event_log.add(address, values, self.now, missing=frozenset(missing), lost=lost)
         return self.take()
 
     def fly(self, seconds: float, rate: float = 10.0) -> list[Event]:
@@ -65,25 +65,25 @@ class Flight:
         return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
 
     def look(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
-        """Update the account with this state of the position stream, None if unknown; return the new events."""
-        self.account.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
+        """Update the event log with this state of the position stream, None if unknown; return the new events."""
+        self.event_log.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
         return self.take()
 
     def reject(self, reason: str = "x is NaN") -> list[Event]:
-        self.account.reject(POSITION, reason, self.now)
+        self.event_log.reject(POSITION, reason, self.now)
         return self.take()
 
     def take(self) -> list[Event]:
-        new, self._seen = self.account.events_since(self._seen)
+        new, self._seen = self.event_log.events_since(self._seen)
         return new
 
     @property
     def severity(self) -> str:
-        return self.account.state("1", self.now).severity
+        return self.event_log.state("1", self.now).severity
 
     @property
     def kinds(self) -> list[str]:
-        return [each.kind for each in self.account.state("1", self.now).conditions]
+        return [each.kind for each in self.event_log.state("1", self.now).conditions]
 
 
 def lose_gps(flight: Flight) -> None:

@@ -48,7 +48,7 @@ class World:
             publisher=lambda address, *_, **__: SimpleNamespace(definition=BY_TOPIC[address.topic], **vars(publisher)),
         )
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.daemon.account
+            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.daemon.event_log
         )
         bus = SimpleNamespace(
             connected=True,
@@ -95,9 +95,9 @@ class World:
             if tick % (RATE // 2) == 0:
                 self.daemon.look()
                 self.reader.poll()
-        for account in (self.daemon.account, self.reader.account):
-            account.settle(START + self.now + 60)
-            yield [asdict(event) for event in account.events_since(0)[0]]
+        for event_log in (self.daemon.event_log, self.reader.event_log):
+            event_log.settle(START + self.now + 60)
+            yield [asdict(event) for event in event_log.events_since(0)[0]]
 
 
 def fly(step: float, at: float) -> tuple[World, list[object]]:
@@ -107,7 +107,7 @@ def fly(step: float, at: float) -> tuple[World, list[object]]:
         read = from_json(json.loads(json.dumps(asdict(world.daemon.report(within=1e5)))))
         assert read is not None
         labels = [event.time for event in read.events]
-        steady = [event.time + world.offset for event in world.daemon.account.events_since(0)[0]]
+        steady = [event.time + world.offset for event in world.daemon.event_log.events_since(0)[0]]
         assert labels == pytest.approx(steady, abs=0.01)
         assert read.now == pytest.approx(START + world.now + world.offset, abs=0.01)
         assert world.daemon.status.started == pytest.approx(START + world.offset, abs=0.01)

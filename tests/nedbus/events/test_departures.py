@@ -12,7 +12,7 @@ from nedbus import Bus, Counts, Sample, Selection
 from nedbus.client import PublisherRegistry
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
-from nedbus.events.account import MAX_GONE
+from nedbus.events.event_log import MAX_GONE
 from nedbus.monitoring import Observer
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
@@ -34,7 +34,7 @@ class World:
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
         registry = SimpleNamespace(publisher=self._publisher, shared_vehicles=set, publishers=())
         self.daemon._registry = cast("PublisherRegistry", registry)
-        self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.account)
+        self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.event_log)
         bus = SimpleNamespace(
             connected=True,
             subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
@@ -59,16 +59,16 @@ class World:
         self.alive = Counter(alive)
         self.daemon.look()
         self.output.expire_stale()
-        snapshot, account = self.reader.poll(), self.reader.account
-        states = {name: account.state(name, self.now) for name in account.vehicles}
+        snapshot, event_log = self.reader.poll(), self.reader.event_log
+        states = {name: event_log.state(name, self.now) for name in event_log.vehicles}
         self.fleet.update(snapshot, states)
 
     def sizes(self) -> dict[str, int]:
         """Return the number of objects for each kind of state."""
-        accounts = self.daemon.account, self.reader.account
+        event_logs = self.daemon.event_log, self.reader.event_log
         return {
-            "vehicles": max(len(each.vehicles) for each in accounts),
-            "counts": max(len(each.counts) for each in accounts),
+            "vehicles": max(len(each.vehicles) for each in event_logs),
+            "counts": max(len(each.counts) for each in event_logs),
             "addresses": len(self.output.addresses + self.output.stale),
             "streams": len(self.reader.measure()),
             "page": len(self.fleet.streams),

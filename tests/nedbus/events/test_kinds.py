@@ -28,9 +28,9 @@ def test_kind_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
     [begun] = flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=True)
     assert (begun.kind, begun.severity, begun.text) == ("freefall", "bad", "free fall")
     assert [each.kind for each in begun.evidence] == ["gps_fix_lost"]
-    assert flight.account.state("1", flight.now).text == "free fall"
+    assert flight.event_log.state("1", flight.now).text == "free fall"
     flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=False)
-    [story] = [each for each in stories_of(flight.account.events) if each.what == "free fall"]
+    [story] = [each for each in stories_of(flight.event_log.events) if each.what == "free fall"]
     assert [each.kind for each in story.before] == ["gps_fix_lost"]
 
 

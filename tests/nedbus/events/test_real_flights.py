@@ -18,7 +18,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
-from nedbus.sources import FileAccount
+from nedbus.sources import FileEvents
 from tests.flights import ulogs
 from tests.flights.ulogs import LOGS
 from tests.nedbus.events import events_table
@@ -41,12 +41,12 @@ def path_of(name: str) -> Path:
     return next(LOGS.parent.rglob(f"{name}.ulg"))
 
 
-def account_of(name: str) -> FileAccount:
-    return ulogs.account_of(path_of(name))
+def cached_events(name: str) -> FileEvents:
+    return ulogs.cached_events(path_of(name))
 
 
 def told_in(name: str) -> list[Event]:
-    return account_of(name).account.events_since(0)[0]
+    return cached_events(name).event_log.events_since(0)[0]
 
 
 def time_of(event: Event) -> float:
@@ -153,8 +153,8 @@ def test_evidence_precedes(name: str) -> None:
 
 def why(name: str, *, at: float | None = None) -> list[Story]:
     """Return the stories of a log; `at` is seconds since boot."""
-    read, told = account_of(name), told_in(name)
-    followed = read.account.vehicles["1"]
+    read, told = cached_events(name), told_in(name)
+    followed = read.event_log.vehicles["1"]
     if at is not None:
         at = read.times.find(str(at), told[-1])
     return stories_of(told, followed.conditions.values(), topics=list(followed.topics), at=at)
@@ -196,7 +196,7 @@ def test_estimate_that_was_never_valid(name: str, lacking: tuple[str, ...]) -> N
 @pytest.mark.parametrize("name", NAMES)
 def test_what_held_for_the_whole_flight(name: str) -> None:
     """A flight without fix and global reference has these conditions, also after landing; others got both in time."""
-    vehicle = account_of(name).account.vehicles["1"]
+    vehicle = cached_events(name).event_log.vehicles["1"]
     held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
     not_global = {"xy has no global reference", "z has no global reference"}
     assert held == {
@@ -309,8 +309,8 @@ def test_texts_are_those_of_px4(name: str) -> None:
 
 def verdict(path: Path) -> Verdict:
     """Return the verdict on the vehicle of a log."""
-    read = ulogs.account_of(path)
-    events, (followed,) = read.account.events_since(0)[0], read.account.vehicles.values()
+    read = ulogs.cached_events(path)
+    events, (followed,) = read.event_log.events_since(0)[0], read.event_log.vehicles.values()
     held = [each for each in followed.conditions.values() if each.severity != "info"]
     return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)
 
@@ -334,7 +334,7 @@ def test_verdict_names_cause_and_times(
     assert found.end is not None
     assert (found.usable, found.begin.boot, found.end.boot) == (False, begin, end)
     assert [each for each in short(found.cause) if each in cause] == cause
-    times = account_of(name).times
+    times = cached_events(name).times
     moments = [times.text(each) for each in (found.begin, found.end, *found.cause) if (each.kind, each.boot) in cause]
     assert all(moment in found.text for moment in moments)
     assert f"({end - begin:.1f} s)" in found.text
@@ -369,7 +369,7 @@ def test_verdict_of_a_flight_without_gps() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_state_and_verdict_name_the_same_cause(name: str) -> None:
     """While a flight goes on, the fault of the badge is the one that the live verdict names, after each event."""
-    events, (followed,) = told_in(name), account_of(name).account.vehicles.values()
+    events, (followed,) = told_in(name), cached_events(name).event_log.vehicles.values()
     spans, states = spans_of(events, list(followed.initial)), 0
     for now in sorted({event.time + after for event in events for after in (0.001, 1.0)}):
         state = state_at(spans, now)

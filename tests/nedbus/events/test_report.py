@@ -41,7 +41,7 @@ SCRIPT = AccountReport("", "h", 0.0, {"7": VehicleReport("info", "ok", has_posit
 
 
 def report(flight: Flight, *, service: str = "s", host: str = "h", within: float = 1e9) -> AccountReport:
-    return report_of(flight.account, service, host, flight.now, within=within)
+    return report_of(flight.event_log, service, host, flight.now, within=within)
 
 
 def flying(*, since: float = 1.0, **fields: Any) -> Flight:
@@ -88,7 +88,7 @@ def test_story_is_the_same_from_a_report() -> None:
 
 
 def test_report_has_all_events_of_the_period() -> None:
-    """A report has all events of the period that the account keeps, and none for a period that is no number."""
+    """A report has all events of the period that the event log keeps, and none for a period that is no number."""
     flight = Flight()
     for number in range(1500):
         flight.wait(0.1).status(ARMED, nav_state=number % 3)

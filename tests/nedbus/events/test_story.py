@@ -13,9 +13,9 @@ from .flight import ARMED, Flight, lose_gps
 
 
 def why(flight: Flight, *, at: float | None = None) -> list[Story]:
-    """Return the stories of a vehicle; `at` is by the account's clock."""
-    followed = flight.account.vehicles["1"]
-    events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
+    """Return the stories of a vehicle; `at` is by the event log's clock."""
+    followed = flight.event_log.vehicles["1"]
+    events = sorted(flight.event_log.events_since(0)[0], key=lambda each: each.time)
     return stories_of(events, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
@@ -122,7 +122,7 @@ def test_condition_whose_begin_is_not_reported() -> None:
     flight = Flight()
     flight.send(z_valid=False)
     flight.wait(2.0).send(z_valid=False, xy_valid=False)
-    held = list(flight.account.vehicles["1"].conditions.values())
+    held = list(flight.event_log.vehicles["1"].conditions.values())
     assert [(each.what, each.begin, each.until) for each in stories_of([], held)] == [
         ("z not valid", None, None), ("xy not valid", held[1].begin, None),
     ]  # fmt: skip

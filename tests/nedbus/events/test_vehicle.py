@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Account, Event, Times, report_of, spans_of, state_at, stories_of, story_of
+from nedbus.events import Event, EventLog, Times, report_of, spans_of, state_at, stories_of, story_of
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP
 
@@ -15,27 +15,27 @@ GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indica
 
 
 class Sent:
-    """An account of vehicle 1 that gets fields by name, as in a service."""
+    """An event log of vehicle 1 that gets fields by name, as in a service."""
 
     def __init__(self) -> None:
-        self.account = Account()
+        self.event_log = EventLog()
 
     def __call__(self, time: float, topic: str = VLP, instance: int | None = None, **fields: Any) -> None:
         given = {**(VALID if topic.endswith("local_position") else {}), "timestamp": round((10 + time) * 1e6), **fields}
         given = {name: value for name, value in given.items() if value is not None}
-        self.account.add(Address("1", topic, instance), given, time)
+        self.event_log.add(Address("1", topic, instance), given, time)
 
     @property
     def told(self) -> list[tuple[str, str]]:
-        return [(event.kind, event.change) for event in self.account.events]
+        return [(event.kind, event.change) for event in self.event_log.events]
 
     def state(self, time: float) -> str:
-        return self.account.state("1", time).severity
+        return self.event_log.state("1", time).severity
 
     def stories(self, **options: Any) -> list[tuple[str, float | None]]:
-        vehicle = self.account.vehicles["1"]
+        vehicle = self.event_log.vehicles["1"]
         conditions = [*vehicle.initial, *vehicle.conditions.values()]
-        return [(story.what, story.until) for story in stories_of(list(self.account.events), conditions, **options)]
+        return [(story.what, story.until) for story in stories_of(list(self.event_log.events), conditions, **options)]
 
 
 @pytest.fixture
@@ -58,11 +58,11 @@ def test_flags_that_a_source_does_not_have_are_no_state(sent: Sent) -> None:
 def test_silence_ends_with_the_vehicle_that_was_gone(sent: Sent) -> None:
     """A vehicle that was silent, then gone, then back, has no story without an end."""
     sent(0.0)
-    sent.account.update(4.0, {MAIN: "stale"})
-    sent.account.update(8.0, {MAIN: "gone"})
+    sent.event_log.update(4.0, {MAIN: "stale"})
+    sent.event_log.update(8.0, {MAIN: "gone"})
     sent(20.0)
     assert sent.told == [("silent", "begin"), ("gone", "begin"), ("gone", "end")]
-    assert state_at(spans_of(list(sent.account.events)), 24.0).severity == "info"
+    assert state_at(spans_of(list(sent.event_log.events)), 24.0).severity == "info"
     assert all(until is not None for _, until in sent.stories())
 
 
@@ -136,7 +136,7 @@ def test_what_holds_from_first_to_last_is_the_state_at_any_time(sent: Sent) -> N
     """A vehicle that is never valid in a recording is bad at any time, as it would be live."""
     for second in range(5):
         sent(float(second), xy_valid=False)
-    state = state_at(spans_of(list(sent.account.events), sent.account.vehicles["1"].initial), 3.0)
+    state = state_at(spans_of(list(sent.event_log.events), sent.event_log.vehicles["1"].initial), 3.0)
     assert (state.severity, state.text) == ("bad", "xy not valid")
     assert [each.initial for each in state.conditions] == [True]
 
@@ -145,7 +145,7 @@ def test_condition_that_a_worse_one_replaces_ends_there(sent: Sent) -> None:
     """A battery that was low at the first message, becomes critical and is replaced, is no longer low."""
     for second, warning in enumerate((1, 2, 0)):
         sent(float(second), "battery_status", 0, warning=warning, connected=True)
-    spans = spans_of(list(sent.account.events), sent.account.vehicles["1"].initial)
+    spans = spans_of(list(sent.event_log.events), sent.event_log.vehicles["1"].initial)
     assert [(span.text, span.since, span.until) for span in spans] == [
         ("battery low", 0.0, 1.0), ("battery critical", 1.0, 2.0),
     ]  # fmt: skip
@@ -160,7 +160,7 @@ def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
     sent(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)
     sent(2.0, timestamp=2_000_000, xy_reset_counter=1, x=3.0, y=4.0, xy_valid=False)
     sent(3.0, timestamp=3_000_000, xy_reset_counter=1, x=3.0, y=4.0)
-    events = list(sent.account.events)
+    events = list(sent.event_log.events)
     stories = {(event.kind, event.change): story_of(event, events) for event in events}
     told = {key: story.what for key, story in stories.items() if story is not None}
     assert told["reset", "once"].startswith("reset of xy by 5.0 m")
@@ -170,15 +170,15 @@ def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
 
 
 def test_noisy_vehicle_leaves_room_for_others_in_an_answer() -> None:
-    """A full account has the events of each vehicle, even after thousands of events of another one."""
-    account = Account(keep=300)
+    """A full event log has the events of each vehicle, even after thousands of events of another one."""
+    event_log = EventLog(keep=300)
     quiet, noisy = Address("quiet", VLP), Address("noisy", VLP)
     for second, valid in enumerate((True, False, True)):
-        account.add(quiet, {**VALID, "timestamp": (second + 1) * 10**6, "xy_valid": valid}, float(second))
+        event_log.add(quiet, {**VALID, "timestamp": (second + 1) * 10**6, "xy_valid": valid}, float(second))
     for number in range(9000):
         fields = {**VALID, "timestamp": (number + 1) * 10**6, "xy_reset_counter": number % 256}
-        account.add(noisy, fields, 10.0 + number)
-    answered = report_of(account, "s", "h", 10_000.0, within=1e9).events
+        event_log.add(noisy, fields, 10.0 + number)
+    answered = report_of(event_log, "s", "h", 10_000.0, within=1e9).events
     assert [event.kind for event in answered if event.vehicle == "quiet"] == ["xy_invalid", "xy_invalid"]
     assert len(answered) == 300
     assert [event.time for event in answered] == sorted(event.time for event in answered)
@@ -187,14 +187,14 @@ def test_noisy_vehicle_leaves_room_for_others_in_an_answer() -> None:
 def test_dropout_of_the_logger_is_no_silence(sent: Sent) -> None:
     """Nothing was recorded for 5 s: an event of the logger with its duration, and no silent vehicle."""
     sent(0.0)
-    sent.account.add_dropout("1", 5.0, 0.02)
+    sent.event_log.add_dropout("1", 5.0, 0.02)
     for time in (1.0, 4.0, 5.0, 7.9):
-        sent.account.update(time)
+        sent.event_log.update(time)
     assert sent.told == [("dropout", "once")]
-    [event] = sent.account.events
+    [event] = sent.event_log.events
     assert (event.severity, event.time, event.numbers["duration"]) == ("info", 0.02, 5.0)
     assert event.text == "the logger recorded nothing for 5.0 s"
-    sent.account.update(8.5)  # 3 s after its end
+    sent.event_log.update(8.5)  # 3 s after its end
     assert sent.told[1:] == [("silent", "begin")]
 
 
@@ -227,7 +227,7 @@ def test_fault_of_an_unused_ekf_names_it(sent: Sent) -> None:
         sent(time, "estimator_status_flags", 1, reject_hor_pos=rejects)
         sent(time, "estimator_selector_status", primary_instance=primary)
         sent(time, xy_reset_counter=round(time), x=5.0 * time)
-    found = [each for each in sent.account.events if each.kind not in ("reset", "jump")]
+    found = [each for each in sent.event_log.events if each.kind not in ("reset", "jump")]
     rejected = "EKF 1, not in use: rejects horizontal position"
     assert [(each.change, each.severity, each.text) for each in found] == [
         ("begin", "info", rejected),
@@ -238,11 +238,11 @@ def test_fault_of_an_unused_ekf_names_it(sent: Sent) -> None:
         ("end", "info", "EKF rejects horizontal position: superseded by estimator_status_flags/0 after 1.0 s"),
         ("begin", "info", rejected),
     ]  # fmt: skip
-    resets = [each for each in sent.account.events if each.kind == "reset"]
+    resets = [each for each in sent.event_log.events if each.kind == "reset"]
     assert [[each.kind for each in reset.evidence] for reset in resets] == [
         [], ["ekf_changed", "innovation_rejected"], ["ekf_changed", "innovation_rejected"],
     ]  # fmt: skip
-    assert sent.account.vehicles["1"].state(100.0).conditions == ()
+    assert sent.event_log.vehicles["1"].state(100.0).conditions == ()
 
 
 def test_ekf_in_use_without_a_selector(sent: Sent) -> None:
@@ -255,9 +255,9 @@ def test_ekf_in_use_without_a_selector(sent: Sent) -> None:
             sent(time, "estimator_status_flags", instance, cs_mag_fault=False)
     sent(3.0, "estimator_status_flags", 0, cs_mag_fault=True)
     sent(4.0, "estimator_status_flags", 1, cs_mag_fault=True)
-    texts = [each.text for each in sent.account.events]
+    texts = [each.text for each in sent.event_log.events]
     assert texts == ["EKF 0, not in use: fault: magnetometer", "EKF fault: magnetometer"]
-    assert [each.kind for each in sent.account.vehicles["1"].state(100.0).conditions] == ["estimator_fault"]
+    assert [each.kind for each in sent.event_log.vehicles["1"].state(100.0).conditions] == ["estimator_fault"]
 
 
 def test_selector_that_arrives_late_names_the_ekf_in_use(sent: Sent) -> None:
@@ -269,7 +269,7 @@ def test_selector_that_arrives_late_names_the_ekf_in_use(sent: Sent) -> None:
         sent(time, "estimator_status_flags", 0, cs_mag_fault=time == 3.0)
         if time >= 1.0:
             sent(time, "estimator_selector_status", primary_instance=0)
-    assert [each.text for each in sent.account.events] == ["EKF fault: magnetometer"]
+    assert [each.text for each in sent.event_log.events] == ["EKF fault: magnetometer"]
 
 
 @pytest.mark.parametrize("gnss", [False, True])
@@ -280,7 +280,7 @@ def test_fake_position_that_ends_is_evidence(sent: Sent, gnss: bool) -> None:
     sent(1.0, "estimator_status_flags", 0, cs_fake_pos=True, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
     sent(2.0, "estimator_status_flags", 0, cs_fake_pos=False, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
     sent(2.2, xy_valid=False)
-    [invalid] = [each for each in sent.account.events if each.kind == "xy_invalid"]
+    [invalid] = [each for each in sent.event_log.events if each.kind == "xy_invalid"]
     assert [each.text for each in invalid.evidence] == [
         "no horizontal aiding: fake position ended, nothing else is fused"
     ][: not gnss]

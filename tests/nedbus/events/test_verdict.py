@@ -20,8 +20,8 @@ LIVE = Times(is_live=True)
 
 def verdict(flight: Flight, *, times: Times | None = None, at: float | None = None) -> Verdict:
     """Return the verdict on the vehicle now; by default in seconds since boot."""
-    followed = flight.account.vehicles["1"]
-    events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
+    followed = flight.event_log.vehicles["1"]
+    events = sorted(flight.event_log.events_since(0)[0], key=lambda each: each.time)
     held = [each for each in followed.conditions.values() if each.severity != "info"]
     return verdict_of("1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at)
 
@@ -74,7 +74,7 @@ def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
     flight = Flight()
     for _ in range(5):
         flight.wait(0.1).send(missing=("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
-    (known,) = report_of(flight.account, "s", "h", flight.now, within=60).vehicles.values()
+    (known,) = report_of(flight.event_log, "s", "h", flight.now, within=60).vehicles.values()
     found = verdict_of("1", [], topics=known.topics, unknown=known.unknown, times=Times(), end=0.5)
     assert (found.usable, found.text) == (None, "no faults in 0 s; the data has no validity of a position")
 
@@ -96,7 +96,7 @@ def text(flight: Flight, words: str, level: int = 4) -> None:
     """Have PX4 say something now."""
     severity: Any = "bad" if level < 3 else "watch" if level < 5 else "info"
     said = Finding("text", "once", words, ("warning",), {"level": level}, severity)
-    flight.account.vehicles["1"].emit(said, "log_message", flight.now)
+    flight.event_log.vehicles["1"].emit(said, "log_message", flight.now)
 
 
 def test_evidence_of_an_end_is_not_earlier_than_its_begin() -> None:
@@ -107,13 +107,13 @@ def test_evidence_of_an_end_is_not_earlier_than_its_begin() -> None:
     flight.gps()
     flight.wait(1.0).send(xy_valid=False)
     flight.wait(2.0).send()
-    ended = flight.account.events_since(0)[0][-1]
+    ended = flight.event_log.events_since(0)[0][-1]
     assert (ended.kind, ended.change, ended.evidence) == ("xy_invalid", "end", ())
     assert "GPS" not in verdict(flight).text
     flight.wait(1.0).send(xy_valid=False)
     text(flight, "Failsafe activated")
     flight.wait(2.0).send()
-    assert flight.account.events_since(0)[0][-1].evidence == ()
+    assert flight.event_log.events_since(0)[0][-1].evidence == ()
 
 
 def test_verdict_quotes_px4() -> None:
@@ -194,7 +194,7 @@ def test_state_and_verdict_name_the_same_cause(steps: list[Callable[[Flight], ob
     flight.send()
     for step in steps:
         step(flight.wait(1.0))
-    assert flight.account.state("1", flight.now).text.startswith(cause)
+    assert flight.event_log.state("1", flight.now).text.startswith(cause)
     assert verdict(flight, times=LIVE).text.removeprefix("not usable: ").startswith(cause)
 
 
@@ -206,7 +206,7 @@ def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
     flight.status(ARMED)
     flight.gps()
     flight.fly(60)
-    events = flight.account.events_since(0)[0]
+    events = flight.event_log.events_since(0)[0]
     other: list[Any] = [replace(each, vehicle="2") for each in events]
     topics = ["vehicle_local_position"]
     assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).stories == ()
@@ -260,7 +260,7 @@ def test_texts_of_one_moment_are_different_events() -> None:
     for words in ("invalid setpoints", "Failsafe: blind land"):
         text(flight, words)
     flight.wait(0.1).send(xy_valid=False)
-    sent = report_of(flight.account, "s", "h", flight.now, within=60)
+    sent = report_of(flight.event_log, "s", "h", flight.now, within=60)
     read = from_json(json.loads(json.dumps(asdict(sent))))
     assert read is not None
     assert [each.words for each in read.events if each.origin == "px4"] == [

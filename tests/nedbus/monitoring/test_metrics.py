@@ -23,7 +23,7 @@ from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.worker import State
-from nedbus.events import Account, AccountReport, VehicleReport
+from nedbus.events import AccountReport, EventLog, VehicleReport
 from nedbus.health import SourceStatus, StreamHealth, StreamStatus
 from nedbus.monitoring import Exporter, HttpServer, Page, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page, stream_metrics
@@ -210,14 +210,14 @@ def test_what_peers_say_is_one_line() -> None:
 @pytest.mark.parametrize("every", [1, 3])
 def test_flag_that_goes_to_and_fro_is_a_condition(every: int) -> None:
     """A scrape that meets a moment at which it is not set misses nothing, until it has settled; messages are made."""
-    account, address = Account(), Address("7", VLP)
+    event_log, address = EventLog(), Address("7", VLP)
     for number in range(100):
         is_valid = number // every % 2 == 0
-        account.add(address, message(20_000 * (number + 1), **{**VALID, "xy_valid": is_valid}), 0.02 * number)
+        event_log.add(address, message(20_000 * (number + 1), **{**VALID, "xy_valid": is_valid}), 0.02 * number)
         if number > 5 * every:
-            assert account.state("7", 0.02 * number).text.startswith("xy not valid")
-    account.update(10.0, {address: "ok"})
-    assert account.state("7", 10.0).severity == ("info" if is_valid else "bad")
+            assert event_log.state("7", 0.02 * number).text.startswith("xy not valid")
+    event_log.update(10.0, {address: "ok"})
+    assert event_log.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
 def test_metrics_pass_the_linter(serve: Serve, pages: Pages, start: Start, tmp_path: Path) -> None:
@@ -451,14 +451,14 @@ def test_account_of_a_thousand_vehicles_with_faults_arrives(endpoint: str) -> No
             for seconds, flags in enumerate(({}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False})):
                 for name in names:
                     sent = message((seconds + 1) * 10**6, **VALID | flags)
-                    daemon.account.add(Address(name, VLP), sent, clock.steady())
-            [account] = bus.accounts(within=60.0)
+                    daemon.event_log.add(Address(name, VLP), sent, clock.steady())
+            [report] = bus.accounts(within=60.0)
     finally:
         daemon.stop()
         running.join()
-    assert account.vehicles.keys() >= names
-    assert all({"xy_invalid", "z_invalid"} <= set(account.vehicles[name].kinds) for name in names)
-    assert len(account.events) >= 1998
+    assert report.vehicles.keys() >= names
+    assert all({"xy_invalid", "z_invalid"} <= set(report.vehicles[name].kinds) for name in names)
+    assert len(report.events) >= 1998
 
 
 def test_a_scrape_looks_at_each_stream_once(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
-from tests.flights.ulogs import LOGS, account_of
+from tests.flights.ulogs import LOGS, cached_events
 from tests.peers.command_line import run_command
 
 REAL = sorted(LOGS.parent.glob("*/*.ulg"))
@@ -47,15 +47,15 @@ def drawn(
 
 
 def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) -> Event:
-    """Return an event, whose account began with the flight."""
+    """Return an event, whose event log began with the flight."""
     return Event("7", kind, change, severity, fields.pop("text", kind.replace("_", " ")), boot - 1.0, boot, **fields)
 
 
 def told_by(path: Path) -> list[Event]:
     """Return the events of a log, and the begin of what held all the time."""
-    account = account_of(path).account
-    held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
-    return [*held, *account.events_since(0)[0]]
+    event_log = cached_events(path).event_log
+    held = [each.begin for each in event_log.vehicles["1"].conditions.values() if each.initial]
+    return [*held, *event_log.events_since(0)[0]]
 
 
 def marks_of(axes: Any, marker: str) -> list[tuple[float, float]]:

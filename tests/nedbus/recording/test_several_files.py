@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import read_account
+from nedbus.sources import read_events
 from nedbus.web.playback import Recording
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
@@ -79,9 +79,9 @@ def test_flights_of_one_vehicle_years_apart_are_read_at_once(tmp_path: Path) -> 
     """The time between two files costs nothing."""
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
     second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
-    account = read_account(first, second)
-    assert [event.vehicle for event in account.account.events_since(0)[0]] == ["a", "a", "b", "b"]
-    assert math.isclose(account.end, 3e8 - 60 + 9.9, abs_tol=0.01)
+    read = read_events(first, second)
+    assert [event.vehicle for event in read.event_log.events_since(0)[0]] == ["a", "a", "b", "b"]
+    assert math.isclose(read.end, 3e8 - 60 + 9.9, abs_tol=0.01)
 
 
 def test_file_without_utc_has_no_place_among_others(tmp_path: Path, swarm: list[str]) -> None:
@@ -131,4 +131,4 @@ def test_swarm_of_users_flies_at_one_time() -> None:
     streams = nedbus.read(paths, [VLP])
     assert [*streams] == [f"{name}/{VLP}" for name in ("swarm_a", "swarm_b", "3")]
     assert {int(each["timestamp"][0]) for each in streams.values()} == {EPOCH + 60_000_000}
-    assert 9.9 < read_account(*paths).end < 10.1
+    assert 9.9 < read_events(*paths).end < 10.1

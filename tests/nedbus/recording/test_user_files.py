@@ -10,7 +10,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import FileAccount, parse_source, read_account
+from nedbus.sources import FileEvents, parse_source, read_events
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
@@ -40,11 +40,11 @@ def dues(name: str) -> tuple[float, float]:
 
 def events(name: str) -> set[tuple[str, str]]:
     """Return the kind and the severity of all events."""
-    return {(each.kind, each.severity) for each in account(name).account.events}
+    return {(each.kind, each.severity) for each in file_events(name).event_log.events}
 
 
-def account(name: str) -> FileAccount:
-    return read_account(CASES / name)
+def file_events(name: str) -> FileEvents:
+    return read_events(CASES / name)
 
 
 RIGHT: Final[list[tuple[Callable[[str], object], str, object]]] = [
@@ -75,7 +75,7 @@ def test_old_log_is_not_damaged(tmp_path: Path) -> None:
     """A log without ver_sw_release is converted whole, with nothing to warn of."""
     log = CASES / "17_old_log_without_release.ulg"
     assert run_command("convert", str(log), str(tmp_path / "a.mcap")).exit_code == 0
-    assert account("17_old_log_without_release.ulg").warnings == ()
+    assert file_events("17_old_log_without_release.ulg").warnings == ()
 
 
 def test_cause_is_the_end_of_the_fake_position() -> None:

@@ -39,7 +39,7 @@ def play():
 
 uses = [
     lambda: nedbus.read(path, ["*"]), lambda: nedbus.align(path, on=10.0), lambda: nedbus.utc_of(path),
-    lambda: nedbus.sources.read_account(path), convert, play,
+    lambda: nedbus.sources.read_events(path), convert, play,
 ]
 resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -23,7 +23,7 @@ from bokeh.models.widgets import Div
 
 import nedbus
 from nedbus.client import LogStreamStatus, Monitor, Sample, stream_state
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.monitoring import Snapshot
 from nedbus.recording import RecordingWriter
 from nedbus.web import Where, serve_live
@@ -54,8 +54,8 @@ class Sky:
     def __init__(self) -> None:
         self.fleet = Fleet()
         self.monitor = Monitor()
-        self.account = Account()
-        self.chronicle = Chronicle(self.account)
+        self.event_log = EventLog()
+        self.chronicle = Chronicle(self.event_log)
         self.time = NOON
 
     def add(self, address: Address = WING, **fields: object) -> None:
@@ -69,7 +69,7 @@ class Sky:
             heard = other.model.model_validate({"timestamp": stamp, **known})
         sample = Sample(heard, address, round(self.time * 1e9))
         self.monitor.add(sample, received=sample.received)
-        self.account.add(address, heard, self.time)
+        self.event_log.add(address, heard, self.time)
         self.fleet.add(sample, self.time)
 
     def fly(self, seconds: float, *addresses: Address, rate: int = 10, **fields: object) -> None:
@@ -97,8 +97,8 @@ class Sky:
             ).name
             for address, health in healths.items()
         }
-        self.account.update(self.time, arrival, link=link, is_behind=is_behind)
-        states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
+        self.event_log.update(self.time, arrival, link=link, is_behind=is_behind)
+        states = {name: self.event_log.state(name, self.time) for name in self.event_log.vehicles}
         self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=own), states, logs)
         return self.fleet.picture
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Account, Times
+from nedbus.events import EventLog, Times
 from nedbus.web.chronicle import Chronicle
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream
@@ -82,7 +82,7 @@ def test_slow_stream_is_no_state_of_its_vehicle(sky: Sky) -> None:
     sky.fly(20, rate=20)
     sky.fly(3, rate=5)
     assert str(sky.line().state).startswith("slow: 5.0 Hz, usually ")
-    assert sky.row().state == sky.account.state("wing", sky.time)
+    assert sky.row().state == sky.event_log.state("wing", sky.time)
     assert sky.row().grade == "ok"
 
 
@@ -95,11 +95,11 @@ def test_page_that_is_behind_blames_no_vehicle(sky: Sky) -> None:
         sky.time += 0.5
         picture = sky.look(alive=[], is_behind=True, own="slow")
     assert {row.vehicle: row.state.text for row in picture.rows} == {"quad": "xy not valid", "wing": "ok"}
-    assert sky.account.overload is not None
+    assert sky.event_log.overload is not None
     assert not [event for event in sky.chronicle.events if event.kind in ("silent", "gone")]
     sky.time += 6
     sky.look(alive=[])
-    assert sky.account.overload is None
+    assert sky.event_log.overload is None
     assert sky.row(alive=[]).state.text.startswith("gone: ")
 
 
@@ -340,16 +340,16 @@ def test_distance_needs_one_frame(sky: Sky) -> None:
 
 def test_each_time_names_its_clock() -> None:
     """Times are UTC live, and of a recording that has it; else since boot if only one vehicle booted, or the start."""
-    recorded = Chronicle(Account(), times=Times())
+    recorded = Chronicle(EventLog(), times=Times())
     assert recorded.clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_start("1", 70.0, 10.0)
     assert recorded.clock(75.25) == "135.2 s since boot, 75.2 s since the start of the recording"
     recorded.times = Times(offsets={"1": NOON})
     recorded.set_start("1", 70.0, 10.0)
     assert recorded.clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
-    live = Chronicle(Account())
+    live = Chronicle(EventLog())
     assert live.clock(NOON) == "22:13:20.0 UTC"
-    several = Account()
+    several = EventLog()
     for name in ("1", "2"):
         several.add(Address(name, VLP), message(1_000_000), 0.0)
     recorded = Chronicle(several, times=Times())

@@ -389,7 +389,7 @@ def test_words_of_peers_are_escaped(sky: Sky) -> None:
     """Reasons of rejections, a link's words, a title and what the address says are text wherever they are shown."""
     sky.fly(3)
     for reason in ("the first", HOSTILE):
-        sky.account.reject(WING, reason, sky.time)
+        sky.event_log.reject(WING, reason, sky.time)
         sky.fleet.reject([RejectionReport(WING, reason, round(sky.time * 1e9))])
         sky.time += 20
         sky.look()

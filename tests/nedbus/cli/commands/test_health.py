@@ -169,8 +169,8 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
     """A vehicle that its service no longer hears is one, without any option; others are judged beside it."""
     with serving(endpoint, "sim:") as daemon:
         wait_for(lambda: health().exit_code == 0, what="health")
-        daemon.account.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
-        wait_for(lambda: daemon.account.state("2", time.time()).severity == "bad", what="silence")
+        daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
+        wait_for(lambda: daemon.event_log.state("2", time.time()).severity == "bad", what="silence")
         shown = health()
         assert shown.exit_code == 1
         assert re.fullmatch(

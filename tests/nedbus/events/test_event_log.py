@@ -1,4 +1,4 @@
-"""Events of an account, from hand-made messages."""
+"""Events of an event log, from hand-made messages."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from nedbus.events import (
     MAX_VEHICLES,
     RECENT,
     WINDOW,
-    Account,
     Event,
+    EventLog,
 )
-from nedbus.events.account import MAX_GONE
+from nedbus.events.event_log import MAX_GONE
 from nedbus.events.rules import FLAPPING_CHANGES, PAUSE
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
@@ -82,7 +82,7 @@ def test_reboot_is_reported_once(flight: Flight) -> None:
     assert flight.wait(1.0).gps() == []  # neither a second reboot, nor the end of what that receiver had
     flight.fly(20)
     assert flight.status(DISARMED) == []
-    assert [each.kind for each in flight.account.events].count("reboot") == 1
+    assert [each.kind for each in flight.event_log.events].count("reboot") == 1
 
 
 def test_stream_that_returns_long_after_a_reboot(flight: Flight) -> None:
@@ -99,7 +99,7 @@ def test_stream_that_returns_long_after_a_reboot(flight: Flight) -> None:
             flight.wait(8.0)
             told += streams[(first + index) % 3]()
         assert [each.kind for each in told if each.kind not in ("silent", "gone")] == ["reboot"]
-        assert flight.account.vehicles["1"].armed is True
+        assert flight.event_log.vehicles["1"].armed is True
 
 
 def test_late_message_from_before_a_reboot_is_no_reboot(flight: Flight) -> None:
@@ -130,7 +130,7 @@ def test_silence_is_reported_by_updates(flight: Flight) -> None:
     assert begun[0].text == "silent: no vehicle_local_position for 4.0 s"
     assert flight.look("stale") == []
     assert brief(flight.wait(1.0).look("gone")) == [("gone", "begin", "bad")]
-    assert flight.account.state("1", flight.now).since == last
+    assert flight.event_log.state("1", flight.now).since == last
     assert flight.look("stale") == []  # gone stays gone
     back = flight.wait(1.0).send()
     assert brief(back) == [("gone", "end", "info")]
@@ -337,16 +337,19 @@ def test_flight_without_fix_or_global_reference() -> None:
     flight, since = Flight(), 100.0
     assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
     assert flight.wait(1.0).status(DISARMED) == []
-    assert (flight.severity, flight.account.vehicles["1"].initial[1:]) == ("info", [])  # few satellites are information
+    assert (flight.severity, flight.event_log.vehicles["1"].initial[1:]) == (
+        "info",
+        [],
+    )  # few satellites are information
     assert brief(flight.wait(1.0).status(ARMED)) == [("armed", "once", "info")]
     assert flight.wait(PAUSE - 0.1).look() == []
     assert flight.kinds == []
     assert flight.wait(0.2).look() == []
-    held = flight.account.state("1", flight.now).conditions
+    held = flight.event_log.state("1", flight.now).conditions
     assert [(each.text, each.severity, each.since, each.initial) for each in held] == [
         ("no GPS fix, 0 satellites", "watch", since, True), ("xy has no global reference", "watch", since, True),
     ]  # fmt: skip
-    assert set(held) <= set(flight.account.vehicles["1"].initial)
+    assert set(held) <= set(flight.event_log.vehicles["1"].initial)
     assert brief(flight.gps(satellites_used=0)) == [("gps_fix_lost", "end", "info")]
     flight.wait(1.0).status(DISARMED)
     assert flight.severity == "info"
@@ -415,7 +418,7 @@ def test_other_estimates_are_not_used(flight: Flight, topic: str, instance: int 
         assert flight.wait(0.1).send(topic, instance=instance, **fields) == []
         assert flight.send() == []
     assert flight.severity == "info"
-    assert flight.account.vehicles["1"].main == POSITION
+    assert flight.event_log.vehicles["1"].main == POSITION
 
 
 def test_other_estimate_is_used_if_it_is_the_only_one() -> None:
@@ -424,7 +427,7 @@ def test_other_estimate_is_used_if_it_is_the_only_one() -> None:
     fields = message(1, **VALID).model_dump() | {"xy_valid": False}
     flight.send("estimator_local_position", instance=1, **fields)
     flight.send("estimator_local_position", instance=0, **fields)
-    assert flight.account.vehicles["1"].main == Address("1", "estimator_local_position", 0)
+    assert flight.event_log.vehicles["1"].main == Address("1", "estimator_local_position", 0)
     assert flight.kinds == ["xy_invalid"]
     assert flight.send() == []
     assert flight.kinds == []
@@ -612,33 +615,33 @@ def test_state_is_worst_first(flight: Flight) -> None:
     flight.wait(RECENT - 1)
     assert flight.severity == "watch"
     flight.wait(1.5)
-    state = flight.account.state("1", flight.now)
+    state = flight.event_log.state("1", flight.now)
     assert (state.severity, state.text, state.since, state.conditions) == ("info", "ok", None, ())
-    assert flight.account.state("nobody", flight.now).severity == "info"
+    assert flight.event_log.state("nobody", flight.now).severity == "info"
 
 
 def test_memory_is_bounded() -> None:
-    """An account keeps the most recent events, a thousand vehicles, and a thousand streams per vehicle."""
+    """An event log keeps the most recent events, a thousand vehicles, and a thousand streams per vehicle."""
     flight = Flight()
     for number in range(1100):
         flight.send(vehicle=f"v{number}")
-    assert len(flight.account.vehicles) == 1000
+    assert len(flight.event_log.vehicles) == 1000
     for number in range(1100):
         flight.send(f"unknown_{number}", vehicle="v1")
-    known = flight.account.vehicles["v1"]
+    known = flight.event_log.vehicles["v1"]
     assert len(known._detectors) <= 1000
     assert len(known.topics) <= 1000
     for number in range(KEPT + 100):
         flight.wait(0.1).status(DISARMED, vehicle="v2", nav_state=number % 2)
-    new, told = flight.account.events_since(0)
+    new, told = flight.event_log.events_since(0)
     assert (len(new), told) == (KEPT, KEPT + 99)
-    assert flight.account.events_since(told - 1) == ([new[-1]], told)
+    assert flight.event_log.events_since(told - 1) == ([new[-1]], told)
 
 
-def look(account: Account, now: float, *present: str, link: str = "") -> set[str]:
-    """Update an account of which these vehicles have a publisher; return the vehicles that it follows."""
-    account.update(now, {}, link=link, present=present)
-    return set(account.vehicles)
+def look(event_log: EventLog, now: float, *present: str, link: str = "") -> set[str]:
+    """Update an event log of which these vehicles have a publisher; return the vehicles that it follows."""
+    event_log.update(now, {}, link=link, present=present)
+    return set(event_log.vehicles)
 
 
 def test_vehicle_beyond_the_limit_is_told_and_gets_the_place_of_one_that_left(
@@ -650,14 +653,14 @@ def test_vehicle_beyond_the_limit_is_told_and_gets_the_place_of_one_that_left(
         flight.send(vehicle=f"v{number}")
     for _ in range(3):
         flight.send(vehicle="more")
-    account = flight.account
-    assert account.state("more", flight.now).text == "no events: more than 1000 vehicles"
-    assert (account.refused, len(account.vehicles), len(caplog.records)) == (3, MAX_VEHICLES, 1)
+    event_log = flight.event_log
+    assert event_log.state("more", flight.now).text == "no events: more than 1000 vehicles"
+    assert (event_log.refused, len(event_log.vehicles), len(caplog.records)) == (3, MAX_VEHICLES, 1)
     flight.wait(RECENT + 1).send(vehicle="v0")
     flight.send(vehicle="more")
-    assert {"v0", "more"} <= account.vehicles.keys()
-    assert "v1" not in account.vehicles
-    assert account.state("more", flight.now).text == "ok"
+    assert {"v0", "more"} <= event_log.vehicles.keys()
+    assert "v1" not in event_log.vehicles
+    assert event_log.state("more", flight.now).text == "ok"
 
 
 def test_vehicle_that_is_gone_is_forgotten() -> None:
@@ -666,15 +669,15 @@ def test_vehicle_that_is_gone_is_forgotten() -> None:
     for vehicle in ("here", "gone"):
         flight.send(vehicle=vehicle)
         flight.send(vehicle=vehicle, xy_valid=False)
-    account, start = flight.account, flight.now
-    assert look(account, start + TIMINGS.forgotten, "here") == {"here", "gone"}
-    assert look(account, start + TIMINGS.forgotten + 1, link="no link") == {"here", "gone"}
-    assert look(account, start + 2 * TIMINGS.forgotten, "here") == {"here", "gone"}
-    assert look(account, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
-    assert {name for name, _ in account.counts} == {ALL, "here"}
-    assert [each.vehicle for each in account.events if each.kind == "xy_invalid"] == ["here", "gone"]
-    account.update(start + 9 * TIMINGS.forgotten, {})  # of a file
-    assert set(account.vehicles) == {"here"}
+    event_log, start = flight.event_log, flight.now
+    assert look(event_log, start + TIMINGS.forgotten, "here") == {"here", "gone"}
+    assert look(event_log, start + TIMINGS.forgotten + 1, link="no link") == {"here", "gone"}
+    assert look(event_log, start + 2 * TIMINGS.forgotten, "here") == {"here", "gone"}
+    assert look(event_log, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
+    assert {name for name, _ in event_log.counts} == {ALL, "here"}
+    assert [each.vehicle for each in event_log.events if each.kind == "xy_invalid"] == ["here", "gone"]
+    event_log.update(start + 9 * TIMINGS.forgotten, {})  # of a file
+    assert set(event_log.vehicles) == {"here"}
 
 
 def test_of_many_that_left_the_last_fifty_are_known() -> None:
@@ -682,9 +685,9 @@ def test_of_many_that_left_the_last_fifty_are_known() -> None:
     flight = Flight()
     for number in range(3000):
         flight.wait(2.0).send(vehicle=f"v{number}")
-        known = look(flight.account, flight.now, f"v{number}")
+        known = look(flight.event_log, flight.now, f"v{number}")
     assert known == {f"v{number}" for number in range(3000 - MAX_GONE - 31, 3000)}
-    assert len(flight.account.counts) <= 3 * len(known)
+    assert len(flight.event_log.counts) <= 3 * len(known)
 
 
 def test_fleet_that_drops_at_once_is_remembered() -> None:
@@ -692,9 +695,9 @@ def test_fleet_that_drops_at_once_is_remembered() -> None:
     flight, fleet = Flight(), [f"v{number}" for number in range(300)]
     for vehicle in fleet:
         flight.send(vehicle=vehicle)
-    assert look(flight.account, flight.now, *fleet) == set(fleet)
-    assert look(flight.account, flight.now + TIMINGS.forgotten - 1) == set(fleet)
-    assert look(flight.account, flight.now + TIMINGS.forgotten + 1) == set()
+    assert look(flight.event_log, flight.now, *fleet) == set(fleet)
+    assert look(flight.event_log, flight.now + TIMINGS.forgotten - 1) == set(fleet)
+    assert look(flight.event_log, flight.now + TIMINGS.forgotten + 1) == set()
 
 
 def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
@@ -702,7 +705,7 @@ def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
         flight.wait(6.0).look()
-    assert len(flight.account.vehicles["1"]._changes) < 5
+    assert len(flight.event_log.vehicles["1"]._changes) < 5
 
 
 def test_state_is_the_current_one(flight: Flight) -> None:
@@ -710,9 +713,9 @@ def test_state_is_the_current_one(flight: Flight) -> None:
     flight.send()
     flight.wait(1.0).send(xy_reset_counter=1, delta_xy=(20.0, 0.0), x=20.0)
     flight.wait(1.0).send(xy_reset_counter=2, delta_xy=(3.0, 0.0), x=23.0)
-    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 20.0 m")
+    assert flight.event_log.state("1", flight.now).text.startswith("reset of xy by 20.0 m")
     flight.wait(1.0).send(xy_reset_counter=2, x=23.0, dead_reckoning=True)
-    assert flight.account.state("1", flight.now).text == "dead reckoning"
+    assert flight.event_log.state("1", flight.now).text == "dead reckoning"
 
 
 FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning", "heading_good_for_control", "xy_global")
@@ -762,7 +765,7 @@ def test_events_are_consistent(steps: list[tuple[str, Any]]) -> None:
         flight.wait(20.0).look()
     begun: dict[tuple[str, str], Event] = {}
     initial: set[tuple[str, str]] = set()  # those that ended without a begin, which they can do once
-    for event in sorted(flight.account.events, key=lambda each: each.time):
+    for event in sorted(flight.event_log.events, key=lambda each: each.time):
         assert event.kind in KINDS
         assert all(each.time <= event.time for each in event.evidence)
         assert event.lasted is None or event.lasted >= 0

@@ -14,7 +14,7 @@ from typing import Final, cast
 
 from nedbus import recording
 from nedbus.errors import InvalidMessageError, SourceError
-from nedbus.events import AIR_DATA, EKF_SELECTOR, Account, Times
+from nedbus.events import AIR_DATA, EKF_SELECTOR, EventLog, Times
 from nedbus_msgs import BY_TOPIC, TOPICS, codec_of, upgrade_fields
 
 from .kinds import parse_source, source_text_of_file
@@ -28,10 +28,10 @@ _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not set
 
 
 @dataclass(frozen=True, slots=True)
-class FileAccount:
+class FileEvents:
     """The events of whole files. Times are seconds since their first message; `end` is the time of the last one."""
 
-    account: Account
+    event_log: EventLog
     times: Times
     end: float
     warnings: tuple[str, ...]
@@ -110,33 +110,33 @@ class Flights:
         self.ended.update(names.values())
 
 
-def read_account(*paths: Path) -> FileAccount:
+def read_events(*paths: Path) -> FileEvents:
     """Return the events of files, as `Flights` reads them; raise its errors."""
-    flights, account, due = Flights(paths), Account(KEPT_OF_FILE), 0.0
-    for message, _, _ in follow(flights.messages(), account, ended=flights.ended):
+    flights, event_log, due = Flights(paths), EventLog(KEPT_OF_FILE), 0.0
+    for message, _, _ in follow(flights.messages(), event_log, ended=flights.ended):
         due = message.due
-    account.label_first_events()
-    return FileAccount(account, flights.times, due, flights.warnings)
+    event_log.label_first_events()
+    return FileEvents(event_log, flights.times, due, flights.warnings)
 
 
 def follow(
-    messages: Iterable[SourceMessage], account: Account, *, ended: Collection[str] = ()
+    messages: Iterable[SourceMessage], event_log: EventLog, *, ended: Collection[str] = ()
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
-    """Add the messages of a replay to an account; yield each with its rejection reason or its payload.
+    """Add the messages of a replay to an event log; yield each with its rejection reason or its payload.
 
     `ended`: the vehicles that have no more messages, which are not silent.
     """
     checked = due = 0.0
 
     def update(time: float) -> None:
-        mains = (account.vehicles[name].main for name in ended if name in account.vehicles)
-        account.update(time, {main: "ended" for main in mains if main})
+        mains = (event_log.vehicles[name].main for name in ended if name in event_log.vehicles)
+        event_log.update(time, {main: "ended" for main in mains if main})
 
     for message in messages:
         if message.dropout:
-            account.add_dropout(message.address.vehicle, message.dropout, due)
+            event_log.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
-        if due - checked >= _CHECK_INTERVAL and account.vehicles.keys() <= set(ended):
+        if due - checked >= _CHECK_INTERVAL and event_log.vehicles.keys() <= set(ended):
             checked = due  # between two files
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
@@ -146,11 +146,11 @@ def follow(
             try:
                 fields = upgrade_fields(definition, message.fields)
                 payload = codec_of(definition).encode_fields(fields)
-                account.add(message.address, fields, due)
+                event_log.add(message.address, fields, due)
             except InvalidMessageError as exc:
                 reason = exc.reason
         if reason is not None:
-            account.reject(message.address, reason, due)
+            event_log.reject(message.address, reason, due)
         yield message, reason, payload
     update(due)
-    account.settle(due + _SETTLE_TIME)
+    event_log.settle(due + _SETTLE_TIME)

@@ -21,10 +21,10 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 KEPT: Final = 2000
-"""Maximum number of events in an account; beyond, the vehicle with the most events loses its oldest."""
+"""Maximum number of events in an event log; beyond, the vehicle with the most events loses its oldest."""
 
 MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an account; those gone longest make room."""
+"""Maximum number of vehicles in an event log; those gone longest make room."""
 
 MAX_GONE: Final = 50
 """Vehicles gone for a minute that are remembered, or as many as were present at once; further ones are forgotten."""
@@ -33,7 +33,7 @@ _SHARE: Final = 20  # events that a vehicle keeps while others have more
 _NONE: Final[frozenset[str]] = frozenset()
 
 
-class Account:
+class EventLog:
     """The events of all vehicles. Thread-safe: one thread may add samples while others update and read.
 
     All times are of one clock that is never set, or of a file: a step would end or hide conditions.
