@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from nedbus.client import SourceStatus
-from nedbus.events import by_vehicle, since_text, to_age
+from nedbus.events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
 from .finding import Finding, State, brief, list_names
@@ -142,7 +142,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
         if vehicle in (None, name) and told.severity != "info" and not told.is_forgotten(now):
             severity: State = "wrong" if told.severity == "bad" else "warning"
             advice = f"see the events before it with 'nedbus why --vehicle {name}'"
-            text = f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}"
+            text = f"{told.text[:_MAX_TEXT]}{format_since(told.since, now)}"
             yield Finding("vehicle", name, severity, text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
@@ -167,7 +167,7 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
     if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
         last = "no message yet" if address not in seen.ages else "its last message has no timestamp"
         if age is not None:
-            last = f"its last message is {to_age(age)} old"
+            last = f"its last message is {format_duration(age)} old"
         advice = "its publisher is running: check its input, the source of a service or the loop of a script"
         state: State = "wrong" if address in seen.ages else "warning"  # topics of a replay may begin later
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
@@ -202,11 +202,13 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:
         largest = max(abs(offset) for offset, _ in clocks.values())
-        yield Finding("clock", "", "ok", f"the clocks of all publishers agree with this host's to {to_age(largest)}")
+        yield Finding(
+            "clock", "", "ok", f"the clocks of all publishers agree with this host's to {format_duration(largest)}"
+        )
 
 
 def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:
-    text = f"{clock} is {to_age(abs(offset))} {'ahead of' if offset > 0 else 'behind'} {reference}"
+    text = f"{clock} is {format_duration(abs(offset))} {'ahead of' if offset > 0 else 'behind'} {reference}"
     return Finding("clock", name, "wrong" if abs(offset) > _CLOCK_WRONG else "warning", text, advice)
 
 

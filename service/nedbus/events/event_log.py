@@ -126,7 +126,7 @@ class EventLog:
             self._dropped = dropped
             if present is not None:
                 for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
-                    here.heard = time
+                    here.last_seen = time
                 self._most_present = max(self._most_present, len(present))
                 gone = self._gone(time)
                 beyond = gone[: -max(MAX_GONE, self._most_present)]
@@ -182,12 +182,12 @@ class EventLog:
                 self.refused += 1
                 return None
             known = self.vehicles[name] = Vehicle(name, self._record, self._common)
-        known.heard = time
+        known.last_seen = time
         return known
 
     def _gone(self, time: float) -> list[tuple[float, str]]:
         """Return when vehicles that have been gone for a minute were heard, and their names, the longest gone first."""
-        return sorted((each.heard, name) for name, each in self.vehicles.items() if time - each.heard > RECENT)
+        return sorted((each.last_seen, name) for name, each in self.vehicles.items() if time - each.last_seen > RECENT)
 
     def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:
         for _, name in vehicles:

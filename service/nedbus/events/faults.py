@@ -6,7 +6,7 @@ from typing import Final
 
 from .event import ALL
 from .report import AccountReport, VehicleReport, by_vehicle
-from .times import since_text, to_age, to_clock
+from .times import format_duration, format_since, format_utc
 
 VALID: Final[Mapping[str, str]] = {"xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid"}
 """Quantities whose validity a health check can require, with their flags in VehicleLocalPosition."""
@@ -50,12 +50,12 @@ def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: 
     unknown = [each for each in expected.valid if VALID[each] in vehicle.unknown]
     if vehicle.is_silent:
         if name in expected.expect or not vehicle.is_forgotten(now):
-            yield f"{vehicle.text}{since_text(vehicle.since, now)}"
+            yield f"{vehicle.text}{format_since(vehicle.since, now)}"
     elif invalid:
         since = min(filter(None, (vehicle.flags[VALID[each]] for each in invalid)), default=None)
-        yield f"{', '.join(invalid)} not valid{since_text(since, now)}"
+        yield f"{', '.join(invalid)} not valid{format_since(since, now)}"
     elif expected.well and vehicle.severity == "bad":
-        yield f"{vehicle.text}{since_text(vehicle.since, now)}"
+        yield f"{vehicle.text}{format_since(vehicle.since, now)}"
     elif expected.valid and not vehicle.has_position:
         yield "publishes no position"
     if unknown and not vehicle.is_silent:
@@ -70,7 +70,7 @@ def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> I
             is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
             if is_recent and is_selected and event.severity != "info":
                 name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
-                at = f"{to_clock(event.time)} UTC, {to_age(report.now - event.time)} ago"
+                at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
                 lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_RECENT]
     if len(lines) > _MAX_RECENT:

@@ -54,17 +54,17 @@ class Times:
         utc = self.utc(event)
         if utc is None:
             return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
-        return to_clock(utc)
+        return format_utc(utc)
 
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
         """Format when something held, and for how long [s]; None: from the first message, or until the last one."""
         still = f"until {'now' if self.is_live else 'the end'}"
         if begin is None:
-            return f"from the first message on, {still} ({to_age(lasted)})"
+            return f"from the first message on, {still} ({format_duration(lasted)})"
         since = f"{self.text(begin)} {unit_of(self.clock(begin))}"
         if end is None:
-            return f"at {since}" if lasted == 0 else f"from {since}, {still} ({to_age(lasted)})"
-        return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({to_age(lasted)})"
+            return f"at {since}" if lasted == 0 else f"from {since}, {still} ({format_duration(lasted)})"
+        return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({format_duration(lasted)})"
 
     def find(self, text: str, near: Event) -> float:
         """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the event log's time [s].
@@ -102,13 +102,13 @@ def unit_of(clock: str) -> str:
     return CLOCKS[clock].partition(",")[0].replace("seconds", "s")
 
 
-def to_clock(utc: float) -> str:
+def format_utc(utc: float) -> str:
     """Format a Unix time as UTC, such as 14:05:12.3."""
     tenths = round(utc * 10)
     return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"
 
 
-def to_age(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration [s] in ms, s, min or h."""
     if seconds < 1:
         return f"{max(0.0, seconds) * 1e3:.0f} ms"
@@ -117,6 +117,6 @@ def to_age(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
 
 
-def since_text(since: float | None, now: float) -> str:
+def format_since(since: float | None, now: float) -> str:
     """Format the begin of a condition as a suffix of its text; "" if unknown."""
-    return "" if since is None else f", since {to_clock(since)} UTC ({to_age(now - since)})"
+    return "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"

@@ -18,7 +18,7 @@ from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
 from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
-from .times import to_age
+from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
 _REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
@@ -40,7 +40,7 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions that held in the first messages.
     `topics`: the topics that it publishes.
     `main`: the address of the position estimate in use: vehicle_local_position if published, else another estimate.
-    `heard`: time of the last message, by the event log's clock [s], or of the last update while it has a publisher.
+    `last_seen`: time of the last message, by the event log's clock [s], or of the last update while it has a publisher.
     `time`: time of the last message with a detector. `boot`: its time since boot [s].
     `recent`: the most recent events, searched for evidence.
     """
@@ -54,7 +54,7 @@ class Vehicle:
         self.topics: set[str] = set()
         self.main: Address | None = None
         self.armed: bool | None = None
-        self.time = self.heard = 0.0
+        self.time = self.last_seen = 0.0
         self.boot: float | None = None
         self._on_event = on_event
         self._common = common
@@ -136,7 +136,7 @@ class Vehicle:
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
             else:
                 duration = burst.count / 1e3
-                text = f"the logger recorded nothing for {to_age(duration)}"
+                text = f"the logger recorded nothing for {format_duration(duration)}"
                 self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
         if self._on_ground and time - self._armed_at >= PAUSE:
             self.conditions |= self._on_ground
@@ -205,7 +205,7 @@ class Vehicle:
             held = [self.conditions.pop(key) for key in keys if key in self.conditions]
             if known := [each.since for each in held if not each.initial]:
                 lasted = max(0.0, changed - min(known))
-                text = f"{text} after {to_age(lasted)}"
+                text = f"{text} after {format_duration(lasted)}"
             elif found.first:
                 text = found.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)

@@ -148,7 +148,7 @@ class _Handler(BaseHTTPRequestHandler):
         if path not in pages:
             return Page.text(f"available pages: {', '.join(pages)}", status=200 if path == "/" else 404)
         host = self.headers.get("Host") or "localhost"  # every browser sends Host
-        if (is_local or path not in _ANY_NAME) and not leads_here(host, local=is_local):
+        if (is_local or path not in _ANY_NAME) and not is_local_host_header(host, local=is_local):
             return Page.text(f"{path} is only served under an IP address or a name of this host", status=403)
         try:
             return pages[path]()
@@ -161,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.connection.shutdown(socket.SHUT_RD)
 
 
-def leads_here(host: str, *, local: bool) -> bool:
+def is_local_host_header(host: str, *, local: bool) -> bool:
     """Return whether a Host header is a name that a foreign web page cannot point at this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")

@@ -6,7 +6,7 @@ from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
-from nedbus.events import AccountReport, Expectation, by_vehicle, faults_of, since_text
+from nedbus.events import AccountReport, Expectation, by_vehicle, faults_of, format_since
 from nedbus.extras import needs
 
 from .http_server import Page
@@ -29,7 +29,7 @@ def vehicles_page(report: AccountReport) -> Page:
     """Return the state of each vehicle, or status 503 with the faults if there are any."""
     faults = faults_of([report], Expectation(well=True))
     vehicles = ((name, report.vehicles[name]) for name in by_vehicle([report]))
-    lines = [f"{name} {vehicle.text}{since_text(vehicle.since, report.now)}" for name, vehicle in vehicles]
+    lines = [f"{name} {vehicle.text}{format_since(vehicle.since, report.now)}" for name, vehicle in vehicles]
     good = "\n".join(map(_one_line, lines)) or "no vehicle is known"
     return Page.verdict(list(map(_one_line, faults)), good)
 

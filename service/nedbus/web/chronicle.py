@@ -13,10 +13,10 @@ from nedbus.events import (
     Story,
     Times,
     Verdict,
+    format_utc,
     spans_of,
     stories_of,
     story_of,
-    to_clock,
     unit_of,
     verdict_of,
 )
@@ -64,7 +64,7 @@ class Chronicle:
 
     def moment(self, seconds: float) -> str:
         """Format a time of the event log by the clock of the axis."""
-        return to_clock(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
+        return format_utc(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
 
     def clock(self, seconds: float) -> str:
         """Format a time of the event log with the name of its clock and, in a recording, since the start."""

@@ -29,7 +29,7 @@ from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError
 from nedbus.events import ALL, Times
 from nedbus.log_event import about
-from nedbus.monitoring import Exporter, Page, Snapshot, leads_here
+from nedbus.monitoring import Exporter, Page, Snapshot, is_local_host_header
 from nedbus.settings import is_loopback
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection
@@ -241,7 +241,7 @@ def _require_name(handler: RequestHandler, where: Where) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
     origin = headers.get("Origin", f"//{host}").partition("//")[2]  # "Origin: null" has no host
-    is_own = host in where.origins or leads_here(host, local=is_loopback(where.host))
+    is_own = host in where.origins or is_local_host_header(host, local=is_loopback(where.host))
     if not is_own or origin not in (host, *where.origins):
         name = origin if is_own else host
         raise HTTPError(403, reason=f"host name {name[:100]} is not allowed: add it with --origin")

@@ -15,7 +15,7 @@ from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, to_age
+from nedbus.client import Bus, format_duration
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import (
     CLOCKS,
@@ -203,7 +203,7 @@ def _shown(event: Event) -> str:
 
 
 def _before(event: Event, time: float) -> str:
-    return f"{_shown(event)} ({to_age(max(0.0, time - event.time))} before)"
+    return f"{_shown(event)} ({format_duration(max(0.0, time - event.time))} before)"
 
 
 def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
