@@ -1,7 +1,7 @@
 """Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
 
-To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`). One that needs more than a flag needs
-a detector, too, which yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
+To add a kind of event for a flag of a message, add a row to KINDS (`kinds.py`). A kind that depends on more than a flag
+also needs a detector that yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
 """
 
 from .contradictions import AIR_DATA

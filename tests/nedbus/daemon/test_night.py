@@ -83,7 +83,7 @@ def write_night(path: Path) -> None:
                     continue
                 array = arrays_of(position).of([position.model(timestamp=stamp, **fields)])
                 if vehicle == "echo" and 19.0 <= second < 19.3:
-                    array["x"] = float("nan")  # while xy is valid: no service publishes that
+                    array["x"] = float("nan")  # while xy_valid is true: no service publishes that
                 writer.write(
                     array, position, [(Address(vehicle, VLP), Provenance("sim"))], logged=logged, published=logged
                 )

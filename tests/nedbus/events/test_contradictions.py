@@ -48,13 +48,13 @@ def test_contradicted_height(flight: Flight) -> None:
     since = flight.now
     begun = fly(flight, 4.0, up=36.0, baro=36.0)
     assert [(each.kind, each.change, each.severity, each.text) for each in begun] == [
-        ("height_contradicted", "begin", "bad", "height 36 m above GNSS and barometer while z is valid")
+        ("height_contradicted", "begin", "bad", "height 36 m above GNSS and barometer while z_valid is true")
     ]
     assert begun[0].time == pytest.approx(since, abs=0.5)
     assert (flight.severity, flight.kinds) == ("bad", ["height_contradicted"])
     ended = fly(flight, 1.0, baro=0.0)
     assert [(each.kind, each.change, each.severity) for each in ended] == [("height_contradicted", "end", "info")]
-    assert ended[0].text.startswith("height 36 m above GNSS and barometer: over after ")
+    assert ended[0].text.startswith("height no longer contradicted after ")
     assert ended[0].lasted == pytest.approx(4.0, abs=0.4)  # the interval between two comparisons
     assert flight.kinds == []
 
@@ -66,7 +66,7 @@ def test_contradicted_position(flight: Flight) -> None:
     assert fly(flight, 10.0, north=30.0, gps={"eph": 9.0}) == []
     assert fly(flight, 10.0, north=30.0, gps={"eph": 0.0}) == [], "an accuracy that the receiver does not know"
     (begun,) = fly(flight, 10.0, north=7.6)
-    assert begun.text == "position 8 m off GNSS while xy is valid"
+    assert begun.text == "position 8 m off GNSS while xy_valid is true"
     assert begun.numbers == {"distance": pytest.approx(7.6, abs=0.01)}
 
 
@@ -104,7 +104,7 @@ def test_barometer_is_compared_with_its_beginning(flight: Flight) -> None:
     fly(flight, 5.0, gps=none, baro=0.0)
     assert fly(flight, 5.0, gps=none, baro=17.0) == []
     (begun,) = fly(flight, 5.0, gps=none, baro=-24.0)
-    assert begun.text == "height 24 m below barometer while z is valid"
+    assert begun.text == "height 24 m below barometer while z_valid is true"
     fast = Flight()
     fast.status(ARMED)
     fly(fast, 5.0, gps=none, baro=0.0)
@@ -116,7 +116,7 @@ def test_ground_truth(flight: Flight) -> None:
     fly(flight, 2.0, truth=0.0, gps={"fix_type": 0})
     told = fly(flight, 5.0, truth=40.0, gps={"fix_type": 0})
     assert [each.text for each in told if each.change == "begin" and "contradicted" in each.kind] == [
-        "height 40 m above ground truth while z is valid", "position 40 m off ground truth while xy is valid",
+        "height 40 m above ground truth while z_valid is true", "position 40 m off ground truth while xy_valid is true",
     ]  # fmt: skip
 
 

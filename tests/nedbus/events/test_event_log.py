@@ -49,7 +49,7 @@ def test_first_message_is_no_event() -> None:
     assert (flight.severity, flight.kinds) == ("bad", ["xy_invalid", "dead_reckoning"])
     ended = flight.wait(0.1).send()
     assert [(event.text, event.lasted) for event in ended] == [
-        ("xy valid for the first time", None), ("dead reckoning ends", None),
+        ("xy valid for the first time", None), ("dead reckoning ended", None),
     ]  # fmt: skip
     assert (flight.severity, flight.kinds) == ("info", [])
 
@@ -77,7 +77,7 @@ def test_reboot_is_reported_once(flight: Flight) -> None:
     flight.booted = flight.now
     told = flight.wait(1.0).send()
     assert brief(told) == [("reboot", "once", "bad")]
-    assert told[0].text == "rebooted: time since boot 1.0 s, was 10.1 s"
+    assert told[0].text == "reboot: time since boot is 1.0 s, was 10.1 s"
     assert flight.kinds == ["reboot"]
     assert flight.wait(1.0).gps() == []  # neither a second reboot, nor the end of what that receiver had
     flight.fly(20)
@@ -194,7 +194,7 @@ def test_link_down_excuses_vehicles(flight: Flight) -> None:
     flight.link = ""
     ended = flight.wait(60.0).look("unknown")
     assert [(event.vehicle, event.kind, event.change, event.text) for event in ended] == [
-        (ALL, "link_down", "end", "link is back after 2 min")
+        (ALL, "link_down", "end", "link restored after 2 min")
     ]
     assert flight.wait(1.0).send() == []
     assert flight.severity == "info"
@@ -220,7 +220,7 @@ def test_vehicle_that_does_not_return_with_the_link(flight: Flight) -> None:
     assert flight.wait(2.0).look("unknown") == []
     told = flight.wait(1.5).look("stale")
     assert brief(told) == [("silent", "begin", "bad")]
-    assert [each.text for each in told[0].evidence] == ["link is back after 60.0 s"]
+    assert [each.text for each in told[0].evidence] == ["link restored after 60.0 s"]
 
 
 def test_link_that_flaps(flight: Flight) -> None:

@@ -268,9 +268,9 @@ def test_only_one_estimate_is_contradicted(name: str) -> None:
     """
     told = [each for each in told_in(name) if each.kind.endswith("_contradicted")]
     right = [
-        ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z is valid"),
-        ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy is valid"),
-        ("height_contradicted", "end", 118.9, "height 27 m below GNSS and barometer: over after 2.0 s"),
+        ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z_valid is true"),
+        ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy_valid is true"),
+        ("height_contradicted", "end", 118.9, "height no longer contradicted after 2.0 s"),
     ]
     found = [(each.kind, each.change, round(each.boot or 0.0, 1), each.text) for each in told]
     assert sorted(found, key=lambda each: each[2]) == (right if name == "nxp_v0_ekf_failure" else [])
@@ -353,7 +353,7 @@ def test_verdict_of_a_crash() -> None:
     assert "height 27 m below GNSS" in found.text
     assert found.text.index('PX4: "Attitude failure detected"') < found.text.index("dead reckoning")
     assert [short([each]) for each in found.cause if each.kind == "dead_reckoning"] == [[("dead_reckoning", 116.238)]]
-    assert "position 9 m off GNSS while xy is valid" in found.text
+    assert "position 9 m off GNSS while xy_valid is true" in found.text
 
 
 def test_verdict_of_a_flight_without_gps() -> None:
@@ -363,7 +363,7 @@ def test_verdict_of_a_flight_without_gps() -> None:
     text = (
         "position valid throughout, but no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
     )
-    assert found.text == f"{text} from the first message on, until the end (62.3 s)."
+    assert found.text == f"{text} from the first message until the end (62.3 s)."
 
 
 @pytest.mark.parametrize("name", NAMES)

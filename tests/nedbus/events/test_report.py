@@ -235,8 +235,8 @@ def test_expected_vehicles() -> None:
     one = report(flying())
     assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
-    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["2 of 3 vehicles are heard: 1, 7"]
-    assert faults_of([], Expectation(vehicles=1)) == ["0 of 1 vehicles are heard"]
+    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["messages arrive from 2 of 3 vehicles: 1, 7"]
+    assert faults_of([], Expectation(vehicles=1)) == ["messages arrive from 0 of 1 vehicles"]
     assert faults_of([one, SCRIPT], Expectation(("7",), valid=("xy",))) == []  # vehicle 1 is not judged
 
 

@@ -164,7 +164,7 @@ def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
     stories = {(event.kind, event.change): story_of(event, events) for event in events}
     told = {key: story.what for key, story in stories.items() if story is not None}
     assert told["reset", "once"].startswith("reset of xy by 5.0 m")
-    assert told["reboot", "once"].startswith("rebooted")
+    assert told["reboot", "once"].startswith("reboot:")
     assert told["xy_invalid", "end"] == told["xy_invalid", "begin"] == "xy not valid"
     assert story_of(Event("1", "jump", "once", "watch", "", 9.0), events) is None
 
@@ -193,7 +193,7 @@ def test_dropout_of_the_logger_is_no_silence(sent: Sent) -> None:
     assert sent.told == [("dropout", "once")]
     [event] = sent.event_log.events
     assert (event.severity, event.time, event.numbers["duration"]) == ("info", 0.02, 5.0)
-    assert event.text == "the logger recorded nothing for 5.0 s"
+    assert event.text == "logging dropout of 5.0 s"
     sent.event_log.update(8.5)  # 3 s after its end
     assert sent.told[1:] == [("silent", "begin")]
 
@@ -228,13 +228,13 @@ def test_fault_of_an_unused_ekf_names_it(sent: Sent) -> None:
         sent(time, "estimator_selector_status", primary_instance=primary)
         sent(time, xy_reset_counter=round(time), x=5.0 * time)
     found = [each for each in sent.event_log.events if each.kind not in ("reset", "jump")]
-    rejected = "EKF 1, not in use: rejects horizontal position"
+    rejected = "EKF 1 (not primary): rejects horizontal position"
     assert [(each.change, each.severity, each.text) for each in found] == [
         ("begin", "info", rejected),
-        ("once", "watch", "EKF 1 in use, was EKF 0"),
+        ("once", "watch", "primary EKF changed from 0 to 1"),
         ("end", "info", f"{rejected}: superseded by estimator_status_flags/1 after 1.0 s"),
         ("begin", "watch", "EKF rejects horizontal position"),
-        ("once", "watch", "EKF 0 in use, was EKF 1"),
+        ("once", "watch", "primary EKF changed from 1 to 0"),
         ("end", "info", "EKF rejects horizontal position: superseded by estimator_status_flags/0 after 1.0 s"),
         ("begin", "info", rejected),
     ]  # fmt: skip
@@ -256,7 +256,7 @@ def test_ekf_in_use_without_a_selector(sent: Sent) -> None:
     sent(3.0, "estimator_status_flags", 0, cs_mag_fault=True)
     sent(4.0, "estimator_status_flags", 1, cs_mag_fault=True)
     texts = [each.text for each in sent.event_log.events]
-    assert texts == ["EKF 0, not in use: fault: magnetometer", "EKF fault: magnetometer"]
+    assert texts == ["EKF 0 (not primary): fault: magnetometer", "EKF fault: magnetometer"]
     assert [each.kind for each in sent.event_log.vehicles["1"].state(100.0).conditions] == ["estimator_fault"]
 
 
@@ -281,6 +281,6 @@ def test_fake_position_that_ends_is_evidence(sent: Sent, gnss: bool) -> None:
     sent(2.0, "estimator_status_flags", 0, cs_fake_pos=False, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
     sent(2.2, xy_valid=False)
     [invalid] = [each for each in sent.event_log.events if each.kind == "xy_invalid"]
-    assert [each.text for each in invalid.evidence] == [
-        "no horizontal aiding: fake position ended, nothing else is fused"
-    ][: not gnss]
+    assert [each.text for each in invalid.evidence] == ["no horizontal aiding: EKF stopped fusing fake position"][
+        : not gnss
+    ]

@@ -33,8 +33,8 @@ def test_verdict_of_a_fault_that_lasts() -> None:
     found = verdict(flight)
     assert found.text == (
         "not usable: xy and vxy not valid from 16.000 s since boot, until the end (1.0 s). "
-        "Evidence: 11.000 GPS fix 3D to none, "
-        "12 satellites to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
+        "Evidence: 11.000 GPS fix lost: 3D to none, "
+        "satellites 12 to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
         "failsafe_flags."
     )
     assert (found.usable, found.end, len(found.stories)) == (False, None, 1)
@@ -64,9 +64,9 @@ def test_verdict_without_faults() -> None:
     flight.fly(5)
     found = verdict(flight)
     assert (found.text, found.usable, found.stories) == ("no faults in 105 s", True, ())
-    assert verdict(flight, times=LIVE).text == "no faults in the history of the services"
+    assert verdict(flight, times=LIVE).text == "no faults in the services' history"
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
-    assert (unknown.usable, "the data has no validity of a position" in unknown.text) == (None, True)
+    assert (unknown.usable, "the data has no position validity" in unknown.text) == (None, True)
 
 
 def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
@@ -76,7 +76,7 @@ def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
         flight.wait(0.1).send(missing=("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
     (known,) = report_of(flight.event_log, "s", "h", flight.now, within=60).vehicles.values()
     found = verdict_of("1", [], topics=known.topics, unknown=known.unknown, times=Times(), end=0.5)
-    assert (found.usable, found.text) == (None, "no faults in 0 s; the data has no validity of a position")
+    assert (found.usable, found.text) == (None, "no faults in 0 s; the data has no position validity")
 
 
 def test_verdict_of_a_vehicle_that_stays_usable() -> None:
@@ -146,7 +146,7 @@ def test_verdict_has_evidence_of_any_kind_before_it_has_none() -> None:
     flight.wait(0.5).status(ARMED, nav_state=3)
     flight.send("failsafe_flags", fd_critical_failure=True)
     found = verdict(flight)
-    assert "failsafe flags: attitude or altitude beyond its limit" in found.text
+    assert "failsafe flags: attitude or altitude limit exceeded" in found.text
     assert [each.kind for each in found.cause] == ["heading_not_good"]
 
 
@@ -164,13 +164,13 @@ def test_verdict_of_what_holds_from_begin_to_end() -> None:
     topics = ["vehicle_local_position", "vehicle_gps_position"]
     found = verdict_of("1", [], conditions, topics=topics, times=Times(), end=62.0)
     assert found.text == (
-        "position valid throughout, but no GPS fix; xy has no global reference from the first message on, "
+        "position valid throughout, but no GPS fix; xy has no global reference from the first message "
         "until the end (62.0 s)."
     )
     assert (found.usable, len(found.stories)) == (True, 1)
     invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
-    assert found.text.startswith("not usable: xy not valid from the first message on, until the end (62.0 s). ")
+    assert found.text.startswith("not usable: xy not valid from the first message until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
     assert (found.usable, len(found.stories)) == (False, 1)
 
@@ -211,7 +211,7 @@ def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
     topics = ["vehicle_local_position"]
     assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).stories == ()
     assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).stories
-    assert verdict(flight, at=flight.now - 30).text.startswith("no fault then; the nearest: ")
+    assert verdict(flight, at=flight.now - 30).text.startswith("no fault at that time; nearest: ")
     assert verdict(flight, at=flight.now - 30).usable is True
     assert verdict(flight, at=107.0).text.startswith(
         "not usable: xy and vxy not valid from 16.000 to 18.000 s since boot"
@@ -226,7 +226,7 @@ def test_verdict_of_a_vehicle_that_was_never_ready_quotes_px4() -> None:
     flight.wait(30.0).send(xy_valid=False)
     text(flight, "Preflight Fail: ekf2 missing data", 2)
     assert verdict(flight).text.startswith(
-        "not usable: xy not valid from the first message on, until the end (30.0 s). "
+        "not usable: xy not valid from the first message until the end (30.0 s). "
         'Evidence: 40.000 PX4: "Preflight Fail: ekf2 missing data". Not in the data: '
     )
 

@@ -128,7 +128,7 @@ def test_height_shows_its_own_resets() -> None:
 
 def test_events_are_marked_by_severity() -> None:
     """A condition is a bar from begin to end, the shape of a mark is its severity; ticks are info. Events made up."""
-    lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix 3D to none")
+    lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix lost: 3D to none")
     events = [
         event_of("mode", "once", "info", 2.0, names=("Hold", "Mission")),
         event_of("dist_bottom_invalid", "begin", "info", 3.0),
@@ -151,7 +151,7 @@ def test_events_are_marked_by_severity() -> None:
     assert marks_of(parts["events"], "x") == [(5.0, 0), (5.5, 1)]
     assert marks_of(parts["events"], "D") == [(3.0, 2), (7.5, 3)]
     assert marks_of(parts["events"], "|") == [(1.0, 4)]
-    assert {text.get_text() for text in parts["events"].texts} >= {"xy not valid", "GPS fix 3D to none", "Mission"}
+    assert {text.get_text() for text in parts["events"].texts} >= {"xy not valid", "GPS fix lost: 3D to none", "Mission"}
     assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 5.0), (0.0, 5.5)])
     assert np.allclose(marks_of(parts["track"], "D"), [(0.0, 3.0), (0.0, 7.5)])
     for name in ("altitude", "speed"):

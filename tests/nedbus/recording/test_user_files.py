@@ -83,7 +83,7 @@ def test_cause_is_the_end_of_the_fake_position() -> None:
     told = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in told if "BAD    xy not valid" in line)
     assert invalid.startswith("   154.300")
-    assert "no horizontal aiding: fake position ended, nothing else is fused (200 ms before)" in invalid
+    assert "no horizontal aiding: EKF stopped fusing fake position (200 ms before)" in invalid
 
 
 @pytest.mark.parametrize(

@@ -866,5 +866,5 @@ def test_page_outlives_the_router() -> None:
         told = [
             event.text.partition(" after")[0] for event in page.viewer._chronicle.events if event.kind == "link_down"
         ]
-        assert told == [f"no link to {where}", "link is back"]
+        assert told == [f"no link to {where}", "link restored"]
     router.close()
