@@ -1,4 +1,4 @@
-"""Reader that tracks the health of the selected streams and the events of their vehicles."""
+"""Observer of the health of selected streams and of their vehicles' events."""
 
 import threading
 from collections import Counter
@@ -12,20 +12,20 @@ from nedbus.events import RECENT, EventLog
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Selection
 
-_MAX_WAITING: Final = 200  # queued messages that do not yet count as falling behind, at any rate
-_MAX_LAG: Final = 1.0  # s worth of queued messages that do not yet count as falling behind
-_MAX_PAUSE: Final = 2.5  # s between two polls; after a longer pause this process itself was stalled
-_SETTLING_TIME: Final = 3.0  # s after a reconnect until delayed messages have arrived
+_MAX_WAITING: Final = 200  # queued messages above which the reader is behind
+_MAX_LAG: Final = 1.0  # s of queued messages at the usual rate, if that is more
+_MAX_PAUSE: Final = 2.5  # s between polls; after a longer pause, this process was stalled
+_SETTLING_TIME: Final = 3.0  # s after a reconnect; then delayed messages have arrived
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
-    `time`: by the steady clock [s], as the times of `rejected`.
-    `healths`: without streams that are forgotten, as their vehicles are, or were silent for an hour.
-    `alive`: the number of publishers of each address, None if unknown.
-    `link`, `behind`: the fault of the link and of this reader, "" if there is none.
+    `time`: time on the steady clock [s], as in `rejected`.
+    `healths`: health by stream, without streams of forgotten vehicles and those silent for an hour.
+    `alive`: number of publishers by address, None if unknown.
+    `link`, `behind`: fault of the router link and of this reader, "" if none.
     """
 
     time: float
@@ -39,8 +39,8 @@ class Snapshot:
 class Observer:
     """Subscribe to a selection and keep an `event_log` of its vehicles on the steady clock.
 
-    The thread that reads `subscription` passes each sample to `add`. `poll` and `measure` may be called in any thread;
-    call `poll` about twice a second.
+    The thread that reads `subscription` passes each sample to `add`. Any thread may call `poll`, about twice a second,
+    and `measure`.
     """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
@@ -51,10 +51,10 @@ class Observer:
         self._rejections = bus.rejections()
         self._looked: float | None = None
         self._disconnected = 0.0  # time of the last poll without a link
-        self._lock = threading.Lock()  # while a sample is added, its stream is briefly missing from the monitor
+        self._lock = threading.Lock()  # a stream is briefly missing from the monitor while it is updated
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample just read; a retained one is ignored, as its stream may have ended long ago."""
+        """Add a sample just read; ignore a retained one, as its stream may have ended long ago."""
         with self._lock:
             counts = self.monitor.add(sample)
         if counts:
@@ -62,7 +62,7 @@ class Observer:
             self.event_log.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
 
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
-        """Return the current health and latencies of each stream."""
+        """Return the current health and latencies by stream."""
         with self._lock:
             healths = self.monitor.snapshot()
             return {address: (health, self.monitor.latencies(address)) for address, health in healths.items()}
@@ -101,5 +101,5 @@ class Observer:
                         self.monitor.forget(address)
         behind = ""
         if self.event_log.overload is not None:
-            behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"
+            behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped"
         return Snapshot(now, healths, alive, rejected, link, behind)
