@@ -182,7 +182,7 @@ def test_every_alert_fires_and_clears(
         fly(silent)
         write_log(missing, range(0, 10_000_000, 100_000), topic="vehicle_local_position_groundtruth")
         for name in expected:
-            wait_for(lambda: not prometheus.alerts(name), what=f"the end of {name}", seconds=TIMEOUT)  # noqa: B023 - it is asked at once
+            wait_for(lambda: not prometheus.alerts(name), what=f"the end of {name}", seconds=TIMEOUT)  # noqa: B023 - called immediately
     assert not any(prometheus.scrape_errors().values())
     assert not prometheus.process.err
 
