@@ -1,4 +1,4 @@
-"""A vehicle with hand-made messages, and its event log."""
+"""A vehicle with synthetic messages, and its event log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DISARMED, ARMED = 1, 2
 
 
 class Flight:
-    """A vehicle and its event log; messages arrive when they are sent, in seconds since boot."""
+    """A vehicle and its event log; messages arrive when they are sent, and times are seconds."""
 
     def __init__(self) -> None:
         self.event_log = EventLog()
@@ -37,7 +37,7 @@ class Flight:
         self, topic: str = VLP, *, vehicle: str = "1", instance: int | None = None, missing: Iterable[str] = (),
         lost: int = 0, **fields: Any,
     ) -> list[Event]:  # fmt: skip
-        """Send a message with valid flags unless given otherwise; return the new events."""
+        """Send a message, with valid flags by default; return the new events."""
         stamp = round((self.now - self.booted) * 1e6)
         values: object = {"timestamp": stamp, **fields}
         if topic == VLP:
@@ -45,15 +45,15 @@ class Flight:
         instance = 0 if instance is None and get_topic(topic).instances else instance
         address = Address(vehicle, topic, instance)
         self.event_log.add(address, values, self.now, missing=frozenset(missing), lost=lost)
-        return self.take()
+        return self.new_events()
 
     def fly(self, seconds: float, rate: float = 10.0) -> list[Event]:
-        """Send positions for a while; return the new events."""
-        told = []
+        """Send positions for this duration; return the new events."""
+        reported = []
         for _ in range(round(seconds * rate)):
             self.wait(1 / rate)
-            told += self.send()
-        return told
+            reported += self.send()
+        return reported
 
     def gps(self, **fields: Any) -> list[Event]:
         return self.send("vehicle_gps_position", **GOOD_GPS | fields)
@@ -64,16 +64,16 @@ class Flight:
     def battery(self, warning: int) -> list[Event]:
         return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
 
-    def look(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
-        """Update the event log with this state of the position stream, None if unknown; return the new events."""
+    def update(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
+        """Update the event log with the state of the position stream, None if unknown; return the new events."""
         self.event_log.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
-        return self.take()
+        return self.new_events()
 
     def reject(self, reason: str = "x is NaN") -> list[Event]:
         self.event_log.reject(POSITION, reason, self.now)
-        return self.take()
+        return self.new_events()
 
-    def take(self) -> list[Event]:
+    def new_events(self) -> list[Event]:
         new, self._seen = self.event_log.events_since(self._seen)
         return new
 
@@ -87,7 +87,7 @@ class Flight:
 
 
 def lose_gps(flight: Flight) -> None:
-    """Lose the receiver, and then the estimate."""
+    """Lose the GPS fix, then the position estimate."""
     flight.gps()
     flight.fly(1)
     flight.gps(fix_type=0, satellites_used=0)
