@@ -73,10 +73,7 @@ def reach_endpoint(endpoint: str) -> Finding | None:
         seen = f"no answer within {_CONNECT_TIMEOUT:g} s"
         advice = "check that the host is on, the address is correct, and no firewall drops the port"
     except OSError as exc:
-        seen, advice = (
-            f"cannot connect: {(exc.strerror or str(exc)).lower()}",
-            "check the cable, the address and the route",
-        )
+        seen, advice = f"cannot connect: {(exc.strerror or str(exc)).lower()}", "check cable, address and route"
     else:
         return None
     return Finding("endpoint", endpoint, "wrong", seen, advice)

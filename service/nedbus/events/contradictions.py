@@ -44,7 +44,7 @@ class ReferenceDetector(ChangeDetector):
         if 0 <= self.stamp - self._compared < _INTERVAL:
             return found
         self._compared, values = self.stamp, self._read_reference(message)
-        if not all(isinstance(each, int | float) for each in values):  # AIR_DATA has no .msg file here
+        if not all(isinstance(each, int | float) for each in values):  # AIR_DATA may have any types
             return found
         new = self._comparison.add(self._name, self.stamp, values)
         return chain(found or (), new) if new else found
@@ -67,9 +67,7 @@ class Comparison:
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         self._height, self._position = _Contradiction("height", "z"), _Contradiction("position", "xy")
-        self._offsets: dict[
-            str, tuple[object, float]
-        ] = {}  # offsets of heights that have another origin than the estimate
+        self._offsets: dict[str, tuple[object, float]] = {}  # of references with another height origin
 
     def add(self, name: str, stamp: int, values: tuple[float, ...]) -> list[Finding]:
         """Compare the estimate with a reference's fields; return contradictions that begin or end."""
@@ -109,7 +107,7 @@ class Comparison:
 
 @dataclass(slots=True)
 class _Contradiction:
-    """State of one quantity; contradicted while all references exceed their limits in the same direction.
+    """State of one quantity, contradicted while all references exceed their limits in the same direction.
 
     `errors`: last time [us], error and limit [m] by reference. `since`: time when all exceeded their limits [us], or 0.
     """

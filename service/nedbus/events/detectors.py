@@ -52,7 +52,7 @@ class Finding:
 
 
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
-"""Yields findings from the fields, by name, of two consecutive messages; the former are {} at the first message."""
+"""Yields findings from the fields of the previous message, {} at first, and of the current one."""
 Detection = tuple[Sequence[str], Sequence[str], Detect]
 """Fields whose changes trigger the function, further fields that it needs, and the function."""
 
@@ -147,7 +147,7 @@ def detection_of(message: str) -> Detection | None:
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield conditions that begin or end; a change from or to an unknown value is not an event."""
     for kind in kinds:
-        found: dict[tuple[bool, Change], list[str]] = {}  # key: (is event, not initial condition; change)
+        found: dict[tuple[bool, Change], list[str]] = {}  # by (is an event rather than initial, change)
         for name in kind.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == kind.bad and kind.initial:
@@ -173,7 +173,7 @@ def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield changes of fix type, satellites, jamming and spoofing in a SensorGps."""
+    """Yield changes of fix type, number of satellites, jamming and spoofing in a SensorGps."""
     fix, was = after["fix_type"], before.get("fix_type")
     satellites, earlier = after["satellites_used"], before.get("satellites_used")
     if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:

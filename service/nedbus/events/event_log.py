@@ -56,7 +56,7 @@ class EventLog:
 
     @property
     def events(self) -> list[Event]:
-        """The events kept, in the order in which they were reported."""
+        """The events kept, in the order of reports."""
         return self.events_since(0)[0]
 
     @property
@@ -81,7 +81,7 @@ class EventLog:
                 vehicle.add(address, message, time, missing=missing, lost=lost)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
-        """Record a dropout of the vehicle's logger that starts at `time`."""
+        """Record a logging dropout of a vehicle that starts at `time`."""
         with self._lock:
             if known := self._vehicle(vehicle, time):
                 known.add_dropout(seconds, time)
@@ -175,9 +175,7 @@ class EventLog:
                 self._forget(self._gone(time)[:1])
             if self.is_full:
                 if not self.refused:
-                    text = (
-                        "more than %d vehicles: no events are detected for further ones; select vehicles with --vehicle"
-                    )
+                    text = "more than %d vehicles: further ones have no events; select vehicles with --vehicle"
                     _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
                 self.refused += 1
                 return None

@@ -29,7 +29,7 @@ class Kind:
     `flags` are labels. Flags that change in the same message become one event.
     `begin`, `end`: event texts, with `{}` for the labels. `first`: text of the end of an initial condition.
     `minor`: flags whose begin is info. `initial`: a flag that is bad in the first message begins a condition.
-    `once_armed`: a state in the first messages becomes a condition once the vehicle has been armed for PAUSE.
+    `once_armed`: active in the first messages, it takes effect once the vehicle has been armed for PAUSE.
     """
 
     name: str

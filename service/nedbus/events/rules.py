@@ -8,7 +8,7 @@ _AIDING: Final = {
     "cs_ev_vel": "vision velocity", "cs_opt_flow": "optical flow", "cs_aux_gpos": "auxiliary position",
 }  # fmt: skip
 FAKE_AIDING: Final = {"cs_fake_pos": "fake position", "cs_valid_fake_pos": "valid fake position"}
-"""Position that the EKF fuses in place of a measured one, while it considers that valid."""
+"""Fake position measurements, which the EKF fuses in the absence of horizontal aiding."""
 AIDING: Final[Mapping[str, str]] = {**_AIDING, **FAKE_AIDING}
 """All sources of horizontal aiding."""
 
@@ -67,9 +67,8 @@ JUMP_DISTANCE: Final = 1.0  # m of unexplained motion, plus JUMP_SHARE of the di
 JUMP_SHARE: Final = 0.2
 LARGE_CORRECTION: Final = 10.0  # m or m/s; without a bad fault, a larger reset or jump heads the verdict
 SMALL_RESET: Final = 0.5  # m or m/s; a smaller reset is info
-# A reference contradicts a valid estimate if the two differ by more than the limit plus HEIGHT_SHARE of the height,
-# SIGMAS of the receiver's accuracy, and the distance flown during GNSS_DELAY. Maximum in healthy logs: 2.9 m in height,
-# and 2.2 m in position at 18 m/s.
+# A reference contradicts a valid estimate beyond the limit plus HEIGHT_SHARE of the height, SIGMAS of the receiver's
+# accuracy, and the distance flown during GNSS_DELAY. Maxima in healthy logs: 2.9 m, and 2.2 m at 18 m/s.
 HEIGHT_LIMIT: Final = 8.0  # m; the whole limit is doubled if there is only one reference
 HEIGHT_SHARE: Final = 0.05
 POSITION_LIMIT: Final = 4.0  # m
@@ -77,11 +76,8 @@ GNSS_DELAY: Final = 0.5  # s
 SIGMAS: Final = 3.0
 UNKNOWN_ACCURACY: Final = 10.0  # m, in place of a missing eph or epv
 CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all references must disagree with the estimate
-FLAPPING_CHANGES: Final = (
-    4,
-    20,
-)  # changes of a condition, and of its kind, within WINDOW; then only the last is reported
-MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; then only the last is reported
+FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of its kind, within WINDOW; beyond, only the last is reported
+MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; beyond, only the last is reported
 PAUSE: Final = 5.0  # s without a recurrence after which flapping, losses, rejections or an overload have ended
 MAX_BURST: Final = 20.0  # s after which continuing losses are reported
 
@@ -102,4 +98,4 @@ WARNINGS: Final[Mapping[int, str]] = {
 LEVELS: Final[Mapping[int, str]] = dict(
     enumerate(("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"))
 )
-"""Names of LogMessage.severity, as of MAV_SEVERITY."""
+"""Names of LogMessage.severity, as in MAV_SEVERITY."""

@@ -21,7 +21,7 @@ from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, 
 from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
-_REBOOT: Final = 1_000_000  # us; a larger step back of PX4's time is a reboot, a smaller one reordering
+_REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event

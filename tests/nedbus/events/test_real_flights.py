@@ -28,11 +28,7 @@ TABLE: Final = json.loads(events_table.TABLE.read_text())
 TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
 NAMES: Final = [name for name in TABLE if name != "from"]
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
-FLAPPING: Final = (
-    4,
-    10.0,
-    5.0,
-)  # changes reported within a window [s]; then only the last, after a pause [s]
+FLAPPING: Final = 4, 10.0, 5.0  # changes per window, window [s], pause until the last one is reported [s]
 NOT_IN_TABLE: Final = (
     "dropout", "text", "ekf_changed", "other_ekf", "height_contradicted", "position_contradicted",
 )  # fmt: skip

@@ -107,11 +107,8 @@ def _to_summary(message: Message) -> str:
 
 def _notes(sample: Sample[Any]) -> str:
     lost = f"  [{sample.lost} lost]" if sample.lost else ""
-    old = (
-        f"  [{format_duration(sample.latency)} old]"
-        if sample.latency is not None and sample.latency > TIMINGS.old
-        else ""
-    )
+    age = sample.latency or 0.0
+    old = f"  [{format_duration(age)} old]" if age > TIMINGS.old else ""
     return f"{old}{lost}"
 
 
