@@ -337,10 +337,7 @@ def test_missing_fix_and_reference_are_conditions_once_armed() -> None:
     flight, since = Flight(), 100.0
     assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
     assert flight.wait(1.0).status(DISARMED) == []
-    assert (flight.severity, flight.event_log.vehicles["1"].initial[1:]) == (
-        "info",
-        [],
-    )  # few satellites are info
+    assert (flight.severity, flight.event_log.vehicles["1"].initial[1:]) == ("info", [])  # initial[0]: few_satellites
     assert brief(flight.wait(1.0).status(ARMED)) == [("armed", "once", "info")]
     assert flight.wait(PAUSE - 0.1).update() == []
     assert flight.kinds == []
