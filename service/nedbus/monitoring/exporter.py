@@ -60,7 +60,7 @@ class Exporter(Observer):
     def run(self, stop: threading.Event) -> None:
         """Run until `stop` is set; raise the error that ended the reader early."""
         with ThreadPoolExecutor(2, thread_name_prefix="nedbus-export") as pool:
-            tasks = pool.submit(self._read), pool.submit(self._ask_peers, stop)
+            tasks = pool.submit(self._read), pool.submit(self._query_peers, stop)
             for task in tasks:
                 task.add_done_callback(lambda _: stop.set())
             try:
@@ -115,7 +115,7 @@ class Exporter(Observer):
         for sample in self.subscription.rows():
             self.add(sample)
 
-    def _ask_peers(self, stop: threading.Event) -> None:
+    def _query_peers(self, stop: threading.Event) -> None:
         # A separate session: large replies (183 kB from a router with 1,000 sessions) would delay messages.
         due = 0.0
         while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, due - time.monotonic()))):

@@ -49,7 +49,7 @@ class Observer:
         self._bus, self._selection = bus, selection
         self.monitor = Monitor()
         self._rejections = bus.rejections()
-        self._looked: float | None = None
+        self._last_poll: float | None = None
         self._disconnected = 0.0  # time of the last poll without a link
         self._lock = threading.Lock()  # a stream is briefly missing from the monitor while it is updated
 
@@ -86,7 +86,7 @@ class Observer:
             if main is not None and (main in healths or not settled)
         }
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"
-        paused, self._looked = self._looked is not None and now - self._looked > _MAX_PAUSE, now
+        paused, self._last_poll = self._last_poll is not None and now - self._last_poll > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
         self.event_log.update(

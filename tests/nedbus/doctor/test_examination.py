@@ -365,7 +365,9 @@ def test_failing_source_of_real_service_is_wrong(run_nedbus: Start) -> None:
     assert set(report["findings"][0]) == {"check", "subject", "state", "seen", "advice"}
 
 
-def test_exit_codes(bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: Start) -> None:
+def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
+    bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: Start
+) -> None:
     """The exit code is 0 if nothing is wrong, even with warnings, and 2 for usage errors."""
     with publishing(bus), service_status(raw, sources=[source(state="waiting")]):
         doctor = run_command("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)

@@ -200,7 +200,7 @@ def test_vehicle_is_not_silent_while_link_is_down(flight: Flight) -> None:
     assert flight.severity == "info"
 
 
-def test_message_before_link_update_ends_no_silence(flight: Flight) -> None:
+def test_message_before_link_update_prevents_silence(flight: Flight) -> None:
     """A message that arrives before the restored link is polled does not make the vehicle silent."""
     flight.fly(1)
     flight.link = "no link"

@@ -128,7 +128,7 @@ def test_table_is_generated_by_its_script() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_numbers_are_finite(name: str) -> None:
+def test_event_numbers_are_finite(name: str) -> None:
     """All numbers of events are finite, as JSON has no NaN."""
     for event in events_in(name):
         assert all(math.isfinite(number) for number in event.numbers.values()), event
@@ -207,7 +207,7 @@ def test_conditions_of_the_whole_flight(name: str) -> None:
     }.get(name, set())
 
 
-def test_gps_loss_without_gps_messages() -> None:
+def test_gps_loss_without_gps_topic_has_missing_topics() -> None:
     """In a log with position and status only, dead reckoning is the evidence, and missing topics are named."""
     only = why("gps_loss")
     assert [each.what for each in only] == ["xy and vxy not valid"]
@@ -222,7 +222,7 @@ def test_gps_loss_without_gps_messages() -> None:
     assert story.lacking == ("vehicle_gps_position", "estimator_status_flags", "failsafe_flags")
 
 
-def test_gps_loss_with_all_messages() -> None:
+def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
     """With all topics logged the lost GPS fix is the evidence, and the position jumps when it is regained."""
     only = why("twelve_messages")
     assert [each.what for each in only] == ["xy and vxy not valid"]
@@ -343,7 +343,7 @@ def test_verdict_names_cause_and_times(
     assert ("Not in the data: vehicle_gps_position" in found.text) == (name == "gps_loss")
 
 
-def test_verdict_of_a_crash() -> None:
+def test_verdict_names_contradicted_height() -> None:
     """Despite valid flags the verdict is the contradicted height, with PX4's text as first evidence."""
     found = verdict(path_of("nxp_v0_ekf_failure"))
     assert found.begin is not None
@@ -357,7 +357,7 @@ def test_verdict_of_a_crash() -> None:
     assert "position 9 m off GNSS while xy_valid is true" in found.text
 
 
-def test_verdict_of_a_flight_without_gps() -> None:
+def test_vehicle_with_vision_is_usable_without_gps() -> None:
     """The vehicle is usable with vision, but without fix and global reference throughout."""
     found = verdict(path_of("cuav_1.16_gps_interference"))
     assert found.usable is True

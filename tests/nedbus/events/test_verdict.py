@@ -243,7 +243,7 @@ def test_verdict_counts_equal_faults() -> None:
     )
 
 
-def test_verdict_is_short() -> None:
+def test_verdict_fits_three_lines() -> None:
     """Long PX4 texts are truncated: a verdict has at most three lines of 100 columns."""
     flight = Flight()
     flight.send()
