@@ -18,7 +18,7 @@ from .processes import HERE, Checkout, end, expect, tell
 ADD: Final = """
 import sys, time
 from pathlib import Path
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.sources import parse_source, source_text_of_file
 from nedbus.errors import InvalidMessageError
 from nedbus_msgs import BY_TOPIC, upgrade_fields
@@ -35,10 +35,10 @@ def read():
 messages = list(read())
 print(len(messages), flush=True)
 for _ in sys.stdin:
-    account, start = Account(), time.process_time()
+    event_log, start = EventLog(), time.process_time()
     for address, fields, due in messages:
-        account.add(address, fields, due)
-    account.settle(due)
+        event_log.add(address, fields, due)
+    event_log.settle(due)
     print(1e6 * (time.process_time() - start) / len(messages), flush=True)
 """  # for each line on stdin: us per message
 
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def measure(path: Path, checkouts: tuple[Checkout, ...], rounds: int) -> None:
-    """Add the messages of a file to accounts, and print the time of each checkout and the ratio."""
+    """Add the messages of a file to event logs, and print the time of each checkout and the ratio."""
     running = [checkout.start("-c", ADD, str(path)) for checkout in checkouts]
     try:
         (count, *_), times = [int(expect(process)) for process in running], [list[float]() for _ in running]

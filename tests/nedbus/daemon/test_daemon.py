@@ -19,7 +19,7 @@ import zenoh
 
 import nedbus
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition
@@ -116,7 +116,7 @@ def take(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[zenoh.Sample]
 
 def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
     """A message of a source never gets the time of this host as timestamp, unlike a message of a script."""
-    output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, Account())
+    output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, EventLog())
     output.publish_live(SourceMessage(0.0, Address("1", VLP), {"x": 1.0}))
     assert (output.published, output.rejected) == (0, 1)
 

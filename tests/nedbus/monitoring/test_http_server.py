@@ -1,4 +1,4 @@
-"""The HTTP server of metrics and health: whatever is asked, by whomever, it answers, and nothing can be changed."""
+"""The HTTP server answers any request from any client, and is read-only."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ PATHS = ("/metrics", "/healthz", "/readyz", "/vehicles", "/status")
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Pages]:
-    """Serve a page, one that fails, and one that waits until it is told to go."""
+    """Serve a page, one that raises, and one that blocks until GO is set."""
 
     def fail() -> Page:
-        raise RuntimeError("a page that fails")
+        raise RuntimeError("broken page")
 
     def wait() -> Page:
         BUSY.release()
@@ -40,23 +40,23 @@ def server() -> Iterator[Pages]:
 
 @pytest.fixture(scope="module")
 def others() -> Iterator[tuple[Pages, Pages]]:
-    """Serve the pages of a service, for this host and for others."""
+    """Serve the pages of a service on loopback and on all interfaces."""
     content = {path: lambda: Page.text("content") for path in PATHS}
     with closing(HttpServer("127.0.0.1:0", content)) as local, closing(HttpServer("0.0.0.0:0", content)) as public:
         yield Pages(local.port), Pages(public.port)
 
 
-def test_unknown_path_is_not_found(server: Pages, caplog: pytest.LogCaptureFixture) -> None:
-    """404 says which pages there are, as / does; a page that fails is 500, goes to the log, and ends nothing."""
+def test_unknown_path_is_404_and_failing_page_500(server: Pages, caplog: pytest.LogCaptureFixture) -> None:
+    """404 and / list the available pages; a page that raises is 500, is logged, and does not stop the server."""
     assert server.ask("/other") == (404, "available pages: /page, /fails, /waits\n")
     assert server.ask("/")[0] == 200
-    assert server.ask("/fails") == (500, "unexpected error, see the log\n")
-    assert "a page that fails" in caplog.text
+    assert server.ask("/fails") == (500, "unexpected error: see the log\n")
+    assert "broken page" in caplog.text
     assert server.ask("/page") == (200, "a page\n")
 
 
-def test_nothing_can_be_changed(server: Pages) -> None:
-    """Whatever is not GET or HEAD is refused; HEAD has the headers of GET, and no content."""
+def test_only_get_and_head_are_allowed(server: Pages) -> None:
+    """Other methods than GET and HEAD are 501; HEAD returns the headers of GET without content."""
     for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"):
         assert server.ask("/page", method)[0] == 501, method
     assert server.ask("/page", "HEAD") == (200, "")
@@ -70,14 +70,14 @@ def test_nothing_can_be_changed(server: Pages) -> None:
     ("host", "status", "elsewhere"),
     [
         ("127.0.0.1:9464", 200, 200),
-        ("192.0.2.1", 200, 200),  # of a forwarded port
+        ("192.0.2.1", 200, 200),  # forwarded port
         ("[::1]:9464", 200, 200),
         ("[fe80::1]", 200, 200),
         ("localhost:1234", 200, 200),
         ("LocalHost.", 200, 200),
         (f"{socket.gethostname()}:9464", 200, 200),
         (f"{socket.getfqdn()}:9464", 200, 200),
-        ("vehicle-1:9464", 403, 200),  # of a container
+        ("vehicle-1:9464", 403, 200),  # Docker container
         ("evil.example:9464", 403, 403),
         ("localhost.evil.example", 403, 403),
         ("127.0.0.1.evil.example", 403, 403),
@@ -85,10 +85,10 @@ def test_nothing_can_be_changed(server: Pages) -> None:
         ("[evil.example]", 403, 403),
     ],
 )
-def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, status: int, elsewhere: int) -> None:
-    """A page of somebody else whose name leads here cannot read the status, and on loopback nothing at all.
+def test_foreign_host_header_is_forbidden(others: tuple[Pages, Pages], host: str, status: int, elsewhere: int) -> None:
+    """A page whose host name is rebound to this server cannot read the status, and on loopback nothing at all.
 
-    Where other hosts may ask, a Prometheus and probes get metrics, health, readiness and vehicles under any name.
+    On other interfaces, metrics, health, readiness and vehicles are served under any name.
     """
     local, public = others
     for path in PATHS:
@@ -110,8 +110,10 @@ def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, statu
         (b"GET /\xff\x00<script> HTTP/1.0\r\n\r\n", b"HTTP/1.0 404 "),
     ],
 )
-def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes) -> None:
-    """Whatever is sent gets an answer, and no line in the log; the next client gets its page."""
+def test_malformed_requests_are_rejected(
+    server: Pages, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes
+) -> None:
+    """A malformed request gets an HTTP error and no log line; the next client is served."""
     with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as client:
         client.sendall(sent)
         assert answer in client.recv(10_000)
@@ -122,12 +124,12 @@ def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixtur
 @pytest.mark.parametrize(
     ("sent", "each_second"),
     [(b"", b""), (b"GET /page HTTP/1.0\r\nHost:", b""), (b"GET /", b"a"), (b"GET /large HTTP/1.0\r\n\r\n", b"")],
-    ids=["silent", "half a request", "byte by byte", "reads no answer"],
+    ids=["no request", "half a request", "byte by byte", "response not read"],
 )
-def test_slow_clients_are_ended(timings: Timings, sent: bytes, each_second: bytes) -> None:
-    """With 16 clients that send nothing, or not all, or read nothing, the next is answered when their time is over."""
+def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes) -> None:
+    """While 16 clients stall in sending or reading, further clients are served once the stalled ones time out."""
     timings.http_client = 0.5
-    large = Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+    large = Page.text("x" * 20_000_000)  # exceeds the socket buffers
     server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})
     with closing(server), ExitStack() as clients:
         slow = [
@@ -146,14 +148,14 @@ def test_slow_clients_are_ended(timings: Timings, sent: bytes, each_second: byte
                 assert Pages(server.port).ask("/page") == (200, "a page\n")
 
 
-def test_close_waits_for_no_client(timings: Timings) -> None:
-    """While 16 clients do not read their answers and another waits for a free thread, it closes at once."""
+def test_close_does_not_wait_for_clients(timings: Timings) -> None:
+    """The server closes at once while 16 clients do not read responses and another one is queued."""
     timings.http_client = 10_000.0  # far beyond the deadline of this test
     made = threading.Semaphore(0)
 
     def make() -> Page:
         made.release()
-        return Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+        return Page.text("x" * 20_000_000)  # exceeds the socket buffers
 
     server = HttpServer("127.0.0.1:0", {"/large": make})
     with ExitStack() as clients:
@@ -165,11 +167,11 @@ def test_close_waits_for_no_client(timings: Timings) -> None:
         server.close()
 
 
-def test_more_clients_than_it_has_room_for(server: Pages) -> None:
-    """While 16 are being answered a further one waits; all get their answers."""
+def test_client_beyond_thread_limit_waits(server: Pages) -> None:
+    """While 16 clients are served, another one waits; all get their responses."""
     with ThreadPoolExecutor(17) as pool:
         answers = []
-        for _ in range(16):  # one after the other: a client that has not sent its request yet may be disconnected
+        for _ in range(16):  # sequential: a client that has not yet sent its request may be disconnected
             answers.append(pool.submit(server.ask, "/waits"))
             assert BUSY.acquire(timeout=DEADLINE)
         answers.append(pool.submit(server.ask, "/waits"))
@@ -178,8 +180,8 @@ def test_more_clients_than_it_has_room_for(server: Pages) -> None:
         assert {answer.result(DEADLINE) for answer in answers} == {(200, "True\n")}
 
 
-def test_server_pauses_without_a_file_for_a_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit of open files a client stays in the queue, and accepting it is not tried again without a pause."""
+def test_server_pauses_without_free_file_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of open files a client stays queued, and the server pauses before it retries."""
     pauses: list[float] = []
     is_full = threading.Event()
     accept = socket.socket.accept

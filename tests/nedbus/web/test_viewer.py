@@ -389,7 +389,7 @@ def test_text_from_peers_is_escaped(sim: SimulatedFleet) -> None:
     """Rejection reasons, link faults, titles and URL arguments are escaped wherever they are shown."""
     sim.fly(3)
     for reason in ("the first", HOSTILE):
-        sim.account.reject(WING, reason, sim.time)
+        sim.event_log.reject(WING, reason, sim.time)
         sim.fleet.reject([RejectionReport(WING, reason, round(sim.time * 1e9))])
         sim.time += 20
         sim.poll()
@@ -866,5 +866,5 @@ def test_page_survives_a_router_restart() -> None:
         texts = [
             event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"
         ]
-        assert texts == [f"no link to {where}", "link is back"]
+        assert texts == [f"no link to {where}", "link restored"]
     router.close()

@@ -14,7 +14,7 @@ from nedbus import __version__
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, Sample, to_age
+from nedbus.client import Bus, Sample, format_duration
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
@@ -72,7 +72,7 @@ def health(
             write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
         raise NedbusError(faults[-1])
     if not json_output:
-        newest = to_age(min(check.ages.values())) if check.ages else "an unknown time"
+        newest = format_duration(min(check.ages.values())) if check.ages else "an unknown time"
         found = f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
         write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest} old")
 
@@ -134,7 +134,7 @@ class _Check:
             yield f"{what}{_REFUSED if self._is_refused else f': {states[:300]}' if states else ''}"
         elif self.ages and min(self.ages.values()) > self._max_age:
             name = min(self.ages, key=lambda each: self.ages[each])
-            age = to_age(self.ages[name])
+            age = format_duration(self.ages[name])
             yield f"the newest message is {age} old, from vehicle {name}: the limit is {self._max_age:g} s"
 
     def vehicle_faults(self) -> Iterator[str]:

@@ -15,7 +15,7 @@ from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, to_age
+from nedbus.client import Bus, format_duration
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import (
     CLOCKS,
@@ -97,11 +97,11 @@ def events(
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(files)
-    _require_vehicle(_name(files), read.account.vehicles, vehicle)
+    _require_vehicle(_name(files), read.event_log.vehicles, vehicle)
     found = select(found)
     begin({read.times.clock(event) for event in found})
     show(found, read.times)
-    vehicles = sorted(each for each in read.account.vehicles.items() if vehicle in (ANY, each[0]))
+    vehicles = sorted(each for each in read.event_log.vehicles.items() if vehicle in (ANY, each[0]))
     if texts := [f"{name}: {each.held_from_start}" for name, each in vehicles if each.held_from_start]:
         write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
@@ -127,7 +127,7 @@ def why(
     """
     if files:
         read, found = _read(files)
-        reports, times = [report_of(read.account, "", "", read.end, within=math.inf)], read.times
+        reports, times = [report_of(read.event_log, "", "", read.end, within=math.inf)], read.times
         where, advice = _name(files), _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
     else:
         with open_bus() as bus:
@@ -203,7 +203,7 @@ def _shown(event: Event) -> str:
 
 
 def _before(event: Event, time: float) -> str:
-    return f"{_shown(event)} ({to_age(max(0.0, time - event.time))} before)"
+    return f"{_shown(event)} ({format_duration(max(0.0, time - event.time))} before)"
 
 
 def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
@@ -213,10 +213,10 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
     def show_new() -> None:
         nonlocal seen
         observer.poll()
-        new, seen = observer.account.events_since(seen)
+        new, seen = observer.event_log.events_since(seen)
         show(event.later(clock.to_utc()) for event in new)
-        known.intersection_update(observer.account.vehicles)
-        for name, each in list(observer.account.vehicles.items()):
+        known.intersection_update(observer.event_log.vehicles)
+        for name, each in list(observer.event_log.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
                 if initial := each.held_from_start:
@@ -232,7 +232,7 @@ def _name(files: Sequence[Path]) -> str:
 
 def _read(files: Sequence[Path]) -> tuple[FileEvents, list[Event]]:
     read = read_file_events(*files)
-    found, told = read.account.events_since(0)
+    found, told = read.event_log.events_since(0)
     for warning in read.warnings:
         write_stderr(warning)
     if told > len(found):

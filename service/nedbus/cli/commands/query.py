@@ -13,8 +13,9 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
+from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
 from nedbus.errors import AddressError, ConfigError, ConnectError
+from nedbus.events import format_duration
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     ANY,
@@ -60,7 +61,8 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
             name, reason = (state.name, state.reason) if state else (None, "no answer")
             write(json.dumps({**asdict(address), "age": age, "state": name, "reason": reason, "stored": is_stored}))
         text = describe_stream(health, state) if health and state else "no answer"
-        rows.append([str(address), "-" if age is None else to_age(age), f"stored, {text}" if is_stored else text])
+        since = "-" if age is None else format_duration(age)
+        rows.append([str(address), since, f"stored, {text}" if is_stored else text])
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
@@ -178,7 +180,7 @@ def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStat
         to_text(address),
         "-" if health.rate is None else f"{health.rate:.1f}",
         f"{health.nominal:g}" if health.nominal else "-",
-        "-" if health.age is None else to_age(health.age),
+        "-" if health.age is None else format_duration(health.age),
         str(health.messages),
         "refused by the router" if is_refused else describe_stream(health, state) + suffix,
     ]

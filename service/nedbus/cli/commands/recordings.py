@@ -117,8 +117,8 @@ def plot(
             raise SourceError(str(source), "nothing to plot: the selected streams have no valid message")
         target = output or source.with_suffix(".png")
         read = read_file_events(source)
-        known = (each for vehicle in read.account.vehicles.values() for each in vehicle.conditions.values())
-        events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.account.events_since(0)[0]]
+        known = (each for vehicle in read.event_log.vehicles.values() for each in vehicle.conditions.values())
+        events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.event_log.events_since(0)[0]]
         draw(streams, target, title=source.name, events=events, times=read.times)
         write(str(target))
         if flight.damaged:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from nedbus.client import Sample, to_age
+from nedbus.client import Sample, format_duration
 from nedbus.errors import ConfigError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, Message, message_doubts
@@ -107,13 +107,14 @@ def _to_summary(message: Message) -> str:
 
 def _notes(sample: Sample[Any]) -> str:
     lost = f"  [{sample.lost} lost]" if sample.lost else ""
-    old = f"  [{to_age(sample.latency)} old]" if sample.latency is not None and sample.latency > TIMINGS.old else ""
+    age = sample.latency or 0.0
+    old = f"  [{format_duration(age)} old]" if age > TIMINGS.old else ""
     return f"{old}{lost}"
 
 
 def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format these fields, or all, one per line, like `ros2 topic echo`."""
-    age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
+    age = "" if sample.latency is None else f", {format_duration(sample.latency)} old"
     source = "" if sample.source is None else f", from {sample.source}"
     stored = ", only stored" if sample.stored else ""
     missing, lines = sample.missing, [f"{sample.address}{age}{source}{stored}"]

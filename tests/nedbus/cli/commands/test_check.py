@@ -46,7 +46,7 @@ def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
         (5, 1, "tcp/nowhere.invalid:1: cannot resolve host name nowhere.invalid"),
-        (5, 1, f"{closed}: connection refused: no program listens on this port"),
+        (5, 1, f"{closed}: connection refused: nothing listens on this port"),
         (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
         (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"),
         (7, 1, "until_done: "),
@@ -84,13 +84,13 @@ def test_two_sources_of_one_vehicle(tmp_path: Path) -> None:
         f' "sim:?vehicle=wing", "sim:?vehicle=8", "px4-zenoh:"]\n'
     )
     reasons = [line.partition(": ")[2] for line in check(file)]
-    advice = "give one of them another vehicle"
+    advice = "set another vehicle for one of them"
     sims = [
-        f"source 'sim:?seed=2': publishes 1/vehicle_local_position, like source 'sim:': {advice}",
-        f"source 'sim:': publishes 1/vehicle_local_position, like source 'sim:': {advice}",
-        f"source 'sim:?vehicle=wing': publishes wing/vehicle_local_position, like source '{named}': {advice}",
+        f"source 'sim:?seed=2': publishes 1/vehicle_local_position, as does source 'sim:': {advice}",
+        f"source 'sim:': publishes 1/vehicle_local_position, as does source 'sim:': {advice}",
+        f"source 'sim:?vehicle=wing': publishes wing/vehicle_local_position, as does source '{named}': {advice}",
     ]
-    first = f"like source 'ulog:{log}?vehicle=7': {advice}"
+    first = f"as does source 'ulog:{log}?vehicle=7': {advice}"
     logs = f"source 'ulog:{log}?vehicle=7&speed=2': publishes 7/vehicle_local_position, {first}"
     assert reasons == [sims[0], logs, *sims[1:]]
     assert [line.partition(": ")[2] for line in check("--offline", file)] == sims
@@ -178,7 +178,7 @@ def test_certificates_that_expire_are_named(tmp_path: Path) -> None:
         f"{settings}, line 3, column 1: this client is",
         f"{router}, line 2, column 24: listen_certificate: it is",
     ]
-    assert all(re.search(r"\d+ days from now: renew it", line) for line in lines), lines
+    assert all(re.search(r"\d+ days left\): renew it", line) for line in lines), lines
     settings.write_text(settings.read_text().replace("soon", "late"))
     assert passes("check", settings)
 
@@ -191,5 +191,5 @@ def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path
     program = "import sys; sys.modules['cryptography'] = None; from nedbus.cli import main; main()"
     checked = start("-c", program, "check", str(settings))
     assert (checked.wait(), checked.out) == (0, "no mistakes found\n"), checked.err
-    reason = "the expiry of the certificate is not checked: cryptography: not installed"
+    reason = "certificate expiry not checked: cryptography: not installed"
     assert f"{tmp_path}/pki/ca.crt: {reason}" in checked.err

@@ -22,7 +22,7 @@ from nedbus.events import KINDS
 from nedbus.sources import read_file_events, source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
-from tests.flights.ulogs import LOGS, UlogWriter, account_of
+from tests.flights.ulogs import LOGS, UlogWriter, cached_events
 from tests.peers.command_line import Ended, run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
@@ -35,7 +35,7 @@ TOLD = [
     ("8.000", "BAD", "vxy not valid  <- dead reckoning (3.0 s before)"),
     ("12.000", "", "xy valid again after 4.0 s"),
     ("12.000", "", "vxy valid again after 4.0 s"),
-    ("12.000", "", "dead reckoning ends after 7.0 s"),
+    ("12.000", "", "dead reckoning ended after 7.0 s"),
 ]
 MISSING = "vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags"
 VERDICT = f"""\
@@ -48,7 +48,7 @@ WHY = f"""\
   before it
     5.000  dead reckoning (3.0 s before)
   ended at 12.000 with
-    12.000  dead reckoning ends after 7.0 s
+    12.000  dead reckoning ended after 7.0 s
   missing topics that may explain it: {MISSING}; \
 PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)
 """
@@ -77,7 +77,7 @@ def log(tmp_path: Path) -> Path:
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have all commands read the real log once: what they say of it is what is tested."""
     where = "nedbus.cli.commands.events.read_file_events"
-    monkeypatch.setattr(where, lambda path: (account_of if path == REAL else read_file_events)(path))
+    monkeypatch.setattr(where, lambda path: (cached_events if path == REAL else read_file_events)(path))
 
 
 def lines_of(shown: Ended) -> list[tuple[str, str, str]]:
@@ -152,12 +152,13 @@ def test_events_of_a_real_flight() -> None:
     told = events_of(str(REAL))
     assert len([topic for _, _, topic in told if topic != "log_message"]) == 63
     assert events_of("flight.mcap") == told
-    assert "23:09:04.9  1        BAD    xy not valid  <- GPS fix 3D to none, 10 satellites to 0 (5.1 s before)" in (
-        run_command("events", str(REAL)).out
+    assert (
+        "23:09:04.9  1        BAD    xy not valid  <- GPS fix lost: 3D to none, satellites 10 to 0 (5.1 s before)"
+        in (run_command("events", str(REAL)).out)
     )
     story = run_command("why", str(REAL), "--all").out
     fault = "xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
-    begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix 3D to none, 10 satellites to 0"
+    begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix lost: 3D to none, satellites 10 to 0"
     assert story.startswith(begin)
     assert f"\n\n1: {fault}\n  before it\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
@@ -188,7 +189,7 @@ def test_why_of_a_moment(log: Path) -> None:
         "1: position valid throughout, but dead reckoning from 5.000 to 12.000 s since boot (7.0 s)."
     )
     shown = run_command("why", str(log), "--at", "19").out
-    assert shown.startswith("1: no fault then; the nearest: xy and vxy not valid from 8.000 to 12.000 s")
+    assert shown.startswith("1: no fault at that time; nearest: xy and vxy not valid from 8.000 to 12.000 s")
 
 
 @pytest.mark.logs
@@ -197,7 +198,7 @@ def test_why_of_a_moment(log: Path) -> None:
 def test_why_of_a_moment_in_both_clocks() -> None:
     """UTC, as the real log's messages tell it, and seconds since boot are the same moment."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
-    assert "GPS fix 3D to none, 10 satellites to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
+    assert "GPS fix lost: 3D to none, satellites 10 to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
     for moment in ("27.557", "+27.325"):
         assert run_command("why", str(REAL), "--at", moment).out == by_utc
 
@@ -221,12 +222,12 @@ def test_what_never_was_valid_is_said(tmp_path: Path) -> None:
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = str(writer.write(tmp_path / "never.ulg"))
     assert run_command("events", log).err == "throughout the file: 1: xy not valid\n"
-    begin = "1: not usable: xy not valid from the first message on, until the end (4.8 s)."
+    begin = "1: not usable: xy not valid from the first message until the end (4.8 s)."
     assert run_command("why", log).out.startswith(begin)
 
 
 def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of more than an account keeps the last are told, and that there were more."""
+    """Of more than an event_log keeps the last are told, and that there were more."""
     monkeypatch.setattr("nedbus.sources.file_events.MAX_FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
@@ -246,7 +247,7 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (("why", "LOG", "--at", "noon"), 2, "nedbus: --at: 'noon': not a time: EXPECTED\n"),
         (("why", "LOG", "--at", "nan"), 2, "nedbus: --at: 'nan': not a time: EXPECTED\n"),
         (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': not a time: EXPECTED\n"),
-        (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle gives UTC: EXPECTED\n"),
+        (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle has UTC: EXPECTED\n"),
         (("events", "LOG", "--severity", "dire"), 2, "nedbus: --severity: 'dire': expected bad or watch or info\n"),
         (("events", "LOG", "--origin", "gcs"), 2, "nedbus: --origin: 'gcs': expected px4 or nedbus or *\n"),
         (("events", "LOG", "--within", "60"), 2, "nedbus: --within: needs live vehicles, not a file\n"),
@@ -301,13 +302,13 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     shown = run_command("why", "-c", endpoint)
     assert (shown.exit_code, shown.err) == (0, "--all shows 1 fault in detail\n")
     assert shown.out.startswith("1: not usable: xy and vxy not valid from ")
-    assert shown.out.endswith("\n2: no faults in the history of the services\n")
+    assert shown.out.endswith("\n2: no faults in the services' history\n")
     bus.publisher(VLP, vehicle="mocap1").publish(message(1))
     shown = run_command("why", "-c", endpoint, "-v", "mocap1")
     reason = "vehicle mocap1 is published, but no nedbus service keeps its history"
     hint = "follow it with 'nedbus events --vehicle mocap1'"
     assert (shown.exit_code, shown.err) == (1, f"nedbus: {reason}: {hint}\n")
-    assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the history of the services\n"
+    assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the services' history\n"
     shown = run_command("why", "-c", endpoint, "-v", "1", "--all")
     clock = r"\d\d:\d\d:\d\d\.\d"
     fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
@@ -317,7 +318,7 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
     assert set(shown.out.splitlines()) <= set(since_boot.out.splitlines())
     refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")
-    assert (refused.exit_code, "--at: '+3': live data has no start to count from" in refused.err) == (2, True)
+    assert (refused.exit_code, "--at: '+3': live data has no start" in refused.err) == (2, True)
     at = re.search(r"\d\d:\d\d:\d\d\.\d", shown.out)
     assert at
     assert run_command("why", "-c", endpoint, "-v", "1", "--at", at[0]).out.startswith("1: ")
@@ -336,7 +337,7 @@ def test_why_live_of_what_held_before(run_nedbus: Start, bus: nedbus.Bus, endpoi
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = writer.write(tmp_path / "never.ulg")
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
-    begin = "1: not usable: xy not valid from the first message on, until now ("
+    begin = "1: not usable: xy not valid from the first message until now ("
     assert run_command("why", "-c", endpoint).out.startswith(begin)
 
 

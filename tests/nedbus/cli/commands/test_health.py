@@ -125,7 +125,7 @@ def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Judge) -> Non
         assert shown.err.splitlines() == [
             "nedbus: vehicle 7 is missing: it has no publisher",
             "nedbus: vehicle 8 is missing: it has no publisher",
-            "nedbus: 1 of 3 vehicles are heard: 1",
+            "nedbus: messages arrive from 1 of 3 vehicles: 1",
         ]
         publisher.publish(message(1, xy_valid=False))
         options = "--expect", "1,script", "--vehicles", "2", "--max-age", "60"
@@ -133,7 +133,7 @@ def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Judge) -> Non
         shown = health(*options, "--valid", "xy,z")
         assert shown.err.splitlines() == [
             "nedbus: vehicle script: xy not valid",
-            "nedbus: vehicle script: the validity of z is unknown, as the vehicle does not send it",
+            "nedbus: vehicle script: validity of z is unknown: the vehicle does not send it",
         ]
 
 
@@ -169,8 +169,8 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
     """A vehicle that its service no longer hears is one, without any option; others are judged beside it."""
     with serving(endpoint, "sim:") as daemon:
         wait_for(lambda: health().exit_code == 0, what="health")
-        daemon.account.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
-        wait_for(lambda: daemon.account.state("2", time.time()).severity == "bad", what="silence")
+        daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
+        wait_for(lambda: daemon.event_log.state("2", time.time()).severity == "bad", what="silence")
         shown = health()
         assert shown.exit_code == 1
         assert re.fullmatch(

@@ -100,7 +100,7 @@ def test_manual_says_what_is_limited() -> None:
     events = {each for names in named for each in re.findall(r"`([a-z_]+)`", names)} & EVENTS.keys()
     assert {"error", "rejected", "client_refused"} <= events
     assert f"{BURST} lines" in section
-    assert f"{PER_MINUTE} a minute" in section
+    assert f"{PER_MINUTE} per minute" in section
 
 
 def test_json_is_one_harmless_object() -> None:

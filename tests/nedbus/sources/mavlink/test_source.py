@@ -131,7 +131,7 @@ def test_validity_without_estimator_status_is_unknown(
     asked = {
         "list": "validity unknown", "info": "validity unknown", "echo --once": "validity unknown",
         "hz --count 2": "validity unknown",
-        "health --expect 9 --valid xy": "the validity of xy is unknown, as the vehicle does not send it",
+        "health --expect 9 --valid xy": "validity of xy is unknown: the vehicle does not send it",
     }  # fmt: skip
     done = threading.Event()
 
