@@ -23,7 +23,7 @@ from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import open_router
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, changing_timings, repeating, wait_for
@@ -148,7 +148,7 @@ def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> N
     text = f'listen = "{free_endpoint()}"\nsource = ["sim:"]\n'
     file.write_text(text)
     often = Timings(systemd_status=0.2)
-    process = start_hasty(start, often, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
+    process = start_with_timings(start, often, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
     systemd.receive_until(is_ready)
     for content, is_wrong in ((text, False), ("source = [", True), (text, False)):
         file.write_text(content)

@@ -17,7 +17,7 @@ from nedbus.client import LogStreamStatus
 from nedbus.recording import Flight
 from nedbus.timings import Timings
 from tests.peers.command_line import run_command
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.http_pages import Pages
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
@@ -37,7 +37,9 @@ def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
     patient = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # of a busy machine
-    service = start_hasty(start, patient, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
+    service = start_with_timings(
+        start, patient, "serve", "--listen", endpoint, "--http", pages.where, "--source", source
+    )
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,

@@ -30,7 +30,7 @@ from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, p
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
 from tests.peers.command_line import run_command
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.http_pages import Pages
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
@@ -370,7 +370,7 @@ def test_refused_service_says_so_until_the_rules_are_mended(
 
     router, pages = start_router(), Pages(free_port())
     options = (*flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
-    service = start_hasty(start, SOON, "serve", "-c", endpoint, *options)
+    service = start_with_timings(start, SOON, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses vehicle 2\n")
     wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
     assert (pages.ask("/healthz"), pages.ask("/readyz")) == (refused, refused)

@@ -27,7 +27,7 @@ from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.command_line import run_command
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.processes import Start
 from tests.waits import wait_for, wait_for_reader
 
@@ -155,7 +155,7 @@ def test_service_logs_json(start: Start) -> None:
     """
     sources = ("-s", REPLAY, "-s", "sim:?vehicle=2")
     soon = Timings(reports=(0.2,))
-    service = start_hasty(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
+    service = start_with_timings(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
     for event in ("done", "progress"):  # a report comes after what to type
         wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - it is called at once
     service.signal(signal.SIGTERM)
@@ -329,7 +329,7 @@ def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session
     """Vehicles that appear, reboot and fall silent by the hundred make a service log a few lines of each event."""
     began = time.monotonic()
     soon = Timings(stale=0.5)
-    service = start_hasty(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
+    service = start_with_timings(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
     wait_for(lambda: '"listening"' in service.err, what="the source")
     fleet = [Px4(raw, namespace=f"wing{number}") for number in range(VEHICLES)]
 

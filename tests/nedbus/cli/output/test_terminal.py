@@ -28,7 +28,7 @@ from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.flights.messages import VALID, VLP, message
 from tests.peers.command_line import fork_command, run_command
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start, Zygote, unmeasured
 from tests.waits import DEADLINE, repeating, wait_for
@@ -318,7 +318,7 @@ def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bu
 def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, timings: Timings) -> None:
     """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
-    hz = start_hasty(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
+    hz = start_with_timings(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
     timings.stale = 0.5
     listed = run_command("list", "-c", endpoint)

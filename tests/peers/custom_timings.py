@@ -19,6 +19,6 @@ main()
 """
 
 
-def start_hasty(start: Start, timings: Timings, *arguments: str, **environment: str) -> Process:
+def start_with_timings(start: Start, timings: Timings, *arguments: str, **environment: str) -> Process:
     """Start `nedbus` with these arguments and timings."""
     return start("-c", _SCRIPT, repr(timings), *arguments, **environment)
