@@ -16,7 +16,7 @@ import nedbus
 from nedbus.timings import Timings
 from nedbus.transport import Session, open_router
 from tests.peers.ports import free_endpoint
-from tests.peers.processes import Process, Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import changing_timings
 
 from .blocking import blocking
@@ -117,10 +117,10 @@ def raw(endpoint: str) -> Iterator[Session]:
 
 
 @pytest.fixture(scope="session")
-def zygote(request: pytest.FixtureRequest) -> Iterator[Zygote]:
+def fork_server(request: pytest.FixtureRequest) -> Iterator[ForkServer]:
     """Keep a process ready that forks others."""
     with request.config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
-        process = Zygote()  # what hangs shows its stacks on the terminal itself
+        process = ForkServer()  # what hangs shows its stacks on the terminal itself
     yield process
     process.close()
 
@@ -133,14 +133,14 @@ def start(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Start]:
     """
     processes: list[Process] = []
 
-    def start_process(*arguments: str, measured: bool = True, fresh: bool = False, **environment: str) -> Process:
+    def start_process(*arguments: str, coverage: bool = True, fresh: bool = False, **environment: str) -> Process:
         where = tmp_path / f"process-{len(processes)}"
         where.mkdir()
-        inherited = dict(os.environ) if measured else unmeasured()
+        inherited = dict(os.environ) if coverage else without_coverage()
         inherited = {name: value for name, value in inherited.items() if not name.startswith("NEDBUS_")}
         environment = inherited | {"PYTHONFAULTHANDLER": "1"} | environment
         command = [sys.executable, *arguments]
-        process = Process(command, where, environment, None if fresh else request.getfixturevalue("zygote"))
+        process = Process(command, where, environment, None if fresh else request.getfixturevalue("fork_server"))
         processes.append(process)
         return process
 

@@ -36,7 +36,7 @@ from tests.flights.replays import convert_replay
 from tests.nedbus.cli.commands.test_events import write_flight
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint, free_port
-from tests.peers.processes import Process, Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import wait_for
 
 SERVERS: Final = ("serve", "router", "export", "web", "foxglove", "ros2")
@@ -54,14 +54,14 @@ PYTHON: Final = [block for block in BLOCKS if block.language == "python"]
 
 
 @pytest.fixture(scope="module")
-def vehicles(zygote: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def vehicles(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Run a router with the vehicles of the pages, for all snippets that only read."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     sources = [text for vehicle, topics in VEHICLES for text in ("--source", f"sim:?vehicle={vehicle}{topics}")]
     command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, *sources)
-    environment = {name: value for name, value in unmeasured().items() if not name.startswith("NEDBUS_")}
-    service = Process(command, tmp_path_factory.mktemp("vehicles"), environment, zygote)
+    environment = {name: value for name, value in without_coverage().items() if not name.startswith("NEDBUS_")}
+    service = Process(command, tmp_path_factory.mktemp("vehicles"), environment, fork_server)
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: len(bus.latest("*")) == 12 + 2 * 5, what="three vehicles")
     yield endpoint
@@ -144,7 +144,7 @@ class Runner:
             arguments += ["--listen", free_endpoint()]
         if name in {"web", "foxglove"} and "--http" not in arguments:
             arguments += ["--http", f"127.0.0.1:{free_port()}"]
-        process = self._start("-c", THERE, str(self._folder), *arguments, measured=False, **self._environment)
+        process = self._start("-c", THERE, str(self._folder), *arguments, coverage=False, **self._environment)
         wait_for(lambda: self._has_said(process) or process.popen.poll() is not None, what=command)
         ends = bool({"--duration", "--check"} & {*arguments}) or (name == "events" and "flight.ulg" in arguments)
         if name in ENDLESS and not ends:
@@ -168,7 +168,7 @@ class Runner:
                 break
         script = self._folder / "script.py"
         script.write_text(self._localize("\n".join([f"import os; os.chdir({str(self._folder)!r})", *texts])))
-        process = self._start(str(script), measured=False, **self._environment)
+        process = self._start(str(script), coverage=False, **self._environment)
 
         def is_done() -> bool:
             has_printed = process.out.count("\n") >= 3 and not unprinted(shown, process.out)

@@ -35,7 +35,7 @@ def run_example(start: Start, name: str, endpoint: str, folder: Path) -> Process
     """Run an example; the default endpoint in it is replaced by this test's."""
     script = folder / name
     script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", endpoint))
-    return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1", measured=False)
+    return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1", coverage=False)
 
 
 def test_all_examples_are_tested() -> None:
@@ -75,7 +75,7 @@ def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Pat
     states = ["vehicle 1: good", "vehicle 1: ALARM: nothing arrived for 1 s", "vehicle 1: good"]
 
     def serve() -> Process:
-        service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", measured=False)
+        service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", coverage=False)
         wait_for(lambda: "router on" in service.err, what="the router")
         return service
 

@@ -26,7 +26,7 @@ import typer
 from nedbus.cli.app import app
 from nedbus.cli.output.logs import RateLimit
 
-from .processes import Forked, Zygote, unmeasured
+from .processes import ForkedProcess, ForkServer, without_coverage
 
 _SIZE: Final = {"COLUMNS": "80", "LINES": "24"}  # where a test does not say another, also if pytest has a terminal
 
@@ -56,12 +56,14 @@ def run_command(*arguments: str, **environment: str) -> Ended:
     return Ended(exit_code, out.getvalue().decode(), err.getvalue().decode())
 
 
-def fork_command(zygote: Zygote, *arguments: str, out: int, err: int | None = None, **environment: str) -> Forked:
+def fork_command(
+    fork_server: ForkServer, *arguments: str, out: int, err: int | None = None, **environment: str
+) -> ForkedProcess:
     """Start `nedbus` with these arguments and streams, and without coverage; it is the test that ends it."""
     with Path(os.devnull).open("r+b") as null:
         streams = null.fileno(), out, null.fileno() if err is None else err
-        started = unmeasured() | environment
-        return zygote.start(("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams)
+        started = without_coverage() | environment
+        return fork_server.start(("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams)
 
 
 @cache

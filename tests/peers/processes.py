@@ -21,8 +21,8 @@ from tests.waits import DEADLINE
 _SAID = 10_000  # characters of a process's output that a failure shows
 
 
-class Forked:
-    """A process forked by a zygote, with the methods of subprocess.Popen."""
+class ForkedProcess:
+    """A process forked by a fork_server, with the methods of subprocess.Popen."""
 
     def __init__(self, command: Sequence[str], status: int) -> None:
         self.args = command
@@ -55,29 +55,29 @@ class Forked:
         return self.returncode
 
 
-class Zygote:
-    """A process of `zygote.py`; one for each worker of pytest, from its first test that starts a process."""
+class ForkServer:
+    """A process of `fork_server.py`; one for each worker of pytest, from its first test that starts a process."""
 
     def __init__(self) -> None:
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.peers.zygote", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.peers.fork_server", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 cwd=Path(__file__).parents[2],
                 # Coverage begins in the forked process, if at all; what has threads cannot be forked.
-                env=unmeasured() | {"OPENBLAS_NUM_THREADS": "1"},
+                env=without_coverage() | {"OPENBLAS_NUM_THREADS": "1"},
             )
 
     def start(
         self, arguments: Sequence[str], *, cwd: Path, environment: dict[str, str], streams: tuple[int, int, int]
-    ) -> Forked:
+    ) -> ForkedProcess:
         """Fork what Python would start with these arguments, with these three standard streams."""
         request = {"arguments": arguments, "cwd": str(cwd), "environment": environment}
         ours, theirs = os.pipe()
         socket.send_fds(self._requests, [json.dumps(request).encode()], [*streams, theirs])
         os.close(theirs)
-        return Forked([sys.executable, *arguments], ours)
+        return ForkedProcess([sys.executable, *arguments], ours)
 
     def close(self) -> None:
         self._requests.close()
@@ -88,16 +88,16 @@ class Process:
     """A process that a test starts: its output in files, gone at the end of the test at the latest."""
 
     def __init__(
-        self, command: Sequence[str], where: Path, environment: dict[str, str], zygote: Zygote | None = None
+        self, command: Sequence[str], where: Path, environment: dict[str, str], fork_server: ForkServer | None = None
     ) -> None:
         self._measured = any(name.startswith("COVERAGE_") for name in environment)
         self._out = where / "stdout"
         self._err = where / "stderr"
-        self.popen: Forked | subprocess.Popen[bytes]
+        self.popen: ForkedProcess | subprocess.Popen[bytes]
         with self._out.open("wb") as out, self._err.open("wb") as err, Path(os.devnull).open("rb") as null:
-            if zygote is not None:
+            if fork_server is not None:
                 streams = null.fileno(), out.fileno(), err.fileno()
-                self.popen = zygote.start(command[1:], cwd=where, environment=environment, streams=streams)
+                self.popen = fork_server.start(command[1:], cwd=where, environment=environment, streams=streams)
             else:
                 self.popen = subprocess.Popen(command, stdin=null, stdout=out, stderr=err, cwd=where, env=environment)
 
@@ -122,7 +122,7 @@ class Process:
 
     def signal(self, number: signal.Signals) -> None:
         if self._measured and number == signal.SIGINT:
-            pytest.fail("start what SIGINT is to end with measured=False")
+            pytest.fail("start what SIGINT is to end with coverage=False")
         self.popen.send_signal(number)
 
     def kill(self) -> None:
@@ -130,7 +130,7 @@ class Process:
         self.popen.wait(DEADLINE)
 
 
-def unmeasured() -> dict[str, str]:
+def without_coverage() -> dict[str, str]:
     """Return an environment without coverage, for what SIGINT ends: KeyboardInterrupt can be raised in its lock."""
     return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
 

@@ -91,7 +91,7 @@ def connected(url: str) -> Iterator[Client]:
 def test_vehicles_appear_and_every_field_can_be_plotted(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """Channels come with vehicles and go with them; a plot's data is the message, with its definition."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
+    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/estimator_local_position/1"
     sent = message(5, x=0.25, vxy_max=float("inf"))
@@ -118,7 +118,7 @@ def test_what_is_said_once_is_shown_to_the_first_who_subscribes(
 ) -> None:
     """A home comes once, and brings its channel: nobody can have subscribed to that before."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
+    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/home_position"
     with connected(url) as client, bus.publisher("home_position", vehicle="7") as publisher:

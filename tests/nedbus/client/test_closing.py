@@ -315,7 +315,7 @@ def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, raw
     kept: list[zenoh.Query] = []
     code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
     with answering(raw, "nedbus/**", kept.append):
-        process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+        process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
         wait_for(lambda: kept, what="the question")
         process.signal(signal.SIGINT)
         assert process.wait() == -signal.SIGINT, process.err
@@ -359,7 +359,7 @@ for ask in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
         print(exc)
 sys.exit(7)
 """
-    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False, fresh=True)
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False, fresh=True)
     assert process.wait() == 7, process.err
     assert process.out.count("start processes with multiprocessing.get_context('spawn')") == 5
     assert "Traceback" not in process.err

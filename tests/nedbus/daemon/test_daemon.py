@@ -237,7 +237,7 @@ def test_signal_ends_the_service(tmp_path: Path, serve: Serve, number: signal.Si
     """SIGTERM and SIGINT end the service, whatever its sources do, and nothing has to be forced."""
     path = write_log(tmp_path / "a.ulg", range(0, 10_000_000, 10_000))
     sources = ("sim:", f"ulog:{path}?vehicle=2", f"ulog:{path}?vehicle=3&speed=max&loop=1", "ulog:/nowhere.ulg")
-    service, bus = serve(*(f"--source={source}" for source in sources), measured=False)
+    service, bus = serve(*(f"--source={source}" for source in sources), coverage=False)
     for place, state in enumerate(("running", "running", "running", "retrying")):
         wait_for(has_state(bus, state, place), what=sources[place])
     service.signal(number)

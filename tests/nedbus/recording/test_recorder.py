@@ -121,7 +121,7 @@ def test_power_cut_costs_a_second_at_most(run_nedbus: Start, endpoint: str, tmp_
     costs: list[int] = []
     while not costs or (costs[-1] >= 1_500_000 and len(costs) < 5):
         path = tmp_path / f"cut{len(costs)}.mcap"
-        recorder = run_nedbus("record", "-c", endpoint, "-o", str(path), measured=False)
+        recorder = run_nedbus("record", "-c", endpoint, "-o", str(path), coverage=False)
         wait_for(path.exists, what="the file")
         with nedbus.connect(endpoint) as bus, bus.subscribe(VLP) as subscription:
             first = subscription.receive(DEADLINE).message.timestamp
@@ -328,7 +328,7 @@ def test_replay_follows_the_times_of_recording(tmp_path: Path, logged: list[floa
 def test_record_ends_with_ctrl_c(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
     """Ctrl-C ends a recording: exit code 0, a finished file, and a line with the counts."""
     path = tmp_path / "a.mcap"
-    recorder = run_nedbus("record", VLP, "-c", endpoint, "-o", str(path), measured=False)
+    recorder = run_nedbus("record", VLP, "-c", endpoint, "-o", str(path), coverage=False)
     wait_for(path.exists, what="the file")
     publisher = bus.publisher(VLP, vehicle="1")
     bus.publisher("external_ins_local_position", vehicle="1").publish(message(1))

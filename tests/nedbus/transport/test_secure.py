@@ -326,7 +326,7 @@ for number in range(2000):
     print(number, flush=True)
 print("the end", end="")
 """
-    process = start("-c", code, measured=False)
+    process = start("-c", code, coverage=False)
     assert process.wait() == 0
     assert process.out.split("\n") == [*map(str, range(2000)), "the end"]
 

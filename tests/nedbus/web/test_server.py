@@ -262,7 +262,7 @@ def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: 
     """With --http 0.0.0.0 the command says who can look, --origin adds a name, and Ctrl-C ends it."""
     port = free_port()
     url, listen = f"http://127.0.0.1:{port}", f"--http=0.0.0.0:{port}"
-    process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", measured=False)
+    process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", coverage=False)
     wait_for(lambda: "no password protects" in process.err, what="the warning")
     assert status_of(f"{url}/healthz", Host="evil.example") == 200
     assert status_of(url, Host="ground.example:8420") == 200

@@ -87,7 +87,7 @@ def test_hot_path_is_as_fast_as_it_was(start: Start) -> None:
     """Each form takes at most its share of the baseline, for each flight, and no valid message falls off a cliff."""
     best: dict[str, dict[str, float]] = {}
     for _ in range(6):
-        process = start("-c", PROGRAM, str(FLIGHTS), measured=False, fresh=True)
+        process = start("-c", PROGRAM, str(FLIGHTS), coverage=False, fresh=True)
         assert process.wait(100.0) == 0, process.err
         for flight, forms in json.loads(process.out).items():
             known = best.setdefault(flight, forms)

@@ -28,7 +28,7 @@ from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import open_replay
 from tests.nedbus.cli.output.test_terminal import flying as standing
 from tests.peers.command_line import Ended, fork_command, run_command
-from tests.peers.processes import Forked, Start, Zygote
+from tests.peers.processes import ForkedProcess, ForkServer, Start
 from tests.waits import DEADLINE, wait_for
 
 from .test_query import flying
@@ -52,20 +52,22 @@ def echo(endpoint: str, *options: str) -> Ended:
 class Paused(NamedTuple):
     """`nedbus echo` whose stdout is a full pipe that nobody reads, until `resume`."""
 
-    process: Forked
+    process: ForkedProcess
     is_full: Callable[[], bool]
     resume: Callable[[], None]
 
 
 @pytest.fixture
-def pause_echo(zygote: Zygote, endpoint: str, bus: nedbus.Bus) -> Callable[..., AbstractContextManager[Paused]]:
+def pause_echo(
+    fork_server: ForkServer, endpoint: str, bus: nedbus.Bus
+) -> Callable[..., AbstractContextManager[Paused]]:
     """Return what starts `nedbus echo --json` with more options, and publishes until its output blocks."""
 
     @contextmanager
     def pause(*options: str) -> Iterator[Paused]:
         output, write_end = os.pipe()
         capacity = fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
-        process = fork_command(zygote, "echo", "-c", endpoint, "--json", *options, out=write_end)
+        process = fork_command(fork_server, "echo", "-c", endpoint, "--json", *options, out=write_end)
         os.close(write_end)
 
         def is_full() -> bool:  # so that the next line blocks the process
@@ -127,18 +129,18 @@ def test_echo_full_prints_every_field(flying: str) -> None:
 
 def test_interrupt_is_130(run_nedbus: Start, flying: str) -> None:
     """Ctrl-C ends echo at once and quietly."""
-    process = run_nedbus("echo", "-c", flying, measured=False)
+    process = run_nedbus("echo", "-c", flying, coverage=False)
     wait_for(lambda: process.out, what="a line")
     process.signal(signal.SIGINT)
     assert process.wait() == 130
     assert "Traceback" not in process.err
 
 
-def test_closed_pipe_is_no_error(flying: str, zygote: Zygote) -> None:
+def test_closed_pipe_is_no_error(flying: str, fork_server: ForkServer) -> None:
     """`nedbus echo | head` ends without a message."""
     read_end, write_end = os.pipe()
     with Path("err").open("wb") as err, os.fdopen(read_end) as head:
-        process = fork_command(zygote, "echo", "-c", flying, out=write_end, err=err.fileno())
+        process = fork_command(fork_server, "echo", "-c", flying, out=write_end, err=err.fileno())
         os.close(write_end)
         assert all(head.readline().startswith(f"1/{VLP} ") for _ in range(3))
     assert process.wait(DEADLINE) == 0

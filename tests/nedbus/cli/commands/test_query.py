@@ -24,7 +24,7 @@ from tests.flights.first_message import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import fork_command, run_command
 from tests.peers.ports import free_endpoint
-from tests.peers.processes import Process, Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import DEADLINE, wait_for
 
 COMMANDS = [str(each.name) for each in app.registered_commands]
@@ -32,13 +32,13 @@ COMMANDS += [f"pki {each.name or getattr(each.callback, '__name__', None)}" for 
 
 
 @pytest.fixture(scope="module")
-def flying(zygote: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def flying(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Run a router with a service and its simulated vehicle, for all tests that only look at it."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, "-s", "sim:")
-    environment = {name: value for name, value in unmeasured().items() if not name.startswith("NEDBUS_")}
-    service = Process(command, tmp_path_factory.mktemp("flying"), environment, zygote)
+    environment = {name: value for name, value in without_coverage().items() if not name.startswith("NEDBUS_")}
+    service = Process(command, tmp_path_factory.mktemp("flying"), environment, fork_server)
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: len(bus.latest(ANY)) == 12, what="twelve streams")
     yield endpoint
@@ -114,7 +114,7 @@ def test_list_that_has_not_arrived_is_no_empty_list(
 
 def test_hz_measures(run_nedbus: Start, flying: str) -> None:
     """Rate, jitter, latency and loss of each stream, as a table, JSON or CSV; that of the estimate is near 100 Hz."""
-    table, csv_form = (run_nedbus("hz", "-c", flying, "-t", VLP, *form, measured=False) for form in ([], ["--csv"]))
+    table, csv_form = (run_nedbus("hz", "-c", flying, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
     measured: list[dict[str, Any]] = []
 
     def is_near() -> bool:
@@ -291,10 +291,10 @@ def test_version_and_help(run_nedbus: Start) -> None:
 
 
 @pytest.mark.process
-def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus, zygote: Zygote) -> None:
+def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus, fork_server: ForkServer) -> None:
     """An output that cannot be written is an error, not a traceback."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
     with Path("/dev/full").open("wb") as full, Path("err").open("wb") as err:
-        ended = fork_command(zygote, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
+        ended = fork_command(fork_server, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
     assert ended.wait(DEADLINE) == 1
     assert Path("err").read_text() == "nedbus: cannot write to stdout: no space left on device\n"

@@ -312,7 +312,7 @@ def count_lines(text: str, elapsed: float) -> Counter[str]:
 def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, raw: Session) -> None:
     """A peer that sends nonsense under ever new keys makes a reader log a few lines, and the number of the rest."""
     start = time.monotonic()
-    echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, measured=False)
+    echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, coverage=False)
     wait_for_reader(raw, f"nedbus/1/{VLP}")
     block = zenoh.CongestionControl.BLOCK
     for number in range(1000):

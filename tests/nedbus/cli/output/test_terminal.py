@@ -30,7 +30,7 @@ from tests.flights.messages import VALID, VLP, message
 from tests.peers.command_line import fork_command, run_command
 from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
-from tests.peers.processes import Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Start, without_coverage
 from tests.waits import DEADLINE, repeating, wait_for
 
 ROOT = Path(__file__).parents[4]
@@ -138,11 +138,11 @@ def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
 class Terminal:
     """A command on a terminal of its own, and what it shows."""
 
-    def __init__(self, zygote: Zygote, *arguments: str, **environment: str) -> None:
+    def __init__(self, fork_server: ForkServer, *arguments: str, **environment: str) -> None:
         self._main, terminal = pty.openpty()
         self._output = bytearray()
         environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
-        self.popen = fork_command(zygote, *arguments, out=terminal, err=terminal, **environment)
+        self.popen = fork_command(fork_server, *arguments, out=terminal, err=terminal, **environment)
         os.close(terminal)
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -175,9 +175,9 @@ OnTerminal = Callable[..., Terminal]
 
 
 @pytest.fixture
-def on_terminal(zygote: Zygote) -> OnTerminal:
+def on_terminal(fork_server: ForkServer) -> OnTerminal:
     """Return what runs a command on a terminal of 80 columns."""
-    return partial(Terminal, zygote)
+    return partial(Terminal, fork_server)
 
 
 @contextmanager
@@ -416,7 +416,7 @@ MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz"
 @pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports after that of nedbus.cli; 10,000 are all
 def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: str, imports: int) -> None:
     """Ctrl-C at any moment from the start of `main` on ends without a traceback, as 130 in a shell."""
-    environment = unmeasured() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
+    environment = without_coverage() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
     arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
     with subprocess.Popen(arguments, stdout=null, stderr=pipe, text=True, env=environment) as process:
@@ -449,7 +449,7 @@ run.run_until_stopped(stand_still, on_stop=lambda: print("stopping", flush=True)
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
 def test_second_signal_ends_at_once(start: Start, number: signal.Signals, exit_code: int) -> None:
     """A command that is stuck, and would have some time to end, has none after a second signal."""
-    stuck = start("-c", STUCK, measured=False)
+    stuck = start("-c", STUCK, coverage=False)
     for text in ("started", "stopping"):
         wait_for(lambda text=text: text in stuck.out, what=text)  # type: ignore[misc]
         stuck.signal(number)
@@ -473,7 +473,7 @@ app(["serve", "-s", "sim:", "-l", sys.argv[1]])
 
 def test_signal_during_a_slow_start_is_no_failure(start: Start) -> None:
     """Where opening a router takes longer than closing a session may, Ctrl-C ends as ever, and nothing is lost."""
-    service = start("-c", SLOW, free_endpoint(), measured=False)
+    service = start("-c", SLOW, free_endpoint(), coverage=False)
     wait_for(lambda: "opening" in service.out, what="the service to open its router")
     service.signal(signal.SIGINT)
     assert service.wait() == 130
@@ -509,7 +509,7 @@ def test_what_does_not_end_is_ended_by_force(
     start: Start, number: signal.Signals, exit_code: int, limit: str, reason: str
 ) -> None:
     """Work has longer to end than a session to be closed; each says that it was cut short."""
-    endless = start("-c", ENDLESS.replace("LIMIT", limit), measured=False)
+    endless = start("-c", ENDLESS.replace("LIMIT", limit), coverage=False)
     wait_for(lambda: "started" in endless.out, what="the start")
     endless.signal(number)
     assert endless.wait() == exit_code
@@ -538,7 +538,7 @@ def owning_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen
     main, terminal = pty.openpty()
     python = (sys.executable, "-c", ON_TERMINAL, sys.executable, "-m", "nedbus", *command)
     with log.open("wb") as err, subprocess.Popen(
-        python, stdin=terminal, stdout=terminal, stderr=err, start_new_session=True, env=unmeasured()
+        python, stdin=terminal, stdout=terminal, stderr=err, start_new_session=True, env=without_coverage()
     ) as process:  # fmt: skip
         os.close(terminal)
         yield process, main
@@ -588,7 +588,9 @@ def test_make_run(tmp_path: Path) -> None:
     command = ["make", "-C", str(ROOT), "run", f"VENV={tmp_path}/venv", f"ARGS={options}"]
     log = tmp_path / "log"
     with log.open("w") as written:
-        first = subprocess.Popen(command, stdout=written, stderr=written, env=unmeasured(), start_new_session=True)
+        first = subprocess.Popen(
+            command, stdout=written, stderr=written, env=without_coverage(), start_new_session=True
+        )
     try:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
         second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)

@@ -180,7 +180,7 @@ def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.usefixtures("stuck")
 def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """One Ctrl-C ends a script of which six publishers wait for a reader."""
-    process = start("-c", SCRIPT, NEDBUS_CONNECT=endpoint, measured=False)
+    process = start("-c", SCRIPT, NEDBUS_CONNECT=endpoint, coverage=False)
     wait_for(lambda: len(bus.latest()) == 6, what=f"the messages: {process.err}")
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
