@@ -110,7 +110,7 @@ def bus(endpoint: str) -> Iterator[nedbus.Bus]:
 
 
 @pytest.fixture
-def raw(endpoint: str) -> Iterator[Session]:
+def zenoh_session(endpoint: str) -> Iterator[Session]:
     """Connect a plain Zenoh session, as a client in another language would."""
     with nedbus.connect(endpoint) as other:
         yield other._session

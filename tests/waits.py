@@ -26,16 +26,16 @@ def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEA
         time.sleep(0.01)
 
 
-def wait_for_reader(raw: Session, key: str) -> None:
+def wait_for_matching(zenoh_session: Session, key: str) -> None:
     """Wait until a session knows of a subscriber of this key: what it publishes before goes nowhere."""
-    probe = raw.declare_publisher(key)
+    probe = zenoh_session.declare_publisher(key)
     wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
     probe.undeclare()
 
 
-def wait_for_router(raw: Session) -> None:
+def wait_for_router(zenoh_session: Session) -> None:
     """Wait until the router knows what a session has declared: it answers in the order in which it is told."""
-    alive_keys(raw, "nowhere", timeout=DEADLINE)
+    alive_keys(zenoh_session, "nowhere", timeout=DEADLINE)
 
 
 @contextmanager

@@ -310,11 +310,11 @@ def test_collecting_garbage_never_closes() -> None:
     assert closed != [threading.current_thread()]
 
 
-def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
+def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, zenoh_session: Session) -> None:
     """A Ctrl-C ends the wait for a queryable that never replies."""
     kept: list[zenoh.Query] = []
     code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
-    with answering(raw, "nedbus/**", kept.append):
+    with answering(zenoh_session, "nedbus/**", kept.append):
         process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
         wait_for(lambda: kept, what="the question")
         process.signal(signal.SIGINT)

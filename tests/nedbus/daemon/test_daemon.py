@@ -189,7 +189,7 @@ def test_ended_replay_starts_again_or_keeps_its_last_value(tmp_path: Path, serve
 
 
 def test_invalid_message_is_rejected_counted_and_reported(
-    tmp_path: Path, run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus
+    tmp_path: Path, run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus
 ) -> None:
     """An invalid message is never published: it is on the rejected key with its reason, and counted in status."""
     writer = UlogWriter()
@@ -198,7 +198,7 @@ def test_invalid_message_is_rejected_counted_and_reported(
         broken = number in {3, 4}
         writer.add(VLP, message(number), z_valid=int(broken), z=math.nan if broken else 1.0)
     path = writer.write(tmp_path / "a.ulg")
-    listener = raw.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.RingChannel(10))
+    listener = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.RingChannel(10))
     service = run_nedbus("serve", "-c", endpoint, "-s", f"ulog:{path}?wait=1")
     with bus.subscribe(VLP, mode="every") as subscription:
         taken = [subscription.receive(DEADLINE).message.timestamp for _ in range(8)]
@@ -453,20 +453,25 @@ def test_router_file_is_that_of_zenohd(tmp_path: Path, run_nedbus: Start, comman
     wait_for(lambda: f"joined {near}" in router.err, what="the link")
 
 
-def ask(raw: Session, key: str) -> list[dict[str, Any]]:
+def ask(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
     """Return what is answered, as any Zenoh client can ask."""
-    return [json.loads(reply.ok.payload.to_bytes()) for reply in raw.get(key) if reply.ok]
+    return [json.loads(reply.ok.payload.to_bytes()) for reply in zenoh_session.get(key) if reply.ok]
 
 
-def test_status_schema_and_last_values_are_on_the_network(run_nedbus: Start, raw: Session, endpoint: str) -> None:
+def test_status_schema_and_last_values_are_on_the_network(
+    run_nedbus: Start, zenoh_session: Session, endpoint: str
+) -> None:
     """Any Zenoh client can ask for the status - who, since when, where, and each source - and what the fields are.
 
     A plain get on a key or a wildcard is answered with the last payload of each key, stamped.
     """
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?topics=VehicleLocalPosition")
     status_key = "nedbus/@service/*/status"
-    wait_for(lambda: [s for each in ask(raw, status_key) for s in each["sources"] if s["published"]], what="messages")
-    [status] = ask(raw, status_key)
+    wait_for(
+        lambda: [s for each in ask(zenoh_session, status_key) for s in each["sources"] if s["published"]],
+        what="messages",
+    )
+    [status] = ask(zenoh_session, status_key)
     assert {"service", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"} == set(status)
     assert (status["role"], status["endpoints"]) == ("client", [endpoint])
     [source] = status["sources"]
@@ -483,12 +488,12 @@ def test_status_schema_and_last_values_are_on_the_network(run_nedbus: Start, raw
         *(f"estimator_local_position/{n}" for n in (0, 1)),
     )
     assert source["addresses"] == [f"1/{topic}" for topic in topics]
-    layouts = ask(raw, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
+    layouts = ask(zenoh_session, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
     [current] = [layout for layout in layouts if layout["wire"] == 1]
     assert [field["name"] for field in current["fields"]] == list(VehicleLocalPosition.model_fields)
 
-    wait_for(lambda: len(list(raw.get("nedbus/**"))) == 5, what="five answers")
-    [reply] = raw.get("nedbus/1/estimator_local_position/1")
+    wait_for(lambda: len(list(zenoh_session.get("nedbus/**"))) == 5, what="five answers")
+    [reply] = zenoh_session.get("nedbus/1/estimator_local_position/1")
     assert reply.ok is not None
     assert str(reply.ok.encoding) == "application/msgpack;px4_msgs/VehicleLocalPosition;source=sim"
     assert reply.ok.timestamp is not None

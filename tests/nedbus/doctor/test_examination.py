@@ -149,9 +149,9 @@ def test_what_is_no_router(timings: Timings) -> None:
             found(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
 
 
-def test_all_is_well(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
+def test_all_is_well(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
     """A vehicle that flies is no reason to complain: nothing is wrong, and each check says so."""
-    with flying(bus), reporting(raw, sources=[source(addresses=[f"1/{VLP}"])]):
+    with flying(bus), reporting(zenoh_session, sources=[source(addresses=[f"1/{VLP}"])]):
         findings = look(endpoint, vehicle="1", listen=1.0)
     assert is_well(findings), findings
     for check in ("settings", "endpoint", "router", "read", "write", "service", "vehicle", "clock"):
@@ -178,12 +178,12 @@ def test_two_publishers_of_one_address(bus: nedbus.Bus, endpoint: str) -> None:
         found(hear(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
 
 
-def test_payload_that_is_no_message(raw: Session, endpoint: str) -> None:
+def test_payload_that_is_no_message(zenoh_session: Session, endpoint: str) -> None:
     """It is found, with the decoder's reason; another layout is named as such."""
 
     def publish() -> None:
-        raw.put(f"nedbus/1/{VLP}", b"junk")
-        raw.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
+        zenoh_session.put(f"nedbus/1/{VLP}", b"junk")
+        zenoh_session.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
 
     with repeating(publish):
         findings = hear(endpoint, "1/.*: cannot decode", "2/.*: cannot decode")
@@ -200,42 +200,44 @@ def test_payload_that_is_no_message(raw: Session, endpoint: str) -> None:
     ],
     ids=["of a service", "of one service", "of this host"],
 )
-def test_clock_that_is_off(raw: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str) -> None:
+def test_clock_that_is_off(
+    zenoh_session: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str
+) -> None:
     """Of two clocks nobody can tell which is right; of three the one that is alone is not, this host's perhaps."""
     with ExitStack() as services:
         for name, offset in clocks.items():
-            services.enter_context(reporting(raw, name, offset=offset))
+            services.enter_context(reporting(zenoh_session, name, offset=offset))
         assert advice in found(look(endpoint), "clock", "wrong", text).advice
 
 
-def test_publisher_whose_clock_is_off(raw: Session, endpoint: str) -> None:
+def test_publisher_whose_clock_is_off(zenoh_session: Session, endpoint: str) -> None:
     """The timestamps of messages tell as well, without any service."""
     payload = encode(message(1))
 
     def publish() -> None:
         later = dt.datetime.now(dt.UTC) + dt.timedelta(seconds=HOUR)
-        raw.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
+        zenoh_session.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
 
     with repeating(publish):
         findings = hear(endpoint, "publisher of 1/")
     found(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
 
 
-def test_what_services_report(raw: Session, endpoint: str) -> None:
+def test_what_services_report(zenoh_session: Session, endpoint: str) -> None:
     """Sources that fail, wait, lost their vehicle or reject messages are found, the worst of many, and a version is."""
     sources = [
         source(state="failed", error="the disk is gone"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
         source(source="px4-zenoh:", state="waiting"),
     ]
-    with reporting(raw, version="99.1.0", sources=sources):
+    with reporting(zenoh_session, version="99.1.0", sources=sources):
         findings = look(endpoint)
     found(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
     found(findings, "source", "warning", "px4-zenoh:: waiting")
     found(findings, "source", "warning", "no more messages of 9/x")
     found(findings, "source", "warning", "7 messages rejected: xy_valid")
     found(findings, "version", "warning", r"nedbus 99\.1\.0 there, ")
-    with reporting(raw, sources=[*sources, *50 * [source(state="waiting")]]):
+    with reporting(zenoh_session, sources=[*sources, *50 * [source(state="waiting")]]):
         findings = look(endpoint)
     found(findings, "source", "warning", "more of the same kind")
     found(findings, "source", "wrong", "the disk is gone")
@@ -251,7 +253,7 @@ def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -
         yield
 
 
-def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None:
+def test_what_services_remember_of_vehicles(zenoh_session: Session, endpoint: str) -> None:
     """A bad vehicle is an error, one to be watched a warning; one that is well, or was switched off, is no finding.
 
     Of two services that remember a vehicle the one counts that hears it. The peers answer as services do.
@@ -259,7 +261,7 @@ def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None
     silent = {"severity": "bad", "text": "no position", "kinds": ["silent"]}
     with (
         remembering(
-            raw,
+            zenoh_session,
             "first",
             sick={"severity": "bad", "text": "failsafe", "since": 9990.0, "kinds": ["failsafe"]},
             doubtful={"severity": "watch", "text": "dead reckoning", "since": 9880.0, "kinds": ["dead_reckoning"]},
@@ -268,7 +270,7 @@ def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None
             gone={**silent, "since": 9999.0},
             moved={**silent, "since": 9999.0},
         ),
-        remembering(raw, "second", moved={"severity": "info", "text": "ok"}),
+        remembering(zenoh_session, "second", moved={"severity": "info", "text": "ok"}),
     ):
         findings = look(endpoint)
         of_one = look(endpoint, vehicle="doubtful")
@@ -292,12 +294,12 @@ def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None
     ],
     ids=["name", "nan", "inf", "now", "severity", "list"],
 )
-def test_account_that_makes_no_sense(raw: Session, endpoint: str, told: Mapping[str, object]) -> None:
+def test_account_that_makes_no_sense(zenoh_session: Session, endpoint: str, told: Mapping[str, object]) -> None:
     """Nothing of it is said, and no check is lost; the peer answers in place of a service."""
-    server = QueryServer(raw)
+    server = QueryServer(zenoh_session)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **told}
     server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
-    with closing(server), reporting(raw, sources=[source(state="failed", error="the disk is gone")]):
+    with closing(server), reporting(zenoh_session, sources=[source(state="failed", error="the disk is gone")]):
         findings = look(endpoint)
     found(findings, "source", "wrong", "the disk is gone")
     assert not [each for each in findings if "evil" in each.seen or "check failed" in each.seen]
@@ -314,28 +316,30 @@ def test_vehicle_of_a_real_service_that_is_not_well(run_nedbus: Start, tmp_path:
 
 
 @pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
-def test_status_that_makes_no_sense(raw: Session, endpoint: str, now: object) -> None:
+def test_status_that_makes_no_sense(zenoh_session: Session, endpoint: str, now: object) -> None:
     """A peer may answer anything: what can be understood of it is said, and no other check is lost."""
     states: list[object] = [[], {}, 7, None]
     strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
-    with reporting(raw, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]):
+    with reporting(
+        zenoh_session, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]
+    ):
         findings = look(endpoint)
     found(findings, "source", "wrong", "mavlink:x: failed: unknown reason")
     assert not [each for each in findings if "check failed" in each.seen]
 
 
-def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
+def test_keys_that_readers_do_not_look_at(zenoh_session: Session, endpoint: str) -> None:
     """Another prefix is found by its tokens or by its messages, a PX4's own keys by its tokens, unless bridged."""
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), NO_HASH)
-    token = raw.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
+    token = zenoh_session.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
     with nedbus.connect(endpoint, prefix="other/fleet") as other, flying(other):
         payload = encode(message(1))
-        with repeating(lambda: raw.put(f"third/1/{VLP}", payload)):
+        with repeating(lambda: zenoh_session.put(f"third/1/{VLP}", payload)):
             findings = hear(endpoint, "other/fleet", "third")
         found(findings, "prefix", "warning", "other/fleet: .*the prefix here is nedbus/")
         found(findings, "prefix", "warning", "third: .*the prefix here is nedbus/")
         found(findings, "ros2", "warning", f"publishes /fmu/out/{VLP}, but no service bridges it")
-        with reporting(raw, sources=[source(source="px4-zenoh:")]):
+        with reporting(zenoh_session, sources=[source(source="px4-zenoh:")]):
             assert not [each for each in look(endpoint) if each.check == "ros2"]
     token.undeclare()
 
@@ -357,9 +361,9 @@ def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
     assert set(report["findings"][0]) == {"check", "subject", "state", "seen", "advice"}
 
 
-def test_exit_codes(bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: Start) -> None:
+def test_exit_codes(bus: nedbus.Bus, endpoint: str, zenoh_session: Session, run_nedbus: Start) -> None:
     """0 when nothing is wrong, though it may warn; 2 for usage."""
-    with flying(bus), reporting(raw, sources=[source(state="waiting")]):
+    with flying(bus), reporting(zenoh_session, sources=[source(state="waiting")]):
         doctor = run_command("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)
     assert (doctor.exit_code, doctor.out.splitlines()[-1].rpartition(", ")[2]) == (0, "1 warning"), doctor.out
     assert "set by NEDBUS_CONNECT" in " ".join(doctor.out.split())
@@ -370,10 +374,12 @@ def test_exit_codes(bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: St
     assert (process.wait(), process.err.count("\n")) == (2, 1), process.err
 
 
-def test_what_peers_send_is_harmless(raw: Session, endpoint: str) -> None:
+def test_what_peers_send_is_harmless(zenoh_session: Session, endpoint: str) -> None:
     """Nothing acts on a terminal, adds a line of its own, or fills the screen."""
     evil = "\x1b[2J\nok all is well " + 1_000 * "x"
-    with reporting(raw, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil):
+    with reporting(
+        zenoh_session, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil
+    ):
         doctor = run_command("doctor", "-c", endpoint)
     assert doctor.exit_code == 1
     assert "\x1b" not in doctor.out

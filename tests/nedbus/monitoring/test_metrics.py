@@ -41,7 +41,7 @@ from tests.peers.http_pages import Pages, read_families
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
 from tests.peers.prometheus import start_promtool
-from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 # A service where the extra `metrics` is not installed.
 WITHOUT_CLIENT = "import sys; sys.modules['prometheus_client'] = None; from nedbus.cli import main; main()"
@@ -102,19 +102,19 @@ def test_pages_of_a_service(serve: Serve, pages: Pages) -> None:
 
 
 def test_pages_of_an_exporter(
-    bus: nedbus.Bus, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus, zenoh_session: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An exporter sees what is published, lost and invalid, and how long messages take."""
     timings.retransmit_timeout = 0.1  # no publisher caches what is missing
-    publisher = raw.declare_publisher(f"nedbus/7/{VLP}")
+    publisher = zenoh_session.declare_publisher(f"nedbus/7/{VLP}")
     numbers = [1, 2, 3, 6, 7]  # 4 and 5 were lost before they came to the router
     of_stream = {"vehicle": "7", "topic": VLP}
     with exporting(bus) as pages:
-        wait_for_reader(raw, f"nedbus/7/{VLP}")
+        wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
         for number in numbers:
             info, content = zenoh.SourceInfo(publisher.id, number), encode(message(10_000 * number, **VALID))
-            publisher.put(content, source_info=info, timestamp=raw.new_timestamp())
-        raw.put(f"nedbus/8/{VLP}", b"junk")
+            publisher.put(content, source_info=info, timestamp=zenoh_session.new_timestamp())
+        zenoh_session.put(f"nedbus/8/{VLP}", b"junk")
         received = "nedbus_messages_received_total"
         wait_for(lambda: pages.values(received, **of_stream) == [len(numbers)], what="all that was sent")
         assert pages.values("nedbus_messages_lost_total", **of_stream) == [2]
@@ -173,10 +173,10 @@ def test_vehicle_that_is_not_well(serve: Serve, pages: Pages, tmp_path: Path) ->
     assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
 
 
-def test_vehicles_of_an_exporter(bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+def test_vehicles_of_an_exporter(bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
     """An exporter judges what it reads by the same states, and counts events; a real publisher is the peer."""
     with nedbus.connect(endpoint) as reader, exporting(reader) as pages, ExitStack() as closing:
-        wait_for_reader(raw, f"nedbus/7/{VLP}")
+        wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
         position, state = bus.publisher(VLP, vehicle="7"), bus.publisher("vehicle_status", vehicle="7")
         numbers, failsafe = itertools.count(1), threading.Event()
 

@@ -36,7 +36,7 @@ from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 ADDRESS = Address("7", VLP)
 
@@ -76,7 +76,7 @@ def test_independent_readers_get_named_fields(tmp_path: Path) -> None:
 
 
 def test_recording_is_replayed_to_the_bit(
-    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session, tmp_path: Path
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
     """Recorded from the bus and replayed from the file: the same messages, and the same fields not provided."""
     messages = list(open_replay("sim:?duration=1&topics=VehicleLocalPosition").messages)
@@ -90,7 +90,7 @@ def test_recording_is_replayed_to_the_bit(
     thread = threading.Thread(target=recorder.run, args=(stop,))
     thread.start()
     for publisher in publishers.values():
-        wait_for_reader(raw, publisher.key)
+        wait_for_matching(zenoh_session, publisher.key)
     sent: dict[str, list[bytes]] = {}
     for each in messages:
         published = upgrade({name: value for name, value in each.fields.items() if name != "tilt_var"})

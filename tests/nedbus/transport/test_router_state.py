@@ -160,9 +160,9 @@ def test_limits_that_make_no_sense(room: object) -> None:
         assert read_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
 
 
-def test_large_and_many_answers(endpoint: str, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_and_many_answers(endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     """A peer that claims to be many routers, or one with a book of sessions, fills no reader's memory."""
-    (real,) = ask_routers(raw, timeout=5.0)
+    (real,) = ask_routers(zenoh_session, timeout=5.0)
 
     def answer(query: zenoh.Query) -> None:
         for number in range(20):
@@ -171,10 +171,10 @@ def test_large_and_many_answers(endpoint: str, raw: Session, monkeypatch: pytest
 
     with open_client([endpoint], timeout=DEADLINE) as impostor:
         impostor.declare_queryable("@/*/router", answer)
-        wait_for(lambda: len(ask_routers(raw, timeout=5.0)) == 21, what="the answers of the impostor")
-        assert real.zid in {state.zid for state in ask_routers(raw, timeout=5.0)}
+        wait_for(lambda: len(ask_routers(zenoh_session, timeout=5.0)) == 21, what="the answers of the impostor")
+        assert real.zid in {state.zid for state in ask_routers(zenoh_session, timeout=5.0)}
         monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
-        assert len(ask_routers(raw, timeout=5.0)) == 5
+        assert len(ask_routers(zenoh_session, timeout=5.0)) == 5
 
 
 def test_doctor_warns_from_four_fifths_on(small: str) -> None:

@@ -35,7 +35,7 @@ from tests.peers.http_pages import Pages
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
 from tests.peers.zenohd import EITHER, start_zenohd
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 __all__ = ["clock", "pki"]
 
@@ -120,7 +120,7 @@ def test_message_without_a_file_is_read(join: Join) -> None:
     sent = definition.model.model_validate({"timestamp": 1, "wheel_speed": (0.5, 2.0)})
     with reader.subscribe("*", mode="every") as subscription:
         for key in (encoders.key, attitude.key):
-            wait_for_reader(vehicle._session, key)
+            wait_for_matching(vehicle._session, key)
         attitude.publish({"timestamp": 1, "q": (1.0, 0.0, 0.0, 0.0)})
         assert subscription.receive(DEADLINE).topic == "vehicle_attitude"
 
@@ -429,12 +429,18 @@ def look(permission: WritePermission) -> Mapping[str, bool]:
     ids=lambda value: " ".join(map(str, value)),
 )
 def test_refusal_is_believed_when_it_is_repeated(
-    endpoint: str, raw: Session, pki: Path, monkeypatch: pytest.MonkeyPatch, *, history: list[str], outcome: Outcome
+    endpoint: str,
+    zenoh_session: Session,
+    pki: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    history: list[str],
+    outcome: Outcome,
 ) -> None:
     """Three denials in a row, asked for by the second, are a refusal until the router takes something."""
     verdicts = iter(history)
     monkeypatch.setattr(f"{PERMISSION}probe_writes", lambda *_, **__: {"1": next(verdicts)})
-    permission = permission_of(raw, endpoint, pki, "1")
+    permission = permission_of(zenoh_session, endpoint, pki, "1")
     refused, pause = outcome
     assert [permission.check() for _ in history][-1] == pause
     assert permission.refused == ({} if refused is None else {"1": refused})

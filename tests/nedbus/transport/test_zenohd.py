@@ -88,7 +88,9 @@ def last_messages(session: Session) -> list[int]:
     return [decode(reply.ok.payload.to_bytes()).timestamp for reply in replies if reply.ok]
 
 
-def test_storage_keeps_what_a_vehicle_sent_last(start: Start, tmp_path: Path, zenohd: str, raw: Session) -> None:
+def test_storage_keeps_what_a_vehicle_sent_last(
+    start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
+) -> None:
     """config/storage.json5 answers for a vehicle that is gone, and stamps nothing anew that others receive."""
     start_storage(start, tmp_path, zenohd)
     with nedbus.connect(zenohd) as reader, open_client([zenohd], timeout=DEADLINE) as vehicle:
@@ -104,26 +106,28 @@ def test_storage_keeps_what_a_vehicle_sent_last(start: Start, tmp_path: Path, ze
             vehicle.put(f"nedbus/1/{VLP}", encode(message(number)), timestamp=stamps[-1])
             with suppress(nedbus.NoDataError):
                 received.append(subscription.receive(0.1))
-            return bool(received and last_messages(raw))
+            return bool(received and last_messages(zenoh_session))
 
         wait_for(are_both_there, what="the storage and the reader")
         vehicle.close()
         last = next(timestamps) - 1
-        wait_for(lambda: last_messages(raw) == [last], what="the last message")
+        wait_for(lambda: last_messages(zenoh_session) == [last], what="the last message")
         while received[-1].message.timestamp != last:
             received.append(subscription.receive(DEADLINE))
         assert {sample.stamp for sample in received} <= set(stamps)
         assert reader.vehicles() == {}
 
 
-def test_vehicle_that_restarted_wins_over_the_storage(start: Start, tmp_path: Path, zenohd: str, raw: Session) -> None:
+def test_vehicle_that_restarted_wins_over_the_storage(
+    start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
+) -> None:
     """A real storage keeps a message of the last run, whose clock was ahead: live answers win, and `get` tells."""
     start_storage(start, tmp_path, zenohd)
-    ahead = zenoh.Timestamp(raw.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
+    ahead = zenoh.Timestamp(zenoh_session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
 
     def is_stored() -> bool:
-        raw.put(f"nedbus/1/{VLP}", encode(message(99)), timestamp=ahead)
-        return last_messages(raw) == [99]
+        zenoh_session.put(f"nedbus/1/{VLP}", encode(message(99)), timestamp=ahead)
+        return last_messages(zenoh_session) == [99]
 
     wait_for(is_stored, what="the message in the storage")
     with nedbus.connect(zenohd) as reader:

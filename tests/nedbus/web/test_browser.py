@@ -21,7 +21,7 @@ from tests.nedbus.web.page import flying, serving_live, write_flight
 from tests.peers.browser import PATIENCE, VEHICLE, Tab, browser, open_tabs
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
-from tests.waits import repeating, wait_for, wait_for_reader
+from tests.waits import repeating, wait_for, wait_for_matching
 
 __all__ = ["browser"]  # a fixture
 
@@ -225,7 +225,7 @@ def on_each_other(page: Tab) -> list[str]:
     ] or ([] if len(labels) > 2 else ["too few labels"])
 
 
-def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str, tmp_path: Path) -> None:
+def test_hostile_words_are_text(fly: Fly, tab: Open, zenoh_session: Session, endpoint: str, tmp_path: Path) -> None:
     """Text of a peer in a reason, or in a GeoJSON file, is shown as text and makes no element."""
     field = tmp_path / f"{HOSTILE[:24].replace('/', '')}.geojson"
     line = {"type": "LineString", "coordinates": [[8.545, 47.397], [8.546, 47.398]]}
@@ -235,8 +235,8 @@ def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str
         page = tab()
         page.open(url)
         key = Address("wing", VLP).rejected_key()
-        wait_for_reader(raw, key)
-        raw.put(key, json.dumps({"reason": HOSTILE, HOSTILE: HOSTILE}))
+        wait_for_matching(zenoh_session, key)
+        zenoh_session.put(key, json.dumps({"reason": HOSTILE, HOSTILE: HOSTILE}))
         page.wait_for_text("1 rejected")
         page.page.locator("[data-do=streams]").click()
         until(lambda: HOSTILE in page.part("more"), "the reason")
@@ -245,7 +245,7 @@ def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str
         page.page.get_by_placeholder("search").fill(HOSTILE)
         until(lambda: page.states == {}, "the list to be empty")
         page.page.get_by_placeholder("search").fill("")
-        raw.put(key, json.dumps({"reason": [HOSTILE]}))
+        zenoh_session.put(key, json.dumps({"reason": [HOSTILE]}))
         page.wait_for_text("2 rejected")
         assert page.page.evaluate("window.hacked") is None
         assert page.page.locator("img").count() == 0
@@ -255,7 +255,7 @@ def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str
 # Viewers
 
 
-def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, raw: Session) -> None:
+def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, zenoh_session: Session) -> None:
     """Two pages follow the same fleet; a click in the list, a tap on a marker, or a key chooses a vehicle there alone.
 
     What happened before can be looked at, in one page as well. Whatever a browser does to its document, the other page
@@ -303,7 +303,7 @@ def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, raw: Sessi
     until(lambda: first.asked == {"vehicle": "b"}, "the present")
     until(lambda: second.asked == {"vehicle": "a"}, "the other page to be as it was")
     heard: set[str] = set()
-    watcher = raw.declare_subscriber("**", lambda sample: heard.add(str(sample.key_expr)))
+    watcher = zenoh_session.declare_subscriber("**", lambda sample: heard.add(str(sample.key_expr)))
     assert second.page.evaluate(
         """() => {
           for (const model of Bokeh.documents[0].all_models) {

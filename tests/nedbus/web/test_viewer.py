@@ -824,7 +824,7 @@ def open_page(endpoint: str) -> Iterator[tuple[Shown, Callable[[Callable[[], obj
         reading.result()
 
 
-def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """Published vehicles are in the list and on the map; those no longer valid, or switched off, stay there."""
     fields = {**VALID, "x": 5.0}
     wing, quad = (bus.publisher(VLP, vehicle=name) for name in ("wing", "quad"))
@@ -839,7 +839,7 @@ def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session)
             quad.close()
             until(lambda: page.states == {"quad": "gone", "wing": "xy not valid"}, "the end of the other")
         assert page.marks["quad"]["shape"] == "square"
-        raw.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
+        zenoh_session.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
         page.say("streams")
         until(lambda: "<td>a rule</td>" in page.part("more"), "the report")
         until(lambda: any("rejected: a rule" in event.text for event in page.viewer._chronicle.events), "its event")

@@ -147,13 +147,13 @@ def test_closed_pipe_is_no_error(flying: str, fork_server: ForkServer) -> None:
     assert Path("err").read_text() == ""
 
 
-def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """Losses and invalid payloads are counted on stderr at the end."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     process = run_nedbus("echo", "-c", endpoint, "-n", "2")
     wait_for(lambda: process.out, what="the first line")
-    raw.put(publisher.key, b"garbage")
+    zenoh_session.put(publisher.key, b"garbage")
     wait_for(lambda: "not a VehicleLocalPosition" in process.err, what="the warning")
     publisher.publish(message(2))
     assert process.wait() == 0

@@ -26,7 +26,7 @@ from tests.flights.ulogs import LOGS, UlogWriter, account_of
 from tests.peers.command_line import Ended, run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
-from tests.waits import repeating, wait_for, wait_for_reader
+from tests.waits import repeating, wait_for, wait_for_matching
 
 REAL = LOGS.parent / "px4" / "twelve_messages.ulg"
 TOLD = [
@@ -374,7 +374,7 @@ def test_texts_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endp
         assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in shown
 
 
-def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+def test_events_live(run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
     """Events of a script's vehicle are told as they happen, and conditions from before are said."""
     fields: dict[str, object] = VALID | {"z_valid": False}
     with bus.publisher(VLP, vehicle="7") as publisher:
@@ -384,7 +384,7 @@ def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint:
 
         publish()
         follower = run_nedbus("events", "-c", endpoint)
-        wait_for_reader(raw, "nedbus/7/vehicle_local_position")
+        wait_for_matching(zenoh_session, "nedbus/7/vehicle_local_position")
         with repeating(publish):
             wait_for(lambda: "7: z not valid, from the start\n" in follower.err, what="what held before")
             assert follower.out == ""
@@ -399,7 +399,7 @@ def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint:
     assert lines[0][1].startswith("BAD    xy not valid")
 
 
-def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
     """--vehicle leaves out the others, --severity what is not as bad."""
     fields: dict[str, object] = dict(VALID)
     with bus.publisher(VLP, vehicle="7") as seven, bus.publisher(VLP, vehicle="8") as eight:
@@ -409,7 +409,7 @@ def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Ses
                 publisher.publish(message(time.monotonic_ns() // 1000, **fields))
 
         follower = run_nedbus("events", "-c", endpoint, "--vehicle", "8", "--severity", "bad")
-        wait_for_reader(raw, "nedbus/8/vehicle_local_position")
+        wait_for_matching(zenoh_session, "nedbus/8/vehicle_local_position")
         with repeating(publish):
             heard = bus.subscribe(VLP, vehicle="8")
             heard.receive(30)

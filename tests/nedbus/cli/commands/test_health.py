@@ -209,10 +209,10 @@ def test_old_replay_is_no_silence_of_now(endpoint: str, bus: nedbus.Bus) -> None
         assert shown.out == ""
 
 
-def test_service_that_keeps_no_account_is_a_fault(endpoint: str, raw: Session, health: Judge) -> None:
+def test_service_that_keeps_no_account_is_a_fault(endpoint: str, zenoh_session: Session, health: Judge) -> None:
     """An older service answers its status whatever is asked: what is expected of its vehicles is not known to hold."""
     key, status = "nedbus/@service/old/status", {"service": "old", "host": socket.gethostname(), "sources": []}
-    with answering(raw, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")):
+    with answering(zenoh_session, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")):
         for option in ("--valid", "xy"), ("--within", "60"):
             shown = health("--services", "1", *option)
             assert shown.exit_code == 1

@@ -29,7 +29,7 @@ from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.command_line import run_command
 from tests.peers.custom_timings import start_with_timings
 from tests.peers.processes import Start
-from tests.waits import wait_for, wait_for_reader
+from tests.waits import wait_for, wait_for_matching
 
 REPLAY = "sim:?duration=1&speed=max"
 ROOT = Path(__file__).parents[4]
@@ -309,15 +309,15 @@ def count_lines(text: str, elapsed: float) -> Counter[str]:
     return happened
 
 
-def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, zenoh_session: Session) -> None:
     """A peer that sends nonsense under ever new keys makes a reader log a few lines, and the number of the rest."""
     start = time.monotonic()
     echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, coverage=False)
-    wait_for_reader(raw, f"nedbus/1/{VLP}")
+    wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")
     block = zenoh.CongestionControl.BLOCK
     for number in range(1000):
-        raw.put(f"nedbus/flood-{number}/{VLP}", b"garbage", congestion_control=block)
-    raw.put(f"nedbus/1/{VLP}", encode(message(1)), congestion_control=block)
+        zenoh_session.put(f"nedbus/flood-{number}/{VLP}", b"garbage", congestion_control=block)
+    zenoh_session.put(f"nedbus/1/{VLP}", encode(message(1)), congestion_control=block)
     wait_for(lambda: echo.out, what="the last message")
     echo.signal(signal.SIGINT)
     assert echo.wait() == 130
@@ -325,13 +325,13 @@ def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, 
     assert happened["invalid"] == 100  # keys; further ones are only counted
 
 
-def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
+def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus) -> None:
     """Vehicles that appear, reboot and fall silent by the hundred make a service log a few lines of each event."""
     began = time.monotonic()
     soon = Timings(stale=0.5)
     service = start_with_timings(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
     wait_for(lambda: '"listening"' in service.err, what="the source")
-    fleet = [Px4(raw, namespace=f"wing{number}") for number in range(VEHICLES)]
+    fleet = [Px4(zenoh_session, namespace=f"wing{number}") for number in range(VEHICLES)]
 
     def status(name: str) -> object:
         (answer,) = bus.services()

@@ -210,11 +210,11 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
 
 
 @pytest.mark.process
-def test_info_names_what_is_gone(on_terminal: OnTerminal, endpoint: str, raw: Session) -> None:
+def test_info_names_what_is_gone(on_terminal: OnTerminal, endpoint: str, zenoh_session: Session) -> None:
     """The number stands in the table, the addresses below it; on a terminal no address is broken."""
     gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
     sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
-    service = answer(raw, "nedbus/@service/s/status", {"service": "s", "sources": sources})
+    service = answer(zenoh_session, "nedbus/@service/s/status", {"service": "s", "sources": sources})
     info = run_command("info", "-c", endpoint)
     assert info.exit_code == 0, info.err
     assert "  5 gone\n" in info.out
@@ -326,18 +326,18 @@ def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, t
     assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5
 
 
-def answer(raw: Session, key: str, status: object) -> object:
+def answer(zenoh_session: Session, key: str, status: object) -> object:
     """Answer queries for a status as a hostile service would."""
-    return raw.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
+    return zenoh_session.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
 
 
-def test_hostile_status_is_shown_harmless(endpoint: str, raw: Session) -> None:
+def test_hostile_status_is_shown_harmless(endpoint: str, zenoh_session: Session) -> None:
     """Escape sequences, forged lines and endless texts of a service are shown as short text, or left out."""
     flood = [{"source": EVIL * 1000, "state": "retrying", "error": EVIL * 1000, "published": [EVIL] * 1000}]
     stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
     source = {**flood[0], "stale": [EVIL], "streams": [stream, None, {"address": 1}], "addresses": EVIL}
     status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
-    hostile = answer(raw, "nedbus/@service/hostile/status", status)
+    hostile = answer(zenoh_session, "nedbus/@service/hostile/status", status)
     for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
         shown = run_command(*arguments, "-c", endpoint)
         assert shown.exit_code == (arguments[0] == "health"), shown.err
@@ -347,15 +347,16 @@ def test_hostile_status_is_shown_harmless(endpoint: str, raw: Session) -> None:
     del hostile
 
 
-def test_hostile_keys_are_shown_harmless(endpoint: str, raw: Session) -> None:
+def test_hostile_keys_are_shown_harmless(endpoint: str, zenoh_session: Session) -> None:
     """Keys and tokens with escape sequences reach neither the output nor the log."""
     tokens = [
-        raw.liveliness().declare_token(f"nedbus/{name}/@alive/1a/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)
+        zenoh_session.liveliness().declare_token(f"nedbus/{name}/@alive/1a/{VLP}")
+        for name in ("\x1b[2J", "a\nb", "x" * 5000)
     ]
 
     def put() -> None:
-        raw.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
-        raw.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
+        zenoh_session.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
+        zenoh_session.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
 
     with repeating(put):
         for arguments, exit_code in ((["list"], 0), (["echo", "*", "-d", "0.5"], 1), (["hz", "-d", "0.5"], 1)):

@@ -35,7 +35,7 @@ from tests.peers.command_line import run_command
 from tests.peers.listening import Listener, status_of_source
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
-from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 __all__ = ["peer"]  # a fixture
 
@@ -123,11 +123,11 @@ def times(messages: Iterable[SourceMessage]) -> list[object]:
 
 
 def test_message_of_a_px4_reaches_readers(
-    serve: Callable[[], Process], raw: Session, every: nedbus.Subscription
+    serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription
 ) -> None:
     """A service publishes it under the vehicle's name, with the fields that its release does not have as missing."""
     serve()
-    px4 = Px4(raw, layout="1.14")
+    px4 = Px4(zenoh_session, layout="1.14")
     sent = message(1, x=0.1, xy_valid=True, y=-1.0, hagl_max_z=5.0)
     px4.put(sent)
     sample, expected = every.receive(DEADLINE), upgrade(downgrade(sent, "1.14"))
@@ -136,10 +136,10 @@ def test_message_of_a_px4_reaches_readers(
     assert sample.missing == frozenset(LAYOUTS["1.16"].fields) - expected.model_fields_set
 
 
-def test_every_layout_is_read_by_its_hash(listener: Listener, raw: Session) -> None:
+def test_every_layout_is_read_by_its_hash(listener: Listener, zenoh_session: Session) -> None:
     """Messages of any release are received with exactly the fields that this release has."""
     for domain, layout in enumerate(LAYOUTS):
-        px4 = Px4(raw, layout=layout, domain=domain)
+        px4 = Px4(zenoh_session, layout=layout, domain=domain)
         sent = [message(each, x=0.1 * each, xy_valid=True, y=-1.0, hagl_max_z=5.0) for each in range(1, 11)]
         for each in sent:
             px4.put(each)
@@ -149,9 +149,9 @@ def test_every_layout_is_read_by_its_hash(listener: Listener, raw: Session) -> N
         assert received == [(upgrade(downgrade(each, layout)), 0) for each in sent]
 
 
-def test_topics_and_instances(listener: Listener, raw: Session) -> None:
+def test_topics_and_instances(listener: Listener, zenoh_session: Session) -> None:
     """All four topics, instances as users name them, and the names of versioned topics."""
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     names = {
         "vehicle_local_position_v1": "1/vehicle_local_position",
         "vehicle_local_position_groundtruth": "1/vehicle_local_position_groundtruth",
@@ -174,14 +174,14 @@ def test_topics_and_instances(listener: Listener, raw: Session) -> None:
         ("?domain=5", ["1", "px4_1"]),
     ],
 )
-def test_vehicles_are_distinguished(listen: Listen, raw: Session, options: str, expected: list[str]) -> None:
+def test_vehicles_are_distinguished(listen: Listen, zenoh_session: Session, options: str, expected: list[str]) -> None:
     """In SITL all have one gid: domain and namespace distinguish and options name them; one domain ignores others."""
     listener = listen(options)
     places = ((0, ""), (5, ""), (5, "px4_1"), (0, "px4_2"), (3, "swarm/px4_3"))
     heard = [place for place in places if options != "?domain=5" or place[0] == 5]
-    fleet = [Px4(raw, domain=domain, namespace=namespace) for domain, namespace in heard]
+    fleet = [Px4(zenoh_session, domain=domain, namespace=namespace) for domain, namespace in heard]
     for domain, namespace in set(places) - set(heard):
-        raw.put(Px4(raw, domain=domain, namespace=namespace).key(), payload_of(2))
+        zenoh_session.put(Px4(zenoh_session, domain=domain, namespace=namespace).key(), payload_of(2))
     for timestamp in range(1, 21):
         for px4 in fleet:
             px4.put(timestamp)
@@ -191,10 +191,12 @@ def test_vehicles_are_distinguished(listen: Listen, raw: Session, options: str, 
     assert not listener.rejections
 
 
-def test_loss_and_reboot_are_counted(listener: Listener, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
+def test_loss_and_reboot_are_counted(
+    listener: Listener, zenoh_session: Session, caplog: pytest.LogCaptureFixture
+) -> None:
     """Losses before the service are counted by PX4's sequence; a sequence that goes back is a reboot."""
     caplog.set_level("WARNING")
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.put(1)
     px4.put(2, skip=3)
     px4.reboot()
@@ -207,9 +209,9 @@ def test_loss_and_reboot_are_counted(listener: Listener, raw: Session, caplog: p
     assert caplog.text.count("the vehicle rebooted") == 1
 
 
-def test_type_hash_not_supported(listen: Listen, raw: Session) -> None:
+def test_type_hash_not_supported(listen: Listen, zenoh_session: Session) -> None:
     """A build without hashes is rejected with a hint, and received once the layout is configured."""
-    px4 = Px4(raw, layout="1.14")
+    px4 = Px4(zenoh_session, layout="1.14")
     px4.type_hash = NO_HASH
     first, second = listen(), listen("?layout=1.14")
     px4.put(1)
@@ -222,7 +224,7 @@ WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuin
 
 
 def test_message_without_a_file_is_read_by_its_definition(
-    run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus, tmp_path: Path
+    run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
     """With msg= it is carried, range-checked as it is annotated, and readable without that file; else it is listed."""
     (tmp_path / "WheelEncoders.msg").write_text(WHEELS)
@@ -230,9 +232,9 @@ def test_message_without_a_file_is_read_by_its_definition(
     name = ros2_type(definition)
     key = f"0/fmu/out/wheel_encoders/{dds_type(name)}/{hash_of(definition.current, name)}"
     service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
-    wait_for_reader(raw, key)
-    token = raw.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
-    raw.put(key, b"")
+    wait_for_matching(zenoh_session, key)
+    token = zenoh_session.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
+    zenoh_session.put(key, b"")
     wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the list")
     assert status_of_source(bus).rejected == 0
     assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
@@ -240,11 +242,11 @@ def test_message_without_a_file_is_read_by_its_definition(
     wait_for(lambda: status_of_source(bus).not_carried == (), what="the list to be empty")
     service.kill()
     run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:?msg={tmp_path}")
-    wait_for_reader(raw, key)
+    wait_for_matching(zenoh_session, key)
 
     def put(speed: float) -> None:
         fields = {"timestamp": 1, "wheel_speed": (speed, 2.0)}
-        raw.put(key, encode_with(definition, fields, definition.current) + bytes(8))
+        zenoh_session.put(key, encode_with(definition, fields, definition.current) + bytes(8))
 
     with bus.subscribe("wheel_encoders") as wheels, repeating(lambda: put(1.5)):
         assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
@@ -253,14 +255,14 @@ def test_message_without_a_file_is_read_by_its_definition(
 
 
 def test_newer_layout_is_read_by_its_definition(
-    listen: Listen, raw: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    listen: Listen, zenoh_session: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A 54th field is named once; without msg= the rejection says what to do, and another definition is named too."""
     caplog.set_level("WARNING")
     text = message_definition("1.16") + "bool altitude_good_for_lock\n"
     (tmp_path / "VehicleLocalPosition.msg").write_text(text)
     newer = define_msg("VehicleLocalPosition", text)
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.type_hash = hash_of(newer.current, ROS2_TYPE)
     without, given, other = listen(), listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"), listen(f"?msg={tmp_path}")
     fields = {**downgrade(message(1, x=0.5), "1.16"), "altitude_good_for_lock": True}
@@ -278,13 +280,13 @@ def test_newer_layout_is_read_by_its_definition(
     assert px4.type_hash in other.rejections[0].reason
 
 
-def test_topics_that_are_chosen(listen: Listen, raw: Session) -> None:
+def test_topics_that_are_chosen(listen: Listen, zenoh_session: Session) -> None:
     """Others are ignored without a word; a topic that is named and whose message is unknown is rejected with a hint."""
     listener = listen("?topics=vehicle_local_position,wheel_encoders")
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.put(1, topic="estimator_local_position")
-    raw.put(f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b"")
-    raw.put(f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b"")
+    zenoh_session.put(f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b"")
+    zenoh_session.put(f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b"")
     px4.put(2)
     assert [str(each.address) for each in listener.receive()] == [f"1/{VLP}"]
     assert [each.count for each in listener.rejections] == [1]
@@ -292,9 +294,9 @@ def test_topics_that_are_chosen(listen: Listen, raw: Session) -> None:
     assert listener.absence.not_carried == ()
 
 
-def test_message_of_another_type_is_rejected(listener: Listener, raw: Session) -> None:
+def test_message_of_another_type_is_rejected(listener: Listener, zenoh_session: Session) -> None:
     """A position on the topic of attitudes is not taken for an attitude."""
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.put(1, topic="vehicle_attitude")
     listener.turn_until(lambda: listener.rejections, what="the rejection")
     assert "vehicle_attitude has messages of type VehicleAttitude" in listener.rejections[0].reason
@@ -332,27 +334,27 @@ def test_definition_in_any_encoding_is_read(tmp_path: Path, encoding: str) -> No
     parse_source(f"px4-zenoh:?msg={tmp_path}/EscStatus.msg").open_source(vehicle="1")
 
 
-def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:
+def test_hostile_input_is_counted(listener: Listener, zenoh_session: Session) -> None:
     """Wrong hashes, lengths, attachments and random payloads: counted, and each key named, which the log does once."""
-    good = Px4(raw)
+    good = Px4(zenoh_session)
     good.put(1)
-    unknown = Px4(raw, domain=1)
+    unknown = Px4(zenoh_session, domain=1)
     unknown.type_hash = "RIHS01_" + 64 * "0"
     for timestamp in range(10):
         unknown.put(timestamp)
-    short = Px4(raw, domain=2)
+    short = Px4(zenoh_session, domain=2)
     for payload in (b"\x00\x01\x00\x00" + bytes(100), b"", bytes(100_000)):
         short.raw(payload)
-    wrong = Px4(raw, domain=3)
+    wrong = Px4(zenoh_session, domain=3)
     for attachment in (b"x", bytes(33), bytes(34), bytes(Attachment(2**62, 0, GID))[:-1], 16 * b"\xff" + b"\x10" + GID):
         wrong.put(1, attachment=attachment)
-    noise, rng = Px4(raw, domain=4), random.Random(0)
+    noise, rng = Px4(zenoh_session, domain=4), random.Random(0)
     for each in range(2000):
         noise.raw(rng.randbytes(220) if each % 2 else b"\x00\x01\x00\x00" + rng.randbytes(rng.randrange(240)))
-    other = Px4(raw, domain=5)
+    other = Px4(zenoh_session, domain=5)
     other.raw(payload_of(1), topic="somebody/pose")
     for start in (f"0/{'x' * 200}", "ä"):
-        raw.put(f"{start}/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
+        zenoh_session.put(f"{start}/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
     listener.turn_until(lambda: listener.rejected >= 18 + 2000 + 3, what="all rejections")
     good.put(2)
     assert times(listener.receive(2)) == [1, 2]
@@ -362,12 +364,12 @@ def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:
 
 
 def test_invalid_messages_are_reported(
-    serve: Callable[[], Process], raw: Session, every: nedbus.Subscription[Any]
+    serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription[Any]
 ) -> None:
     """A payload that is CDR but violates the rules is reported with its reason, as from any source."""
     serve()
-    reports = raw.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
-    px4 = Px4(raw)
+    reports = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
+    px4 = Px4(zenoh_session)
     px4.raw(payload_of(1, xy_valid=True))
     px4.raw(payload_of(1, eph=-1.0) + b"too long")
     assert "must be finite while xy_valid is true" in reports.handler.recv().payload.to_string()
@@ -376,9 +378,9 @@ def test_invalid_messages_are_reported(
     assert every.receive(DEADLINE).message.timestamp == 2
 
 
-def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, raw: Session) -> None:
+def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, zenoh_session: Session) -> None:
     """Two ROS 2 nodes on one topic have different gids: the first one is received; the first number is 0."""
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     for sequence in range(10):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
         px4.put(100 + sequence, attachment=bytes(Attachment(sequence, 0, GID[::-1])))
@@ -386,31 +388,33 @@ def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, raw: Sessio
     assert times(listener.receive(10)) == list(range(10))
 
 
-def test_hostile_keys_leave_the_status_readable(serve: Callable[[], Process], raw: Session, bus: nedbus.Bus) -> None:
+def test_hostile_keys_leave_the_status_readable(
+    serve: Callable[[], Process], zenoh_session: Session, bus: nedbus.Bus
+) -> None:
     """Long keys and long reasons do not make the status too long to be received."""
     serve()
-    Px4(raw).put(1)
+    Px4(zenoh_session).put(1)
     for number in range(100):
-        raw.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-        raw.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
+        zenoh_session.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
+        zenoh_session.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
     wait_for(lambda: status_of_source(bus).rejected == 200, what="the status")
 
 
-def test_what_waits_to_be_decoded_is_small(listener: Listener, raw: Session) -> None:
+def test_what_waits_to_be_decoded_is_small(listener: Listener, zenoh_session: Session) -> None:
     """Messages that are too long for ROS 2, and large payloads, do not wait; they are counted."""
     name = dds_type(ROS2_TYPE)
-    wait_for_reader(raw, f"0/a/{name}/hash")
+    wait_for_matching(zenoh_session, f"0/a/{name}/hash")
     for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):
-        raw.put(f"0/{topic}/{name}/hash", payload)
+        zenoh_session.put(f"0/{topic}/{name}/hash", payload)
     listener.turn_until(lambda: listener.rejected == 4, what="all rejections")
     listener.turn()
     counts = Counter(each.where for each in listener.rejections for _ in range(each.count))
     assert counts == {"size": 2, f"0/a/{name}/hash": 1, f"0/last/{name}/hash": 1}
 
 
-def test_source_that_has_ended_receives_nothing(raw: Session, endpoint: str) -> None:
+def test_source_that_has_ended_receives_nothing(zenoh_session: Session, endpoint: str) -> None:
     """A service lends it the session of its router: at its end it leaves no subscriber there."""
-    probe = raw.declare_publisher(Px4(raw).key())
+    probe = zenoh_session.declare_publisher(Px4(zenoh_session).key())
     with plain_session(endpoint) as lent:
         with Listener("px4-zenoh:", router=lent):
             wait_for(lambda: is_read(probe), what="the subscriber")
@@ -458,11 +462,11 @@ def test_router_that_is_down_is_retried(run_nedbus: Start) -> None:
 
 @pytest.mark.slow  # PX4's 3 s; nedbus/daemon/test_worker.py has them without waiting
 def test_stale_vehicle_is_not_listed(
-    serve: Callable[[], Process], raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
+    serve: Callable[[], Process], zenoh_session: Session, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
     """A vehicle that sends nothing for 3 s is stale in the status and not listed; others are not affected."""
     service = serve()
-    px4, other = Px4(raw), Px4(raw, domain=1)
+    px4, other = Px4(zenoh_session), Px4(zenoh_session, domain=1)
     px4.put(1)
     every.receive(DEADLINE)
 
@@ -492,11 +496,11 @@ def test_ros_2_publisher_that_restarts_is_received_at_once(listener: Listener, p
     assert (sum(each.lost for each in received), listener.rejections) == (0, [])
 
 
-def test_ros_2_lists_the_source_as_a_subscriber(listener: Listener, peer: Peer, raw: Session) -> None:
+def test_ros_2_lists_the_source_as_a_subscriber(listener: Listener, peer: Peer, zenoh_session: Session) -> None:
     """`ros2 topic info -v` shows it for as long as somebody publishes, as zenoh-ros2-sdk reads the tokens."""
 
     def subscriptions() -> list[dict[str, object]]:
-        tokens = raw.liveliness().get("@ros2_lv/4/*/*/*/MS/**")
+        tokens = zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/MS/**")
         return [_parse_liveliness_keyexpr(str(reply.ok.key_expr)) or {} for reply in tokens if reply.ok]
 
     node = peer("talk", "1.14", topic=f"/drone/{VLP}", rows=[], domain_id=4)
@@ -505,7 +509,7 @@ def test_ros_2_lists_the_source_as_a_subscriber(listener: Listener, peer: Peer, 
     assert str(found["node_name"]).startswith("nedbus_px4_zenoh_")
     topic = (found["qualified_name"], found["dds_type"], found["type_hash"])
     assert topic == (f"/drone/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
-    nodes = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
+    nodes = [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
     assert any(name.endswith(f"/{found['node_name']}") for name in nodes)
     node.kill()
     listener.turn_until(lambda: not subscriptions(), what="the subscription to be withdrawn")
