@@ -19,7 +19,7 @@ from tests.peers.ports import free_endpoint
 from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import changing_timings
 
-from .blocking import blocking
+from .sync_adapter import sync_adapter
 
 # Examples of each property: 25, or 100 with `--hypothesis-profile=all`. A machine that is busy fails none.
 hypothesis.settings.register_profile(
@@ -98,7 +98,7 @@ def client(request: pytest.FixtureRequest, endpoint: str) -> Iterator[nedbus.Bus
         with nedbus.connect(endpoint) as bus:
             yield bus
     else:
-        with asyncio.Runner() as runner, blocking(runner, nedbus.connect_async(endpoint)) as bus:
+        with asyncio.Runner() as runner, sync_adapter(runner, nedbus.connect_async(endpoint)) as bus:
             yield bus
 
 

@@ -49,17 +49,17 @@ def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
     return file
 
 
-def files_of(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
+def tls_settings(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
     """Return the settings of whoever shows a certificate, or none."""
     own = {} if name is None else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
     return {"tls_ca": pki / ca, **own}
 
 
-def tls_of(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
+def client_tls(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
     """Return the same for a script."""
-    return nedbus.Tls(*files_of(pki, name, ca).values())
+    return nedbus.Tls(*tls_settings(pki, name, ca).values())
 
 
-def flags_of(pki: Path, name: str | None) -> list[str]:
+def tls_options(pki: Path, name: str | None) -> list[str]:
     """Return the same for a command."""
-    return [f"--{setting.replace('_', '-')}={path}" for setting, path in files_of(pki, name).items()]
+    return [f"--{setting.replace('_', '-')}={path}" for setting, path in tls_settings(pki, name).items()]

@@ -32,7 +32,7 @@ _SIZE: Final = {"COLUMNS": "80", "LINES": "24"}  # where a test does not say ano
 
 
 @dataclass(frozen=True)
-class Ended:
+class CommandResult:
     """A command that has ended: its exit code and its output."""
 
     exit_code: int
@@ -40,7 +40,7 @@ class Ended:
     err: str
 
 
-def run_command(*arguments: str, **environment: str) -> Ended:
+def run_command(*arguments: str, **environment: str) -> CommandResult:
     """Run `nedbus` with these arguments, in the main thread, and return when it has ended."""
     exit_code, out, err = 0, io.BytesIO(), io.BytesIO()
     stdout = io.TextIOWrapper(out, "utf-8", write_through=True)
@@ -53,7 +53,7 @@ def run_command(*arguments: str, **environment: str) -> Ended:
         except Exception:  # noqa: BLE001 - what a process would show
             exit_code = 1
             traceback.print_exc()
-    return Ended(exit_code, out.getvalue().decode(), err.getvalue().decode())
+    return CommandResult(exit_code, out.getvalue().decode(), err.getvalue().decode())
 
 
 def fork_command(

@@ -19,7 +19,9 @@ from tests.waits import wait_for
 PACKAGING: Final = Path(__file__).parents[2] / "packaging"
 ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
 # Whatever `start` starts is Python: this one reads a file as its input and becomes another program.
-_BECOME: Final = "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
+_EXEC_SCRIPT: Final = (
+    "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
+)
 
 
 def find_program(name: str) -> str:
@@ -32,7 +34,7 @@ def find_program(name: str) -> str:
 
 def start_promtool(start: Start, *arguments: str, stdin: Path | str = os.devnull) -> Process:
     """Start promtool, with a file as its input; it is killed at the end of the test."""
-    return start("-c", _BECOME, os.fspath(stdin), find_program("promtool"), *arguments)
+    return start("-c", _EXEC_SCRIPT, os.fspath(stdin), find_program("promtool"), *arguments)
 
 
 class Prometheus:
@@ -47,7 +49,7 @@ class Prometheus:
         config.write_text(json.dumps({"global": every, "rule_files": ["alerts.yml"], "scrape_configs": scraped}))
         self._url = f"http://127.0.0.1:{free_port()}"
         self.process = start(
-            "-c", _BECOME, os.devnull, program,
+            "-c", _EXEC_SCRIPT, os.devnull, program,
             f"--config.file={config}", f"--storage.tsdb.path={folder / 'data'}",
             f"--web.listen-address={self._url.removeprefix('http://')}", "--log.level=warn",
         )  # fmt: skip

@@ -16,8 +16,8 @@ from tests.peers.processes import Process, Start
 ROOT = Path(__file__).parents[2]
 ARCHIVE = ROOT.parent / "shared" / "bin" / "zenohd-1.10.2.tar.xz"
 # Whatever `start` starts is Python: this one becomes another program.
-BECOME = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
-EITHER = ("nedbus", pytest.param("zenohd", marks=(pytest.mark.slow, pytest.mark.process)))
+EXEC_SCRIPT = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
+ROUTER_KINDS = ("nedbus", pytest.param("zenohd", marks=(pytest.mark.slow, pytest.mark.process)))
 """Parameters of a fixture that runs a router: ours, and the real one where the tests may take their time."""
 
 
@@ -44,4 +44,4 @@ def start_zenohd(start: Start, *arguments: str, **environment: str) -> Process:
     """Start a zenohd with these arguments, by the fixture `start`: it is killed at the end of the test."""
     path = zenohd_path()
     plugins = f"--plugin-search-dir={path.parents[1] / 'lib'}"
-    return start("-c", BECOME, os.fspath(path), plugins, *arguments, NO_COLOR="1", RUST_LOG="info", **environment)
+    return start("-c", EXEC_SCRIPT, os.fspath(path), plugins, *arguments, NO_COLOR="1", RUST_LOG="info", **environment)

@@ -38,7 +38,7 @@ from tests.flights.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrad
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
-from tests.peers.listening import Listener
+from tests.peers.live_source import Listener
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
@@ -390,7 +390,7 @@ def test_loop_is_rejected(
             publisher.publish(message(next(timestamps)))
             return "ignored to avoid a loop" in caplog.text
 
-        listener.turn_until(is_rejected, what="the rejection")
+        listener.step_until(is_rejected, what="the rejection")
         assert (listener.messages, listener.rejections) == ([], [])
 
 

@@ -31,8 +31,8 @@ from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import Link, wait_for_demand
 from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.ports import free_endpoint
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
 
 BOTH: list[Mode] = ["latest", "every"]
@@ -261,7 +261,7 @@ def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus,
     def found() -> list[tuple[str, int, bool]]:
         return [(sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()]
 
-    with answering(zenoh_session, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
         wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="the live one and the stored one")
 
 
@@ -271,7 +271,7 @@ def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session:
     layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
     explained = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
     last = reply_with({f"nedbus/1/{VLP}": msgpack.packb([9, 5, True, 2.5])})
-    with answering(zenoh_session, SCHEMA, explained), answering(zenoh_session, f"nedbus/1/{VLP}", last):
+    with answer_queries(zenoh_session, SCHEMA, explained), answer_queries(zenoh_session, f"nedbus/1/{VLP}", last):
         wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
 
 
@@ -285,7 +285,7 @@ def test_hostile_answers_reach_no_script(
 ) -> None:
     """A status that is not JSON, or nested endlessly, is ignored, with one log line for all of them."""
     junk = {"evil": b"[" * 100_000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
-    with answering(zenoh_session, "nedbus/@service/*/status", services_of(junk)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
@@ -298,7 +298,7 @@ def test_status_that_grows_when_it_is_read_fills_no_memory(
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
-    with answering(zenoh_session, "nedbus/@service/*/status", services_of(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
@@ -309,7 +309,7 @@ def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, zenoh_session:
     """The id of a status is that of its key, unknown fields are ignored, and invalid values and rows are dropped."""
     sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
     told = {"service": "lie", "host": "here", "now": 10**400, "version": [1], "sources": sources, "shape": {"of": "it"}}
-    with answering(
+    with answer_queries(
         zenoh_session, "nedbus/@service/*/status", services_of({"a": json.dumps(told).encode(), "b": b"[5]"})
     ):
         [status] = client.services()
@@ -325,7 +325,7 @@ def test_answers_that_are_too_many_are_left_out(
     monkeypatch.setattr("nedbus.transport.queries.MAX_ANSWER_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
-    with answering(zenoh_session, "nedbus/@service/*/status", services_of(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
     assert "nedbus/@service/*/status: 40 answers left out, beyond the limits of a query" in caplog.messages
 

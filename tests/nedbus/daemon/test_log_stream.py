@@ -18,7 +18,7 @@ from nedbus.recording import Flight
 from nedbus.timings import Timings
 from tests.peers.command_line import run_command
 from tests.peers.custom_timings import start_with_timings
-from tests.peers.http_pages import Pages
+from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
 from tests.peers.px4_log_stream import SHORT, START, STOP, Px4LogStream, read_recording
@@ -33,7 +33,7 @@ def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
 @pytest.mark.process
 def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
     """The stream arrives in full at a subscriber; `info`, /metrics and the saved log have the same totals."""
-    link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), Pages(free_port())
+    link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), HttpClient(free_port())
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
     patient = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # of a busy machine

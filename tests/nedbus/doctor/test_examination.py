@@ -32,7 +32,7 @@ from nedbus_msgs import dds_type, status_key
 from tests.flights.first_message import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
-from tests.peers.certificates import files_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_settings, write_config
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
@@ -407,7 +407,7 @@ def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
 
 def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
     """Whose, for which names, by whom, until when: of the router, of this client, of the authority."""
-    findings = look(run_router(), run_router("router-soon"), tls=files_of(pki, "reader"))
+    findings = look(run_router(), run_router("router-soon"), tls=tls_settings(pki, "reader"))
     assert is_well(findings), findings
     router = r"the router shows router for 127\.0\.0\.1, localhost, issued by nedbus CA, valid until 20\d\d-"
     found(findings, "tls", "ok", router)
@@ -437,7 +437,7 @@ def test_certificate_that_is_wrong(
     router, name, ca = case
     if name != "reader":  # it is rejected, perhaps slowly
         timings.tls_alert = DEADLINE
-    findings = look(run_router(router), tls=files_of(pki, name, ca))
+    findings = look(run_router(router), tls=tls_settings(pki, name, ca))
     for check, text in told.items():
         found(findings, check, "wrong", text)
     assert any("the router shows" in each.seen for each in findings)
@@ -452,7 +452,7 @@ def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timi
     found(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
     found(findings, "tls", "wrong", f"{secure}: .*no authority is given")
     for files, reason in (
-        ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
+        ({**tls_settings(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
         ({"tls_certificate": pki / "reader.crt"}, "not the authority to trust"),
     ):
@@ -484,14 +484,14 @@ def test_what_may_be_read_and_written(
 ) -> None:
     """A vehicle's own certificate may write it, and not read; a reader's may not write, and finds what is dropped."""
     older = {"@doctor": "@probe"} if client == "older" else {}  # rules that know nothing of probes
-    endpoint, own = run_router(**older), tls_of(pki, "vehicle-1")
+    endpoint, own = run_router(**older), client_tls(pki, "vehicle-1")
     with (
         nedbus.connect(endpoint, tls=own, timeout=DEADLINE) as bus,
         open_client([endpoint], tls=own, timeout=DEADLINE) as session,
         flying(bus, *published or "2"),
         reporting(session, sources=[source(addresses=[f"{each}/{VLP}" for each in published])]),
     ):
-        files = files_of(pki, "vehicle-1" if older else client)
+        files = tls_settings(pki, "vehicle-1" if older else client)
         findings = look(endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1)
     assert any(
         (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen} {each.advice}")
@@ -504,7 +504,7 @@ def test_what_may_be_read_and_written(
 def test_certificates_without_the_package_that_reads_them(run_router: Run, pki: Path, start: Start) -> None:
     """Names and dates are unknown then, and what to install is said; whether to trust it is told all the same."""
     endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
-    settings = {name: str(path) for name, path in files_of(pki, "reader").items()}
+    settings = {name: str(path) for name, path in tls_settings(pki, "reader").items()}
     program = f"""
 import sys
 sys.modules["cryptography"] = None

@@ -37,7 +37,7 @@ from tests.flights.first_message import encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
-from tests.peers.http_pages import Pages, read_families
+from tests.peers.http_client import HttpClient, read_families
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
 from tests.peers.prometheus import start_promtool
@@ -50,43 +50,43 @@ Serve = Callable[..., Process]
 
 
 @pytest.fixture
-def pages() -> Pages:
-    return Pages(free_port())
+def pages() -> HttpClient:
+    return HttpClient(free_port())
 
 
 @pytest.fixture
-def serve(run_nedbus: Start, pages: Pages, endpoint: str) -> Serve:
+def serve(run_nedbus: Start, pages: HttpClient, endpoint: str) -> Serve:
     """Start a service of the router of this test that serves pages, and wait until it does."""
 
     def serve(*sources: str, connect: str = endpoint) -> Process:
         service = run_nedbus("serve", "-c", connect, "--http", pages.where, *[f"--source={text}" for text in sources])
-        wait_for(lambda: pages.ask("/healthz")[0] == 200, what=f"the pages: {service.err}")
+        wait_for(lambda: pages.request("/healthz")[0] == 200, what=f"the pages: {service.err}")
         return service
 
     return serve
 
 
 @contextmanager
-def exporting(bus: nedbus.Bus) -> Iterator[Pages]:
+def exporting(bus: nedbus.Bus) -> Iterator[HttpClient]:
     """Read as `nedbus export` does, and serve what was seen."""
     exporter, stop = Exporter(bus, nedbus.Selection(), version="0"), threading.Event()
     with ThreadPoolExecutor(1) as pool, closing(HttpServer("127.0.0.1:0", exporter.pages)) as server:
         reading = pool.submit(exporter.run, stop)
         try:
-            yield Pages(server.port)
+            yield HttpClient(server.port)
         finally:
             stop.set()
         reading.result(DEADLINE)
 
 
-def test_pages_of_a_service(serve: Serve, pages: Pages) -> None:
+def test_pages_of_a_service(serve: Serve, pages: HttpClient) -> None:
     """/metrics counts by vehicle, topic and source; /status is what `nedbus info` shows; the rest says one line."""
     serve("sim:?vehicle=7")
     of_stream = {"vehicle": "7", "topic": VLP, "source": "sim:?vehicle=7"}
     wait_for(lambda: pages.values("nedbus_stream_rate_hertz", **of_stream), what="a rate")
-    assert pages.ask("/readyz") == (200, "ready\n")
-    assert pages.ask("/healthz") == (200, "ok\n")
-    status = json.loads(pages.ask("/status?any=query")[1])
+    assert pages.request("/readyz") == (200, "ready\n")
+    assert pages.request("/healthz") == (200, "ok\n")
+    status = json.loads(pages.request("/status?any=query")[1])
     assert [source["source"] for source in status["sources"]] == ["sim:?vehicle=7"]
     (published,) = pages.values("nedbus_messages_published_total", **of_stream)
     assert published >= status["sources"][0]["streams"][0]["health"]["messages"] > 0
@@ -127,14 +127,14 @@ def test_pages_of_an_exporter(
             == [0]
         )
         assert pages.values("nedbus_connected") == [1]
-        assert pages.ask("/healthz") == (200, "ok\n")
-        status = json.loads(pages.ask("/status")[1])
+        assert pages.request("/healthz") == (200, "ok\n")
+        status = json.loads(pages.request("/status")[1])
     assert (status["connected"], status["invalid"]) == (True, 1)
     assert status["streams"][f"7/{VLP}"]["lost"] == 2
     assert "Traceback" not in caplog.text
 
 
-def test_vehicles_page_of_a_service(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_vehicles_page_of_a_service(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """/vehicles is 503 with a line for each vehicle that is bad; who is well has a line with 200.
 
     The peers are a real service in another process, and a replay of a log that this test writes.
@@ -143,12 +143,12 @@ def test_vehicles_page_of_a_service(serve: Serve, pages: Pages, tmp_path: Path) 
     well = write_log(tmp_path / "well.ulg", times, **VALID)
     serve(f"ulog:{well}?vehicle=7")
     wait_for(lambda: pages.values("nedbus_vehicle_state", vehicle="7", state="ok") == [1], what="the vehicle")
-    assert pages.ask("/vehicles") == (200, "7 ok\n")
+    assert pages.request("/vehicles") == (200, "7 ok\n")
     assert pages.values("nedbus_vehicle_condition") == []
     assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
 
 
-def test_vehicle_that_is_not_well(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_vehicle_that_is_not_well(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """Conditions are told by /vehicles and by metrics; /healthz and /readyz are of the service, and stay 200.
 
     The peers are a real service in another process, and replays of logs that this test writes.
@@ -167,10 +167,10 @@ def test_vehicle_that_is_not_well(serve: Serve, pages: Pages, tmp_path: Path) ->
     assert found == {("lost", "xy_invalid"), ("lost", "dead_reckoning"), ("doubtful", "dead_reckoning")}
     assert pages.values("nedbus_vehicle_state", vehicle="lost", state="bad") == [1]
     assert pages.values("nedbus_vehicle_state", vehicle="doubtful", state="watch") == [1]
-    status, text = pages.ask("/vehicles")
+    status, text = pages.request("/vehicles")
     assert status == 503
     assert re.fullmatch(r"vehicle lost: xy not valid, since [\d:.]+ UTC \(.*\)\n", text)
-    assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
 
 
 def test_vehicles_of_an_exporter(bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
@@ -186,14 +186,14 @@ def test_vehicles_of_an_exporter(bus: nedbus.Bus, zenoh_session: Session, endpoi
             state.publish(VehicleStatus.model_validate({"timestamp": number, "failsafe": failsafe.is_set()}))
 
         closing.enter_context(repeating(publish))
-        wait_for(lambda: pages.ask("/vehicles") == (200, "7 ok\n"), what="the vehicle")
+        wait_for(lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="the vehicle")
         (before,) = pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")
         failsafe.set()
-        wait_for(lambda: pages.ask("/vehicles")[1].startswith("vehicle 7: failsafe, since "), what="failsafe")
+        wait_for(lambda: pages.request("/vehicles")[1].startswith("vehicle 7: failsafe, since "), what="failsafe")
         assert pages.values("nedbus_vehicle_condition", vehicle="7", condition="failsafe") == [1]
         assert pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")[0] > before
         failsafe.clear()
-        wait_for(lambda: pages.ask("/vehicles") == (200, "7 ok\n"), what="its end")
+        wait_for(lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="its end")
 
 
 def test_what_peers_say_is_one_line() -> None:
@@ -220,16 +220,16 @@ def test_flag_that_goes_to_and_fro_is_a_condition(every: int) -> None:
     assert account.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
-def test_metrics_pass_the_linter(serve: Serve, pages: Pages, start: Start, tmp_path: Path) -> None:
+def test_metrics_pass_the_linter(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
     """`promtool check metrics` finds nothing to say: names, units, types and help are as Prometheus wants them."""
     serve("sim:", f"mavlink:udpin:127.0.0.1:{free_port()}")
     text = tmp_path / "metrics"
-    text.write_text(pages.ask("/metrics")[1])
+    text.write_text(pages.request("/metrics")[1])
     promtool = start_promtool(start, "check", "metrics", stdin=text)
     assert (promtool.wait(), promtool.out, promtool.err) == (0, "", "")
 
 
-def test_rejections_are_counted_by_rule(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_rejections_are_counted_by_rule(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """Each rule that messages of a source violate has a count; their sum is the count of the source."""
     log = tmp_path / "flight.ulg"
     writer = UlogWriter()
@@ -247,7 +247,7 @@ def test_rejections_are_counted_by_rule(serve: Serve, pages: Pages, tmp_path: Pa
     assert pages.values("nedbus_messages_published_total") == [1]
 
 
-def test_sources_that_are_configured_alike_are_told_apart(serve: Serve, pages: Pages) -> None:
+def test_sources_that_are_configured_alike_are_told_apart(serve: Serve, pages: HttpClient) -> None:
     """The same source twice is a mistake, and yet no series occurs twice: Prometheus would take neither."""
     serve("sim:", "sim:")
     wait_for(lambda: len(pages.values("nedbus_source_rejected_total")) == 2, what="both sources")
@@ -257,7 +257,7 @@ def test_sources_that_are_configured_alike_are_told_apart(serve: Serve, pages: P
     assert len(pages.values("nedbus_source_state", source="sim: (2)")) == 6
 
 
-def test_source_from_which_nothing_comes_is_not_ready(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_source_from_which_nothing_comes_is_not_ready(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """/readyz is 503 with a line for each source that cannot be read, and each live one that is silent.
 
     A replay that waits for a reader is ready; the process is healthy all the same.
@@ -265,34 +265,34 @@ def test_source_from_which_nothing_comes_is_not_ready(serve: Serve, pages: Pages
     missing, silent = f"ulog:{tmp_path / 'missing.ulg'}", f"mavlink:udpin:127.0.0.1:{free_port()}"
     serve(missing, silent, "sim:?wait=1")
     failed = f"{missing}: retrying: {tmp_path / 'missing.ulg'}: no such file or directory\n"
-    wait_for(lambda: pages.ask("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"), what="all three")
-    assert pages.ask("/healthz")[0] == 200
+    wait_for(lambda: pages.request("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"), what="all three")
+    assert pages.request("/healthz")[0] == 200
     assert sorted(pages.values("nedbus_source_addresses")) == [0, 0, 12]
     assert pages.values("nedbus_source_state", state="waiting") == [0, 1, 1]
 
 
-def test_without_a_router_is_not_ready(serve: Serve, run_nedbus: Start, pages: Pages) -> None:
+def test_without_a_router_is_not_ready(serve: Serve, run_nedbus: Start, pages: HttpClient) -> None:
     """Before its router is there, after it has gone, and while it is there: 503, 503 and 200; an exporter too."""
-    where, exported = free_endpoint(), Pages(free_port())
+    where, exported = free_endpoint(), HttpClient(free_port())
     serve("sim:", connect=where)
-    assert pages.ask("/readyz") == (503, f"the service is starting: {where}\n")
+    assert pages.request("/readyz") == (503, f"the service is starting: {where}\n")
     assert pages.values("nedbus_sessions", role="client") == [0]
     router = run_nedbus("router", "-l", where)
     run_nedbus("export", "--wait", "-c", where, "--http", exported.where)
     both = (pages, exported)
-    wait_for(lambda: {each.ask("/readyz") for each in both} == {(200, "ready\n")}, what="the router")
+    wait_for(lambda: {each.request("/readyz") for each in both} == {(200, "ready\n")}, what="the router")
     router.kill()
     no_router = (503, f"no router answers at {where}\n")
-    wait_for(lambda: {each.ask("/readyz") for each in both} == {no_router}, what="its end")
-    assert exported.ask("/vehicles") == no_router  # it knows nothing of any
+    wait_for(lambda: {each.request("/readyz") for each in both} == {no_router}, what="its end")
+    assert exported.request("/vehicles") == no_router  # it knows nothing of any
     assert pages.values("nedbus_sessions", role="client") == exported.values("nedbus_connected") == [0]
 
 
-def test_without_the_client_it_says_what_to_install(start: Start, pages: Pages, endpoint: str) -> None:
+def test_without_the_client_it_says_what_to_install(start: Start, pages: HttpClient, endpoint: str) -> None:
     """Without prometheus-client /metrics is 501 with what to install, and the other pages are as always."""
     start("-c", WITHOUT_CLIENT, "serve", "-c", endpoint, "-s", "sim:", "--http", pages.where)
-    wait_for(lambda: pages.ask("/readyz")[0] == 200, what="the service")
-    status, text = pages.ask("/metrics")
+    wait_for(lambda: pages.request("/readyz")[0] == 200, what="the service")
+    status, text = pages.request("/metrics")
     assert status == 501
     assert re.fullmatch(r"prometheus_client: not installed: .*pip install .*\[metrics\]'\n", text)
     exporter = start("-c", WITHOUT_CLIENT, "export", "-c", endpoint, "--http", f"127.0.0.1:{free_port()}")
@@ -384,7 +384,7 @@ def test_stuck_source_is_not_healthy(endpoint: str, monkeypatch: pytest.MonkeyPa
 
 
 def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages that stand still would look like vehicles that are silent: the error is raised instead."""
+    """HttpClient that stand still would look like vehicles that are silent: the error is raised instead."""
 
     def fail(_: object) -> None:
         raise ArithmeticError

@@ -28,13 +28,13 @@ from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import take
 from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_demand
 from tests.nedbus.sources.px4.test_source import Px4
-from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import CONFIG, client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import run_command
 from tests.peers.custom_timings import start_with_timings
-from tests.peers.http_pages import Pages
+from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
-from tests.peers.zenohd import EITHER, start_zenohd
+from tests.peers.zenohd import ROUTER_KINDS, start_zenohd
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 __all__ = ["clock", "pki"]
@@ -50,7 +50,7 @@ def configured(pki: Path, tmp_path: Path) -> tuple[Path, str]:
     return write_config(pki, tmp_path / "router-secure.json5", endpoint), endpoint
 
 
-@pytest.fixture(params=EITHER)
+@pytest.fixture(params=ROUTER_KINDS)
 def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iterator[str]:
     """Run a router on the shipped configuration: ours, or the real zenohd."""
     file, endpoint = configured
@@ -66,14 +66,14 @@ def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iter
 def join(secure: str, pki: Path) -> Iterator[Join]:
     """Connect as somebody."""
     with ExitStack() as opened:
-        yield lambda name: opened.enter_context(nedbus.connect(secure, tls=tls_of(pki, name), timeout=DEADLINE))
+        yield lambda name: opened.enter_context(nedbus.connect(secure, tls=client_tls(pki, name), timeout=DEADLINE))
 
 
 @pytest.fixture
 def open_as(secure: str, pki: Path) -> Iterator[Open]:
     """Open a plain session as somebody."""
     with ExitStack() as opened:
-        yield lambda name: opened.enter_context(open_client([secure], tls=tls_of(pki, name), timeout=DEADLINE))
+        yield lambda name: opened.enter_context(open_client([secure], tls=client_tls(pki, name), timeout=DEADLINE))
 
 
 def test_vehicle_is_read_whole(join: Join) -> None:
@@ -200,8 +200,10 @@ def test_half_a_setting_is_refused(
 
 def test_commands_use_certificates(secure: str, pki: Path, run_nedbus: Start) -> None:
     """Service and commands take the same files, as flags or from the environment; health tells of what is refused."""
-    run_nedbus("serve", "-c", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
-    wait_for(lambda: run_command("health", "-c", secure, "-v", "1", *flags_of(pki, "reader")).exit_code == 0, what="1")
+    run_nedbus("serve", "-c", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+    wait_for(
+        lambda: run_command("health", "-c", secure, "-v", "1", *tls_options(pki, "reader")).exit_code == 0, what="1"
+    )
     files = {"CA": "ca.crt", "CERTIFICATE": "reader.crt", "KEY": "reader.key"}
     environment = {"NEDBUS_CONNECT": secure, **{f"NEDBUS_TLS_{name}": f"{pki / file}" for name, file in files.items()}}
     echo = run_command("echo", "-n", "20", **environment)
@@ -221,7 +223,7 @@ def test_px4_reaches_the_secure_router_through_its_own(
     beside = free_endpoint()
     service = run_nedbus(
         *("serve", "--vehicle", "1", "-s", "px4-zenoh:", "--listen", beside),
-        *("--connect", secure, *flags_of(pki, "vehicle-1")),
+        *("--connect", secure, *tls_options(pki, "vehicle-1")),
     )
     wait_for(lambda: f"joined {secure}" in service.err, what="the secure link")
     beyond = open_as("reader").declare_subscriber("*/fmu/**", zenoh.handlers.RingChannel(10))
@@ -245,12 +247,12 @@ def test_list_does_not_ask_for_a_source_that_is_there(secure: str, pki: Path, ru
     """Where a service answers and no vehicle is seen, the hint is about what the router lets through."""
 
     def hint() -> str:
-        listed = run_command("list", "-c", secure, *flags_of(pki, "reader"))
+        listed = run_command("list", "-c", secure, *tls_options(pki, "reader"))
         assert listed.exit_code == 0
         return listed.err
 
     assert "start a source with 'nedbus serve'" in hint()
-    run_nedbus("serve", "--connect", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
+    run_nedbus("serve", "--connect", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
     wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
 
 
@@ -294,7 +296,7 @@ def test_refused_clients_are_logged(
     file, endpoint = configured
     router = run_nedbus(*command, str(file), **environment)
     wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")
-    with nedbus.connect(endpoint, tls=tls_of(pki, "reader")) as bus:
+    with nedbus.connect(endpoint, tls=client_tls(pki, "reader")) as bus:
         assert bus.connected
     assert "refused" not in router.err
 
@@ -305,7 +307,7 @@ def test_refused_clients_are_logged(
         ("reader", "foreign/ca.crt", "it does not accept the certificate of this router", "is not signed by"),
     ):
         with pytest.raises(nedbus.ConnectError) as refused:
-            nedbus.connect(endpoint, tls=tls_of(pki, name, ca), timeout=0.1)
+            nedbus.connect(endpoint, tls=client_tls(pki, name, ca), timeout=0.1)
         assert str(refused.value).startswith(f"no TLS connection to {endpoint}: ")
         assert advice in str(refused.value)
         assert len(str(refused.value)) < 250, "short enough to be read"
@@ -368,15 +370,15 @@ def test_refused_service_says_so_until_the_rules_are_mended(
     def start_router() -> Process:
         return run_nedbus("router", str(file)) if kind == "nedbus" else start_zenohd(start, "-c", str(file))
 
-    router, pages = start_router(), Pages(free_port())
-    options = (*flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
+    router, pages = start_router(), HttpClient(free_port())
+    options = (*tls_options(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
     service = start_with_timings(start, SOON, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses vehicle 2\n")
     wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
-    assert (pages.ask("/healthz"), pages.ask("/readyz")) == (refused, refused)
+    assert (pages.request("/healthz"), pages.request("/readyz")) == (refused, refused)
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
-    assert json.loads(pages.ask("/status")[1])["refused"] == ["2"]
-    reader = ("--wait", "-c", endpoint, *flags_of(pki, "reader"))
+    assert json.loads(pages.request("/status")[1])["refused"] == ["2"]
+    reader = ("--wait", "-c", endpoint, *tls_options(pki, "reader"))
     if certificate == "vehicle-1":  # else not even its status passes
         info = run_command("info", *reader)
         assert info.exit_code == 0, info.err
@@ -393,7 +395,7 @@ def test_refused_service_says_so_until_the_rules_are_mended(
     router.kill()
     start_router()
     wait_for(lambda: "the router accepts vehicle 2 now" in service.err, what="its end")
-    assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [0.0]
     health = run_command("health", "--vehicle", "2", *reader)
     assert health.exit_code == 0, health.err
@@ -403,7 +405,7 @@ Outcome = tuple[bool | None, float]
 
 
 def permission_of(session: Session, endpoint: str, pki: Path, *vehicles: str) -> WritePermission:
-    tls = tls_of(pki, "vehicle-1")
+    tls = client_tls(pki, "vehicle-1")
     return WritePermission(session, [endpoint], tls=tls, prefix="nedbus", vehicles=lambda: set(vehicles))
 
 
@@ -449,7 +451,7 @@ def test_refusal_is_believed_when_it_is_repeated(
 def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path, timings: Timings) -> None:
     """Messages of an embedded router's service pass the router that it joins, or not, by its certificate."""
     timings.probe = 0.5
-    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=tls_of(pki, "vehicle-1")) as session:
+    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=client_tls(pki, "vehicle-1")) as session:
         permission = permission_of(session, secure, pki, "1", "2")
         wait_for(lambda: look(permission) == {"1": False}, what="the vehicle that is allowed")
         wait_for(lambda: look(permission) == {"1": False, "2": True}, what="the vehicle that is not")
@@ -465,7 +467,7 @@ def test_only_access_rules_are_a_refusal(
     shipped = file.read_text()
     file.write_text(shipped.replace("@doctor", "@probe"))
     older = open_router(config_file=file)
-    with open_client([endpoint], timeout=DEADLINE, tls=tls_of(pki, "vehicle-1")) as session:
+    with open_client([endpoint], timeout=DEADLINE, tls=client_tls(pki, "vehicle-1")) as session:
         permission = permission_of(session, endpoint, pki, "1", "2")
         assert look(permission) == {}
         older.close()

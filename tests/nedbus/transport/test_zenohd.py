@@ -20,7 +20,7 @@ import nedbus
 from nedbus.transport import Session, open_client
 from tests.flights.first_message import decode, encode
 from tests.flights.messages import VLP, message
-from tests.peers.certificates import flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
@@ -62,7 +62,7 @@ def raw(zenohd: str) -> Iterator[Session]:
 
 def join(endpoint: str, pki: Path, name: str) -> nedbus.Bus:
     """Connect as somebody."""
-    return nedbus.connect(endpoint, tls=tls_of(pki, name), timeout=DEADLINE)
+    return nedbus.connect(endpoint, tls=client_tls(pki, name), timeout=DEADLINE)
 
 
 def start_storage(start: Start, tmp_path: Path, router: str) -> Process:
@@ -193,7 +193,7 @@ def test_http_reads_and_cannot_write(start: Start, secure: str, pki: Path, tmp_p
 
 def test_bridge_to_ros_2_needs_its_router(run_nedbus: Start, secure: str, zenohd: str, pki: Path) -> None:
     """The secure router has no rule for ROS 2: `nedbus ros2` says so, and works with ROS 2's own router beside it."""
-    flags = flags_of(pki, "reader")
+    flags = tls_options(pki, "reader")
     with join(secure, pki, "vehicle-1") as vehicle:
         vehicle.publisher(VLP, vehicle="1")
         alone = run_nedbus("ros2", "-c", secure, *flags)

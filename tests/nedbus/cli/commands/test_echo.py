@@ -27,7 +27,7 @@ from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import open_replay
 from tests.nedbus.cli.output.test_terminal import flying as standing
-from tests.peers.command_line import Ended, fork_command, run_command
+from tests.peers.command_line import CommandResult, fork_command, run_command
 from tests.peers.processes import ForkedProcess, ForkServer, Start
 from tests.waits import DEADLINE, wait_for
 
@@ -42,7 +42,7 @@ REPLAY = f"sim:?duration=40&speed=max&topics={VLP}"
 LINE = 1000  # bytes that a line of JSON has at least
 
 
-def echo(endpoint: str, *options: str) -> Ended:
+def echo(endpoint: str, *options: str) -> CommandResult:
     """Run `nedbus echo` with options that end it."""
     ended = run_command("echo", "-c", endpoint, *options)
     assert ended.exit_code == 0, ended.err

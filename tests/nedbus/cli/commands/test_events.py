@@ -23,7 +23,7 @@ from nedbus.sources import read_account, source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, account_of
-from tests.peers.command_line import Ended, run_command
+from tests.peers.command_line import CommandResult, run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.waits import repeating, wait_for, wait_for_matching
@@ -80,7 +80,7 @@ def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(where, lambda path: (account_of if path == REAL else read_account)(path))
 
 
-def lines_of(shown: Ended) -> list[tuple[str, str, str]]:
+def lines_of(shown: CommandResult) -> list[tuple[str, str, str]]:
     """Return time, severity and text of each line."""
     found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in shown.out.splitlines()]
     return [(match[1], match[2] or "", match[3]) for match in found if match]

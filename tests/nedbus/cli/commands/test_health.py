@@ -21,13 +21,13 @@ from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
-from tests.peers.answering import answering, reply_with
-from tests.peers.command_line import Ended, run_command
+from tests.peers.command_line import CommandResult, run_command
 from tests.peers.ports import free_port
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
 
-Judge = Callable[..., Ended]
+Judge = Callable[..., CommandResult]
 
 
 @pytest.fixture
@@ -212,7 +212,9 @@ def test_old_replay_is_no_silence_of_now(endpoint: str, bus: nedbus.Bus) -> None
 def test_service_that_keeps_no_account_is_a_fault(endpoint: str, zenoh_session: Session, health: Judge) -> None:
     """An older service answers its status whatever is asked: what is expected of its vehicles is not known to hold."""
     key, status = "nedbus/@service/old/status", {"service": "old", "host": socket.gethostname(), "sources": []}
-    with answering(zenoh_session, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")):
+    with answer_queries(
+        zenoh_session, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")
+    ):
         for option in ("--valid", "xy"), ("--within", "60"):
             shown = health("--services", "1", *option)
             assert shown.exit_code == 1

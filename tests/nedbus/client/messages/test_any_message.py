@@ -15,8 +15,8 @@ import nedbus
 from nedbus.transport import Session
 from nedbus_msgs import Definition, define_msg, field_type, short_hash
 from tests.nedbus_msgs.messages.test_messages import write_wheels
-from tests.peers.answering import answering, reply_with
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 COUNT = 500
@@ -76,7 +76,7 @@ def test_hostile_description_harms_no_other_stream(
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/peer/Evil"
     with (
-        answering(zenoh_session, schema, reply_with({schema: payload})),
+        answer_queries(zenoh_session, schema, reply_with({schema: payload})),
         client.subscribe("*", mode="every") as subscription,
     ):
         good = bus.publisher("vehicle_attitude", vehicle="1")

@@ -27,10 +27,10 @@ from nedbus.transport import Session, open_router, query
 from nedbus_msgs import Address, Definition, Provenance, codec_of, define, encoding_of, field_type, short_hash
 from tests.flights.ulogs import UlogWriter
 from tests.nedbus.client.numbered import wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 NAME, TOPIC = "WindCell", "wind_cell"
@@ -220,7 +220,7 @@ def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, zenoh_sessio
     layout = {"wire": 0, "fields": [{"name": name, "type": str(kind)} for name, kind in wrong.types.items()]}
     claim = {"layouts": [layout], "hash": short_hash(NAME, definition.types)}
     with (
-        answering(zenoh_session, schema, reply_with({schema: json.dumps(claim).encode()})),
+        answer_queries(zenoh_session, schema, reply_with({schema: json.dumps(claim).encode()})),
         client.subscribe(TOPIC, mode="every") as subscription,
     ):
         wait_for_matching(zenoh_session, f"nedbus/1/{TOPIC}")
@@ -240,7 +240,7 @@ def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))
     with (
-        answering(zenoh_session, f"nedbus/@schema/peer/{NAME}", held.append),
+        answer_queries(zenoh_session, f"nedbus/@schema/peer/{NAME}", held.append),
         closing(Reader(endpoint, "models").bus) as reader,
         reader.subscribe(TOPIC, mode="every") as subscription,
     ):

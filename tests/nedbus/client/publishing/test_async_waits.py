@@ -16,8 +16,8 @@ import nedbus
 from nedbus.transport import Session
 from tests.flights.messages import VLP
 from tests.nedbus.client.numbered import numbered, take
-from tests.peers.answering import answering
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries
 from tests.waits import DEADLINE, wait_for, wait_for_router
 
 COUNT = 5000  # messages, more than are sent without a reader that reads
@@ -129,7 +129,7 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Se
             with pytest.raises(nedbus.ClosedError):
                 await second.publish({"timestamp": 2})
 
-    with answering(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
         asyncio.run(scenario())
     wait_for(
         lambda: not any(each.name.startswith("nedbus-close_") for each in threading.enumerate()),
@@ -142,7 +142,7 @@ def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(
 ) -> None:
     """A `with` block that ends with an exception, as Ctrl-C does, waits for no reader."""
     asked: list[zenoh.Query] = []
-    silent = answering(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append)
+    silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
         publisher.publish({"timestamp": 1})
         raise RuntimeError("on purpose")
@@ -153,7 +153,7 @@ def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(
 def test_close_with_a_timeout_gives_up(client: nedbus.Bus, zenoh_session: Session, whole_bus: bool) -> None:
     """A reader that acknowledges nothing delays a close by its timeout at most, and with 0 not at all."""
     asked: list[zenoh.Query] = []
-    with answering(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
         for vehicle, timeout in (("1", 0.0), ("2", 0.05)):
             publisher = client.publisher(VLP, vehicle=vehicle, lossless=True)
             publisher.publish({"timestamp": 1})

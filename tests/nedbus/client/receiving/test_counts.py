@@ -26,7 +26,7 @@ from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
 from tests.nedbus.client.test_bus import BOTH, SCHEMA
-from tests.peers.answering import answering, reply_with
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 KEY = f"nedbus/1/{VLP}"
@@ -214,7 +214,7 @@ def test_newer_layout_is_read_by_its_schema(
     subscription = client.subscribe(mode="every")
     wait_for_matching(zenoh_session, KEY)
     with (
-        answering(zenoh_session, SCHEMA, count),
+        answer_queries(zenoh_session, SCHEMA, count),
         repeating(lambda: zenoh_session.put(KEY, msgpack.packb([9, 4, True, 2.5]))),
     ):
         taken = list(islice(subscription, 2))
@@ -230,7 +230,7 @@ def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_sessio
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)
-    with answering(zenoh_session, SCHEMA, schema), answering(zenoh_session, KEY, last):
+    with answer_queries(zenoh_session, SCHEMA, schema), answer_queries(zenoh_session, KEY, last):
         assert [(each.message.timestamp, each.message.x) for each in client.latest()] == [(4, 2.5)]
 
 
@@ -239,7 +239,7 @@ def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_sessio
 )
 def test_layout_without_a_description_is_invalid(bus: nedbus.Bus, zenoh_session: Session, answer: bytes) -> None:
     """After a hostile or broken description of a layout its messages are counted as invalid."""
-    with answering(zenoh_session, SCHEMA, reply_with({SCHEMA: answer})):
+    with answer_queries(zenoh_session, SCHEMA, reply_with({SCHEMA: answer})):
         subscription = bus.subscribe(VLP, mode="every")
         wait_for_matching(zenoh_session, KEY)
         zenoh_session.put(KEY, msgpack.packb([9, 1, 2]))

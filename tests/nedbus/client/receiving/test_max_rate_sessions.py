@@ -24,8 +24,8 @@ from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 from tests.nedbus.client.numbered import is_read, take, wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
 
 __all__ = ["Clock", "clock", "publish", "take", "wait_for_demand"]  # for others that thin
@@ -155,7 +155,7 @@ def test_storage_is_no_vehicle(bus: nedbus.Bus, zenoh_session: Session, clock: C
     stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=zenoh_session.new_timestamp())
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
-    with answering(zenoh_session, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
         assert subscription.receive(DEADLINE).vehicle == "7"
         wait_for_demand(publisher)
         publish(publisher, clock, 2, 1)

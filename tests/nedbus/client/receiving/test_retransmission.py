@@ -25,8 +25,8 @@ from tests.flights.first_message import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.lossy import Lossy, LossyQueue
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.ports import free_endpoint
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_matching, wait_for_router
 
 KEY = f"nedbus/7/{VLP}"
@@ -150,7 +150,7 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: S
 def test_answers_of_others_are_left_out(lossy: Lossy, zenoh_session: Session) -> None:
     """Replies of peers other than the publisher are ignored."""
     lie = reply_with({KEY: encode(message(666))}, encoding=encoding_of("sim"))
-    with answering(zenoh_session, f"{KEY}/@adv/pub/**", lie):
+    with answer_queries(zenoh_session, f"{KEY}/@adv/pub/**", lie):
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
@@ -168,7 +168,7 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, zenoh_session: Session, 
             for _ in range(2000):
                 query.reply(KEY, b"junk")
 
-    with answering(zenoh_session, f"{KEY}/@adv/pub/**", flood):
+    with answer_queries(zenoh_session, f"{KEY}/@adv/pub/**", flood):
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         if when == "closed":
@@ -207,7 +207,7 @@ def test_requests_without_replies_delay_no_others(lossy: Lossy, zenoh_session: S
     """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"
-    with answering(zenoh_session, f"{evil}/**", taken.append):
+    with answer_queries(zenoh_session, f"{evil}/**", taken.append):
         for number in range(1, 300):
             zenoh_session.put(f"{evil}/{number:x}/1/_", b"\x05\x00\x00\x00")
         wait_for(lambda: taken, what="a question for one that is invented")

@@ -32,7 +32,7 @@ from tests.flights.first_message import (
 from tests.flights.messages import VLP, message
 from tests.nedbus.bridges.test_ros2 import Peer, flight, peer, plain_session
 from tests.peers.command_line import run_command
-from tests.peers.listening import Listener, status_of_source
+from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
@@ -215,7 +215,7 @@ def test_type_hash_not_supported(listen: Listen, zenoh_session: Session) -> None
     px4.type_hash = NO_HASH
     first, second = listen(), listen("?layout=1.14")
     px4.put(1)
-    first.turn_until(lambda: first.rejections, what="the rejection")
+    first.step_until(lambda: first.rejections, what="the rejection")
     assert "choose a layout, as in px4-zenoh:?layout=1.14" in first.rejections[0].reason
     assert times(second.receive()) == [1]
 
@@ -235,11 +235,11 @@ def test_message_without_a_file_is_read_by_its_definition(
     wait_for_matching(zenoh_session, key)
     token = zenoh_session.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
     zenoh_session.put(key, b"")
-    wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the list")
-    assert status_of_source(bus).rejected == 0
+    wait_for(lambda: source_status(bus).not_carried == ("WheelEncoders",), what="the list")
+    assert source_status(bus).rejected == 0
     assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
     token.undeclare()
-    wait_for(lambda: status_of_source(bus).not_carried == (), what="the list to be empty")
+    wait_for(lambda: source_status(bus).not_carried == (), what="the list to be empty")
     service.kill()
     run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:?msg={tmp_path}")
     wait_for_matching(zenoh_session, key)
@@ -251,7 +251,7 @@ def test_message_without_a_file_is_read_by_its_definition(
     with bus.subscribe("wheel_encoders") as wheels, repeating(lambda: put(1.5)):
         assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
     put(501.0)
-    wait_for(lambda: status_of_source(bus).rejected == 1, what="the message out of range")
+    wait_for(lambda: source_status(bus).rejected == 1, what="the message out of range")
 
 
 def test_newer_layout_is_read_by_its_definition(
@@ -270,12 +270,12 @@ def test_newer_layout_is_read_by_its_definition(
         px4.raw(encode_with(newer, fields, newer.current))
     assert [upgrade(each.fields).x for each in given.receive(2)] == [0.5, 0.5]
     assert caplog.text.count("altitude_good_for_lock") == 1
-    without.turn_until(lambda: without.rejections, what="the rejection")
+    without.step_until(lambda: without.rejections, what="the rejection")
     for word in ("VehicleLocalPosition", px4.type_hash, "px4-zenoh:?msg=VehicleLocalPosition.msg"):
         assert word in without.rejections[0].reason
     own, px4.type_hash = px4.type_hash, "RIHS01_" + 64 * "0"
     px4.raw(b"", topic=f"{VLP}_groundtruth")
-    other.turn_until(lambda: other.rejections, what="the rejection")
+    other.step_until(lambda: other.rejections, what="the rejection")
     assert own in other.rejections[0].reason
     assert px4.type_hash in other.rejections[0].reason
 
@@ -298,7 +298,7 @@ def test_message_of_another_type_is_rejected(listener: Listener, zenoh_session: 
     """A position on the topic of attitudes is not taken for an attitude."""
     px4 = Px4(zenoh_session)
     px4.put(1, topic="vehicle_attitude")
-    listener.turn_until(lambda: listener.rejections, what="the rejection")
+    listener.step_until(lambda: listener.rejections, what="the rejection")
     assert "vehicle_attitude has messages of type VehicleAttitude" in listener.rejections[0].reason
 
 
@@ -355,7 +355,7 @@ def test_hostile_input_is_counted(listener: Listener, zenoh_session: Session) ->
     other.raw(payload_of(1), topic="somebody/pose")
     for start in (f"0/{'x' * 200}", "ä"):
         zenoh_session.put(f"{start}/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-    listener.turn_until(lambda: listener.rejected >= 18 + 2000 + 3, what="all rejections")
+    listener.step_until(lambda: listener.rejected >= 18 + 2000 + 3, what="all rejections")
     good.put(2)
     assert times(listener.receive(2)) == [1, 2]
     assert (listener.rejected, listener.messages) == (18 + 2000 + 3, [])
@@ -384,7 +384,7 @@ def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, zenoh_sessi
     for sequence in range(10):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
         px4.put(100 + sequence, attachment=bytes(Attachment(sequence, 0, GID[::-1])))
-    listener.turn_until(lambda: len(listener.messages) + listener.rejected == 20, what="all")
+    listener.step_until(lambda: len(listener.messages) + listener.rejected == 20, what="all")
     assert times(listener.receive(10)) == list(range(10))
 
 
@@ -397,7 +397,7 @@ def test_hostile_keys_leave_the_status_readable(
     for number in range(100):
         zenoh_session.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
         zenoh_session.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-    wait_for(lambda: status_of_source(bus).rejected == 200, what="the status")
+    wait_for(lambda: source_status(bus).rejected == 200, what="the status")
 
 
 def test_what_waits_to_be_decoded_is_small(listener: Listener, zenoh_session: Session) -> None:
@@ -406,8 +406,8 @@ def test_what_waits_to_be_decoded_is_small(listener: Listener, zenoh_session: Se
     wait_for_matching(zenoh_session, f"0/a/{name}/hash")
     for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):
         zenoh_session.put(f"0/{topic}/{name}/hash", payload)
-    listener.turn_until(lambda: listener.rejected == 4, what="all rejections")
-    listener.turn()
+    listener.step_until(lambda: listener.rejected == 4, what="all rejections")
+    listener.step()
     counts = Counter(each.where for each in listener.rejections for _ in range(each.count))
     assert counts == {"size": 2, f"0/a/{name}/hash": 1, f"0/last/{name}/hash": 1}
 
@@ -472,14 +472,14 @@ def test_stale_vehicle_is_not_listed(
 
     def is_stale() -> bool:
         other.put(time.monotonic_ns())
-        return status_of_source(bus).stale == (f"1/{VLP}",)
+        return source_status(bus).stale == (f"1/{VLP}",)
 
-    assert status_of_source(bus).state == "running"
+    assert source_status(bus).state == "running"
     wait_for(is_stale, what="the status to be stale")
     assert list(bus.vehicles()) == ["domain1"]
     assert "is stale: no message for 3 s" in service.err
     px4.put(2)
-    wait_for(lambda: status_of_source(bus).stale == (), what="the vehicle to be back")
+    wait_for(lambda: source_status(bus).stale == (), what="the vehicle to be back")
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
 
 
@@ -504,7 +504,7 @@ def test_ros_2_lists_the_source_as_a_subscriber(listener: Listener, peer: Peer, 
         return [_parse_liveliness_keyexpr(str(reply.ok.key_expr)) or {} for reply in tokens if reply.ok]
 
     node = peer("talk", "1.14", topic=f"/drone/{VLP}", rows=[], domain_id=4)
-    listener.turn_until(subscriptions, what="the subscription")
+    listener.step_until(subscriptions, what="the subscription")
     [found] = subscriptions()
     assert str(found["node_name"]).startswith("nedbus_px4_zenoh_")
     topic = (found["qualified_name"], found["dds_type"], found["type_hash"])
@@ -512,4 +512,4 @@ def test_ros_2_lists_the_source_as_a_subscriber(listener: Listener, peer: Peer, 
     nodes = [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
     assert any(name.endswith(f"/{found['node_name']}") for name in nodes)
     node.kill()
-    listener.turn_until(lambda: not subscriptions(), what="the subscription to be withdrawn")
+    listener.step_until(lambda: not subscriptions(), what="the subscription to be withdrawn")

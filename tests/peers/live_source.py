@@ -22,14 +22,14 @@ class Listener:
         self.messages: list[SourceMessage] = []
         self.rejections: list[Rejection] = []
         self.absence = Absence()
-        self.turn()
+        self.step()
 
     @property
     def rejected(self) -> int:
         """For how many messages the rejections stand."""
         return sum(each.count for each in self.rejections)
 
-    def turn(self) -> None:
+    def step(self) -> None:
         """Take what it yields next, which is nothing after a quarter of a second at the latest."""
         event = next(self._events)
         if isinstance(event, SourceMessage):
@@ -39,16 +39,16 @@ class Listener:
         elif event is not None:
             self.rejections.append(event)
 
-    def turn_until(self, condition: Callable[[], object], *, what: str) -> None:
+    def step_until(self, condition: Callable[[], object], *, what: str) -> None:
         """Take what it yields until a condition holds."""
         end = time.monotonic() + DEADLINE
         while not condition():
             assert time.monotonic() < end, f"waited {DEADLINE} s in vain for {what}"
-            self.turn()
+            self.step()
 
     def receive(self, count: int = 1) -> list[SourceMessage]:
         """Wait for `count` messages, and return them."""
-        self.turn_until(lambda: len(self.messages) >= count, what=f"{count} messages")
+        self.step_until(lambda: len(self.messages) >= count, what=f"{count} messages")
         received, self.messages = self.messages[:count], self.messages[count:]
         return received
 
@@ -59,7 +59,7 @@ class Listener:
         self._events.close()
 
 
-def status_of_source(bus: nedbus.Bus) -> nedbus.health.SourceStatus:
+def source_status(bus: nedbus.Bus) -> nedbus.health.SourceStatus:
     """Return the status of the service's only source, or an empty one before there is one."""
     services = bus.services()
     return services[0].sources[0] if services else nedbus.health.SourceStatus()

@@ -16,14 +16,14 @@ def read_families(text: str) -> dict[str, Metric]:
     return {each.name: each for each in text_string_to_metric_families(text)}
 
 
-class Pages:
+class HttpClient:
     """A server on a port of loopback."""
 
     def __init__(self, port: int) -> None:
         self.port = port
         self.where = f"127.0.0.1:{port}"
 
-    def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
+    def request(self, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
         """Return the status and the content of an answer; (0, "") if there is none."""
         with closing(http.client.HTTPConnection(self.where, timeout=DEADLINE)) as connection:
             try:
@@ -35,7 +35,7 @@ class Pages:
 
     def families(self) -> dict[str, Metric]:
         """Return the metrics by name; {} before there are any."""
-        status, text = self.ask("/metrics")
+        status, text = self.request("/metrics")
         return read_families(text) if status == 200 else {}
 
     def values(self, name: str, **labels: str) -> list[float]:

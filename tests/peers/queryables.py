@@ -13,7 +13,7 @@ from tests.waits import DEADLINE
 
 
 @contextmanager
-def answering(session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]) -> Iterator[None]:
+def answer_queries(session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]) -> Iterator[None]:
     """Let a peer answer what is asked for on these keys, which its router knows from the beginning."""
     queryable = session.declare_queryable(key_expr, zenoh.handlers.Callback(reply, indirect=False))
     alive_keys(session, "nedbus/*/@alive/*/**", timeout=DEADLINE)  # who answers has noted what was declared before

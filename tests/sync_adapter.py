@@ -13,7 +13,7 @@ import nedbus
 _TWINS = (nedbus.AsyncBus, nedbus.AsyncPublisher, nedbus.AsyncSubscription)
 
 
-class Blocking:
+class SyncAdapter:
     """A twin of asyncio's: whatever is awaited there is waited for here, under the same names."""
 
     def __init__(self, runner: asyncio.Runner, twin: Any) -> None:
@@ -46,10 +46,10 @@ class Blocking:
         result = self._runner.run(call())
         if result is self._twin or not isinstance(result, _TWINS):
             return result
-        twin = Blocking(self._runner, result)
+        twin = SyncAdapter(self._runner, result)
         return twin.__enter__() if isinstance(result, nedbus.AsyncSubscription) else twin
 
 
-def blocking(runner: asyncio.Runner, bus: nedbus.AsyncBus) -> nedbus.Bus:
+def sync_adapter(runner: asyncio.Runner, bus: nedbus.AsyncBus) -> nedbus.Bus:
     """Return an AsyncBus with the face of a Bus."""
-    return cast("nedbus.Bus", Blocking(runner, bus))
+    return cast("nedbus.Bus", SyncAdapter(runner, bus))
