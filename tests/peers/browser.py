@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Error, Page, sync_playwright
 
 from tests.waits import wait_for
 
-PATIENCE: Final = 60.0  # s: a page takes its time where other programs use the processor
+PAGE_TIMEOUT: Final = 60.0  # s: a page takes its time where other programs use the processor
 _NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
 VEHICLE: Final = ".row[data-do=vehicle]"
 """The rows of the list."""
@@ -145,12 +145,12 @@ class Tab:
     def __init__(self, page: Page) -> None:
         self.page = page
         self.requested: list[str] = []
-        self.complaints: list[str] = []
-        page.set_default_timeout(PATIENCE * 1e3)
+        self.console_errors: list[str] = []
+        page.set_default_timeout(PAGE_TIMEOUT * 1e3)
         page.on("request", lambda request: self.requested.append(request.url))
         page.on("websocket", lambda socket: self.requested.append(socket.url))
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: self.console_errors.append(str(error)))
+        page.on("console", lambda said: self.console_errors.append(said.text) if said.type == "error" else None)
 
     def open(self, url: str) -> None:
         """Load the page, and wait for its first picture."""
@@ -193,7 +193,7 @@ class Tab:
         return {row["name"]: row for row in self.rows("shape")}
 
     @property
-    def asked(self) -> dict[str, str]:
+    def query(self) -> dict[str, str]:
         """Return the query string of the page's address."""
         return dict(parse_qsl(urlsplit(self.url).query))
 
@@ -210,7 +210,7 @@ class Tab:
         """Return the elements that a selector matches, of parts of the page, table cells and spans."""
         return [Cell(*each) for each in self.page.evaluate(_CELLS, selector)]
 
-    def misplaced(self) -> list[str]:
+    def layout_problems(self) -> list[str]:
         """Return what is wrong with the places of all parts: empty, beyond the page, or on each other."""
         found: list[str] = self.page.evaluate(_LAYOUT, list(PARTS))
         return found
@@ -234,14 +234,14 @@ class Tab:
         return any(each.is_visible() for each in self.page.get_by_text(text).all())
 
     def wait_for_text(self, text: str) -> None:
-        wait_for(lambda: self.shows(text), what=f"the page to say {text!r}", seconds=PATIENCE)
+        wait_for(lambda: self.shows(text), what=f"the page to say {text!r}", seconds=PAGE_TIMEOUT)
 
 
 @contextmanager
-def open_tabs(browser: Browser, *, may_complain: bool = False) -> Iterator[Any]:
+def open_tabs(browser: Browser, *, allow_console_errors: bool = False) -> Iterator[Any]:
     """Give a function that opens tabs; at the end no request has left this host, and no console has an error.
 
-    `may_complain`: a server that is away is an error in the console of every browser.
+    `allow_console_errors`: a server that is away is an error in the console of every browser.
     """
     tabs: list[Tab] = []
     contexts = []
@@ -257,7 +257,7 @@ def open_tabs(browser: Browser, *, may_complain: bool = False) -> Iterator[Any]:
         for tab in tabs:
             hosts = {urlsplit(url).hostname for url in tab.requested if not url.startswith(("data:", "blob:"))}
             assert hosts <= {"127.0.0.1"}
-            assert may_complain or not tab.complaints, tab.complaints
+            assert allow_console_errors or not tab.console_errors, tab.console_errors
     finally:
         for context in contexts:
             context.close()

@@ -169,7 +169,7 @@ class _Stream:
     """
 
     ids: tuple[int, int]
-    is_heard: bool = True
+    is_on_link: bool = True
     sequence: int = 0
     expected: int | None = None
     pending: deque[Message] = field(default_factory=deque)
@@ -200,7 +200,7 @@ class Px4LogStream:
     `round_trip`: from a message to its acknowledgement, at least [s]; in real time that of the recordings.
     `refusal`: MAV_RESULT of every START. `answers`: False without a logger: no COMMAND_ACK at all.
     `unsent`: number of STARTs that are accepted without data.
-    `owner`: ids of a client that has the stream at first; `is_owner_heard`: it has it on this link.
+    `owner`: ids of a client that has the stream at first; `is_owner_on_link`: it has it on this link.
     `events`: at times of the recording [s]. `on_send`: called with each frame.
     `waits`: the recording is held before its own START until one comes.
 
@@ -225,7 +225,7 @@ class Px4LogStream:
         answers: bool = True,
         unsent: int = 0,
         owner: tuple[int, int] | None = None,
-        is_owner_heard: bool = False,
+        is_owner_on_link: bool = False,
         events: Mapping[float, Event] | None = None,
         waits: bool = True,
         deadline: float = 100.0,
@@ -251,7 +251,7 @@ class Px4LogStream:
         self._is_full, self._next_look = False, 0
         self._heartbeat = next(each for _, each in recording.entries if isinstance(each, bytes) and is_heartbeat(each))
         self._rewind()
-        self._stream: _Stream | None = _Stream(owner, is_owner_heard, sequence=5000) if owner else None
+        self._stream: _Stream | None = _Stream(owner, is_owner_on_link, sequence=5000) if owner else None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
@@ -271,7 +271,7 @@ class Px4LogStream:
         if self._failure:
             raise self._failure
 
-    def cause(self, event: Event) -> None:
+    def trigger(self, event: Event) -> None:
         """Let this happen now."""
         self._caused.append(event)
 
@@ -377,7 +377,7 @@ class Px4LogStream:
                 return
             self._answer(STOP, dialect.MAV_RESULT_IN_PROGRESS, request.ids)
             self._stop_from = request.ids
-            if self._stream.is_heard:
+            if self._stream.is_on_link:
                 self._append_tail(self._stream)
             else:
                 self._busy_until = now + _TAIL
@@ -461,7 +461,7 @@ class Px4LogStream:
         else:
             stream.sequence += (message.sequence - stream.expected) % 2**16  # lost before it was recorded
         stream.expected = message.sequence + 1
-        if not stream.is_heard:
+        if not stream.is_on_link:
             stream.sequence += 1
         elif message.acked:
             stream.append(message)

@@ -18,7 +18,7 @@ from nedbus.web import Where
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP, message
 from tests.nedbus.web.page import flying, serving_live, write_flight
-from tests.peers.browser import PATIENCE, VEHICLE, Tab, browser, open_tabs
+from tests.peers.browser import PAGE_TIMEOUT, VEHICLE, Tab, browser, open_tabs
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
 from tests.waits import repeating, wait_for, wait_for_matching
@@ -76,7 +76,7 @@ def fly(bus: nedbus.Bus) -> Iterator[Fly]:
 
 
 def until(condition: Callable[[], object], what: str) -> None:
-    wait_for(condition, what=what, seconds=PATIENCE)
+    wait_for(condition, what=what, seconds=PAGE_TIMEOUT)
 
 
 def until_states(page: Tab, **states: str) -> None:
@@ -102,7 +102,7 @@ def test_simulated_flight_fills_the_page(url: str, tab: Open, run_nedbus: Start,
     until(lambda: "1 ok" in page.part("head"), "it to be well")
     assert page.page.title() == "nedbus"
     until(lambda: page.chosen == ["wing"], "the vehicle")
-    assert page.asked == {}
+    assert page.query == {}
     assert page.marks["wing"]["shape"] == "circle"
     until(lambda: len(points(page.source("valid0"), "valid0")) > 10, "the track")
     until(lambda: len(page.source("speed").get("time", ())) > 10, "the plots")
@@ -166,7 +166,7 @@ def test_page_fits_every_screen(url: str, tab: Open, theme: str) -> None:
     page.page.locator("[data-do=streams]").click()
     for width, height in SIZES:
         page.page.set_viewport_size({"width": width, "height": height})
-        wait_for_none(page.misplaced, f"{width}x{height}, {theme}")
+        wait_for_none(page.layout_problems, f"{width}x{height}, {theme}")
         wait_for_none(lambda: on_each_other(page), f"labels at {width}x{height}, {theme}")
         assert "uav-7" in [label[0] for label in page.labels()]
     texts = page.contrasts("head", "list", "why", "nums", "tool", "more")
@@ -209,7 +209,7 @@ def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
         return not last
 
     try:
-        wait_for(are_none, what=what, seconds=PATIENCE)
+        wait_for(are_none, what=what, seconds=PAGE_TIMEOUT)
     except AssertionError:
         pytest.fail(f"{what}: {'; '.join(last)}")
 
@@ -293,15 +293,15 @@ def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, zenoh_sess
     until(lambda: " to " in first.part("why"), "the end of it")
     first.page.keyboard.press("p")
     first.page.get_by_text("back to now").wait_for()
-    until(lambda: set(first.asked) == {"vehicle", "time"}, "the address")
+    until(lambda: set(first.query) == {"vehicle", "time"}, "the address")
     third = tab(width=1280, height=800)
     third.open(first.url)
     third.page.get_by_text("back to now").wait_for()
-    until(lambda: (third.asked, third.chosen) == (first.asked, ["b"]), "the same moment")
+    until(lambda: (third.query, third.chosen) == (first.query, ["b"]), "the same moment")
     third.page.close()
     first.page.get_by_text("back to now").click()
-    until(lambda: first.asked == {"vehicle": "b"}, "the present")
-    until(lambda: second.asked == {"vehicle": "a"}, "the other page to be as it was")
+    until(lambda: first.query == {"vehicle": "b"}, "the present")
+    until(lambda: second.query == {"vehicle": "a"}, "the other page to be as it was")
     heard: set[str] = set()
     watcher = zenoh_session.declare_subscriber("**", lambda sample: heard.add(str(sample.key_expr)))
     assert second.page.evaluate(
@@ -330,7 +330,7 @@ def test_page_outlives_its_server(web: Web, browser: Browser, fly: Fly, endpoint
     fly("wing")
     port = free_port()
     process = web(port, "-c", endpoint)
-    with open_tabs(browser, may_complain=True) as make:
+    with open_tabs(browser, allow_console_errors=True) as make:
         page = make()
         page.open(f"http://127.0.0.1:{port}")
         until_states(page, wing="ok")
@@ -339,7 +339,7 @@ def test_page_outlives_its_server(web: Web, browser: Browser, fly: Fly, endpoint
         web(port, "-c", endpoint)
         until(lambda: not page.shows("nedbus web has not responded since"), "the page to load again")
         until_states(page, wing="ok")
-        assert all("ERR_CONNECTION" in said or "WebSocket" in said or "bokeh" in said for said in page.complaints)
+        assert all("ERR_CONNECTION" in said or "WebSocket" in said or "bokeh" in said for said in page.console_errors)
 
 
 # A recording
@@ -361,7 +361,7 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
     page.page.get_by_text("pause", exact=True).click()
     page.page.get_by_text("play", exact=True).wait_for()
     until(lambda: len(page.marks) == 1, "the vehicle")
-    wait_for_none(page.misplaced, "the layout")
+    wait_for_none(page.layout_problems, "the layout")
 
     def jump(share: float) -> None:
         # It is deaf for 0.3 s after each click.
@@ -382,13 +382,13 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
     page.page.locator(".strip [data-do=event]").click()
     until(lambda: time() == pytest.approx(60, abs=0.1), "the moment of the event")
     until_states(page, wing="xy not valid")
-    until(lambda: "time" in page.asked, "the address")
+    until(lambda: "time" in page.query, "the address")
     page.page.get_by_text("flight.mcap").click()  # so that keys are for the page, not for a button
     for key, seconds in (("ArrowLeft", 59), ("Shift+ArrowLeft", 49), ("ArrowRight", 50), ("n", 60)):
         page.page.keyboard.press(key)
         until(lambda seconds=seconds: time() == pytest.approx(seconds, abs=0.1), key)  # type: ignore[misc]  # bound here
     page.page.locator("[data-do='focus:follow']").press("Enter")
-    until(lambda: page.asked.get("view") == "follow", "a button to be pressed by a key")
+    until(lambda: page.query.get("view") == "follow", "a button to be pressed by a key")
     other = tab(width=1280, height=800)
     other.open(page.url)
     until(lambda: other.states == {"wing": "xy not valid"}, "the same moment, from which on it is played")
