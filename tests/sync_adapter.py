@@ -1,4 +1,4 @@
-"""The blocking face of the asyncio client, so that one test proves both."""
+"""The asyncio client behind the interface of the blocking client, so that one test covers both."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from typing import Any, Self, cast
 
 import nedbus
 
-_TWINS = (nedbus.AsyncBus, nedbus.AsyncPublisher, nedbus.AsyncSubscription)
+_WRAPPED = (nedbus.AsyncBus, nedbus.AsyncPublisher, nedbus.AsyncSubscription)
 
 
 class SyncAdapter:
-    """A twin of asyncio's: whatever is awaited there is waited for here, under the same names."""
+    """Wrap an asyncio object: the same methods, run to completion by the runner."""
 
-    def __init__(self, runner: asyncio.Runner, twin: Any) -> None:
+    def __init__(self, runner: asyncio.Runner, wrapped: Any) -> None:
         self._runner = runner
-        self._twin = twin
+        self._wrapped = wrapped
 
     def __getattr__(self, name: str) -> Any:
-        value = getattr(self._twin, name)
+        value = getattr(self._wrapped, name)
         return partial(self._call, value) if callable(value) else value
 
     def __enter__(self) -> Self:
-        self._call(self._twin.__aenter__)
+        self._call(self._wrapped.__aenter__)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._call(self._twin.__aexit__, *exc)
+        self._call(self._wrapped.__aexit__, *exc)
 
     def __iter__(self) -> Iterator[Any]:
         try:
             while True:
-                yield self._call(self._twin.__anext__)
+                yield self._call(self._wrapped.__anext__)
         except StopAsyncIteration:
             return
 
@@ -44,12 +44,12 @@ class SyncAdapter:
             return await result if inspect.isawaitable(result) else result
 
         result = self._runner.run(call())
-        if result is self._twin or not isinstance(result, _TWINS):
+        if result is self._wrapped or not isinstance(result, _WRAPPED):
             return result
-        twin = SyncAdapter(self._runner, result)
-        return twin.__enter__() if isinstance(result, nedbus.AsyncSubscription) else twin
+        adapter = SyncAdapter(self._runner, result)
+        return adapter.__enter__() if isinstance(result, nedbus.AsyncSubscription) else adapter
 
 
 def sync_adapter(runner: asyncio.Runner, bus: nedbus.AsyncBus) -> nedbus.Bus:
-    """Return an AsyncBus with the face of a Bus."""
+    """Return an AsyncBus with the interface of a Bus."""
     return cast("nedbus.Bus", SyncAdapter(runner, bus))

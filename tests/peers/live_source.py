@@ -1,4 +1,4 @@
-"""Live sources in a test: what they yield without a service, and what a service tells of its only one."""
+"""Live sources in a test: their output without a service, and the status of a service's only source."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.waits import DEADLINE
 
 
 class Listener:
-    """A live source that listens: the messages that were not received yet, all rejections, and what is absent now."""
+    """A listening live source: pending messages, all rejections, and the topics it lacks now."""
 
     def __init__(self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None) -> None:
         source = parse_source(text).open_source(vehicle="1", routers=routers)
@@ -26,11 +26,11 @@ class Listener:
 
     @property
     def rejected(self) -> int:
-        """For how many messages the rejections stand."""
+        """Number of rejected messages."""
         return sum(each.count for each in self.rejections)
 
     def step(self) -> None:
-        """Take what it yields next, which is nothing after a quarter of a second at the latest."""
+        """Process the next event of the source; it yields None at least every 0.25 s."""
         event = next(self._events)
         if isinstance(event, SourceMessage):
             self.messages.append(event)
@@ -40,14 +40,14 @@ class Listener:
             self.rejections.append(event)
 
     def step_until(self, condition: Callable[[], object], *, what: str) -> None:
-        """Take what it yields until a condition holds."""
+        """Process events until a condition holds."""
         end = time.monotonic() + DEADLINE
         while not condition():
             assert time.monotonic() < end, f"waited {DEADLINE} s in vain for {what}"
             self.step()
 
     def receive(self, count: int = 1) -> list[SourceMessage]:
-        """Wait for `count` messages, and return them."""
+        """Wait for `count` messages and return them."""
         self.step_until(lambda: len(self.messages) >= count, what=f"{count} messages")
         received, self.messages = self.messages[:count], self.messages[count:]
         return received
@@ -60,6 +60,6 @@ class Listener:
 
 
 def source_status(bus: nedbus.Bus) -> nedbus.health.SourceStatus:
-    """Return the status of the service's only source, or an empty one before there is one."""
+    """Return the status of the service's only source, or an empty status before the service has started."""
     services = bus.services()
     return services[0].sources[0] if services else nedbus.health.SourceStatus()

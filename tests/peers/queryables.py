@@ -1,4 +1,4 @@
-"""Peers of plain Zenoh that answer questions, honest or not."""
+"""Plain Zenoh queryables, correct or malicious."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from tests.waits import DEADLINE
 
 @contextmanager
 def answer_queries(session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]) -> Iterator[None]:
-    """Let a peer answer what is asked for on these keys, which its router knows from the beginning."""
+    """Declare a queryable for `key_expr` that the router has registered before the block begins."""
     queryable = session.declare_queryable(key_expr, zenoh.handlers.Callback(reply, indirect=False))
-    alive_keys(session, "nedbus/*/@alive/*/**", timeout=DEADLINE)  # who answers has noted what was declared before
+    alive_keys(
+        session, "nedbus/*/@alive/*/**", timeout=DEADLINE
+    )  # the router answers after it has registered the queryable
     yield
     queryable.undeclare()
 
 
-def reply_with(answers: Mapping[str, bytes], **options: Any) -> Callable[[zenoh.Query], None]:
-    """Answer each question with all of these, by key."""
+def reply_with(payloads: Mapping[str, bytes], **options: Any) -> Callable[[zenoh.Query], None]:
+    """Return a callback that answers each query with all of these payloads, by key."""
 
     def reply(query: zenoh.Query) -> None:
         with query:
-            for key, payload in answers.items():
+            for key, payload in payloads.items():
                 query.reply(key, payload, **options)
 
     return reply
