@@ -313,7 +313,7 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
     begin = rf"1: not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
     assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", shown.out)
-    assert "to publish them: PX4's dds_topics.yaml" in shown.out
+    assert "to publish them, add them to PX4's dds_topics.yaml" in shown.out
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
     assert set(shown.out.splitlines()) <= set(since_boot.out.splitlines())
     refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")

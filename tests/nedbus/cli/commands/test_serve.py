@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from nedbus.cli.output.progress import what_to_type
+from nedbus.cli.output.progress import suggested_commands
 from nedbus.transport import DEFAULT_ENDPOINT
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_port
@@ -14,11 +14,11 @@ from tests.waits import wait_for
 
 def test_hint_needs_no_flag_that_it_lacks() -> None:
     """Commands to paste need no certificate; where one is needed, that is said in one line."""
-    assert " list  published" in what_to_type([DEFAULT_ENDPOINT])
-    assert " hz -c tcp/b:1 " in what_to_type(["tls/a:1", "tcp/b:1"])
+    assert " list  published" in suggested_commands([DEFAULT_ENDPOINT])
+    assert " hz -c tcp/b:1 " in suggested_commands(["tls/a:1", "tcp/b:1"])
     for endpoint in ("tls/a:1", "quic/a:1"):
         hint = f"Readers at {endpoint} need their own certificate, see docs/security.md"
-        assert what_to_type([endpoint]) == hint
+        assert suggested_commands([endpoint]) == hint
 
 
 def wait_for_message(endpoint: str) -> None:
@@ -34,4 +34,4 @@ def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
     (here,) = re.findall(r"nedbus list -c (\S+)", service.err)
     assert here == f"tcp/127.0.0.1:{port}"
     wait_for_message(here)
-    assert " list  published" in what_to_type(["tcp/0.0.0.0:7447"])
+    assert " list  published" in suggested_commands(["tcp/0.0.0.0:7447"])

@@ -287,7 +287,7 @@ def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
     if command == "hz":
         wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
     with closing(open_router(listen=(where,))):
-        wait_for(lambda: f"the link to {where} is back" in follower.err, what="the link")
+        wait_for(lambda: f"the link to {where} is up again" in follower.err, what="the link")
         lines = follower.out.count("\n")
         wait_for(lambda: follower.out.count("\n") > lines + 3, what="more data")
 
@@ -502,7 +502,7 @@ run.run_until_stopped(work, closing=closing)
 @pytest.mark.parametrize(
     ("limit", "reason"),
     [
-        ("_END_TIMEOUT", "still at work 0.1 s after the signal"),
+        ("_END_TIMEOUT", "still running 0.1 s after the signal"),
         ("_CLOSE_TIMEOUT", "links not closed within 0.1 s"),
     ],
 )
