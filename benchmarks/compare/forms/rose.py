@@ -31,7 +31,7 @@ def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
 
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    """Take messages by callback, because its recv() keeps only the newest."""
+    """Receive messages by callback, because recv() keeps only the newest."""
     done = threading.Event()
 
     def take(message: Message, _key: str) -> None:

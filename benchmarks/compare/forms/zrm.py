@@ -16,14 +16,14 @@ PACKAGES = ["zrm==3.1.2"]
 
 
 _PROTO = descriptor_pb2.FieldDescriptorProto
-PROTOBUF_TYPES = {  # the smallest that hold PX4's
+PROTOBUF_TYPES = {  # smallest types that can hold PX4's
     "bool": _PROTO.TYPE_BOOL, "uint64": _PROTO.TYPE_UINT64, "uint8": _PROTO.TYPE_UINT32,
     "float32": _PROTO.TYPE_FLOAT, "float64": _PROTO.TYPE_DOUBLE,
 }  # fmt: skip
 
 
 def message_class() -> type[Message]:
-    """Make what protoc would, from a description of the file."""
+    """Build the class that protoc would generate, from a file descriptor."""
     file = descriptor_pb2.FileDescriptorProto(name="bench/msgs/position.proto", package="bench", syntax="proto3")
     position = file.message_type.add(name="Position")
     for number, (name, type_name) in enumerate(TYPES.items(), start=1):
@@ -39,7 +39,7 @@ Position = message_class()
 
 
 def open_session(endpoint: str) -> zrm.Session:
-    """Open a client of this router whose publishers wait instead of dropping."""
+    """Open a client whose publishers wait instead of dropping messages."""
     waits = [{"key_exprs": [KEY], "config": {"congestion_control": "block"}}]
     return zrm.open(client_config(endpoint, {"qos/publication": waits}))
 
