@@ -1,6 +1,6 @@
-"""Public calls as scripts make them: mypy accepts these, and rejects those that have an ignore.
+"""Public calls of scripts: mypy must accept them, and reject those with an ignore.
 
-An ignore that is not needed is an error of mypy's, so a mistake that slips through fails `make check`.
+mypy reports an unused ignore as an error, so a wrong call that it accepts fails `make check`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from nedbus_msgs.model.px4_types import Float32, field
 
 
 def subscribe(bus: nedbus.Bus) -> None:
-    """The form of the iteration decides what `message` is."""
+    """The kind of iteration determines the type of `message`."""
     with bus.subscribe(vehicle="7", mode="every") as subscription:
         for sample in subscription:
             assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
@@ -37,14 +37,14 @@ def subscribe(bus: nedbus.Bus) -> None:
 
 
 class WheelEncoders(nedbus.Message):
-    """A message of a script."""
+    """A message defined by a script."""
 
     TOPICS = (nedbus.Topic("wheel_encoders", 50.0, "a rover"),)
     wheel_speed: Float32 = field("Speed of the wheels [rad/s]")
 
 
 def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
-    """The class gives the fields of a message; a name of a topic gives any message."""
+    """A class determines the fields of the messages; a topic name yields any message."""
     for sample in bus.subscribe(nedbus.VehicleAttitude):
         assert_type(sample, nedbus.Sample[nedbus.VehicleAttitude])
         assert_type(sample.message.q, tuple[float, float, float, float])
@@ -63,7 +63,7 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
 
 
 def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
-    """A function that takes a message takes a row as well."""
+    """Functions that accept a message accept a row as well."""
     assert_type(nedbus.frames.to_global(sample.message), nedbus.frames.GlobalPosition | None)
     assert_type(nedbus.frames.to_global(row.message), nedbus.frames.GlobalPosition | None)
     nedbus.frames.to_global(row.message).latitude  # type: ignore[union-attr] # None without a global origin
@@ -78,7 +78,7 @@ def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) 
 
 
 def publish(bus: nedbus.Bus) -> None:
-    """A message, its fields by name, the values of a row, or an array."""
+    """Publish a message, fields by name, or an array."""
     publisher = bus.publisher("external_ins_local_position", vehicle="mine", source="ins")
     publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x=2.0))
     publisher.publish({"timestamp": 1, "x": 2.0})
@@ -89,7 +89,7 @@ def publish(bus: nedbus.Bus) -> None:
 
 
 async def read_and_publish() -> None:
-    """The twin for asyncio: what waits is awaited."""
+    """The asyncio client has the same methods as coroutines."""
     tls = nedbus.Tls("ca.crt", "reader.crt", "reader.key")
     async with nedbus.connect_async("tls/10.0.0.1:7447", tls=tls) as bus:
         async for sample in bus.subscribe():
@@ -119,7 +119,7 @@ async def read_and_publish() -> None:
 
 
 def read() -> None:
-    """An array, or a frame of the library that is asked for."""
+    """Files are read as arrays, or as data frames of the requested library."""
     assert_type(nedbus.read("flight.ulg", vehicle=7), nedbus.MessageArray)
     assert_type(nedbus.read("flight.ulg", dataframe="pandas"), pd.DataFrame)
     assert_type(nedbus.read("flight.ulg", ["home_position"]), dict[str, nedbus.MessageArray])
