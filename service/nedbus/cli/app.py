@@ -35,8 +35,8 @@ app.add_typer(pki, name="pki")
 
 
 @command
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(requested: bool) -> None:
+    if requested:
         write(f"nedbus {__version__}")
         raise typer.Exit
 

@@ -40,7 +40,7 @@ TopicArgument = Annotated[
 ]
 FilesArgument = Annotated[
     list[Path] | None,
-    typer.Argument(metavar="[FILE]...", help="Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"),
+    typer.Argument(metavar="FILE", help="Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"),
 ]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]
@@ -52,7 +52,6 @@ CsvOption = Annotated[bool, typer.Option("--csv", help="Write CSV with a header 
 WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait until the router is reachable")]
 CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this number of samples")]
 DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")]
-
 
 ALL: Final = Selection()  # default selection of commands that show all topics
 POSITIONS: Final = Selection(DEFAULT_TOPIC)  # default selection of commands that show positions

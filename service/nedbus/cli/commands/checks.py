@@ -209,7 +209,7 @@ def check(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="CONFIG...",
+            metavar="CONFIG",
             help="Settings (.toml) or router files (.json5); default: the settings of serve",
             show_default=False,
         ),

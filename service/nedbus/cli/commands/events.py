@@ -182,8 +182,7 @@ def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str)
 
 
 _LIVE_ADVICE: Final = (
-    "to publish them, add them to PX4's dds_topics.yaml or pub.csv and use a source without topics=;"
-    " 'nedbus info' lists the topics"
+    "to publish them, add them to PX4's dds_topics.yaml or pub.csv, and to topics= of the source if it is set"
 )
 _ADVICE: Final = {
     ".ulg": "PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)",

@@ -102,7 +102,7 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
 @command
 def renew(
     folder: FolderArgument,
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Default: all expiring soon")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all expiring soon")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
     new_key: Annotated[bool, typer.Option("--new-key", help="Create new keys, too")] = False,
@@ -129,7 +129,7 @@ def renew(
 @command
 def rules(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Router file, such as config/router-secure.json5")],
-    vehicles: Annotated[list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Vehicle ids")] = None,
+    vehicles: Annotated[list[str] | None, typer.Argument(metavar="VEHICLE", help="Vehicle ids")] = None,
     *,
     source: Annotated[Path | None, typer.Option("--from", help="File of ids, stdin (-), or PKI folder")] = None,
     add: Annotated[bool, typer.Option("--add", help="Add these vehicles to the file's")] = False,

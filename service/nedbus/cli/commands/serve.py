@@ -31,7 +31,8 @@ _SOURCES = f"Source to publish: {_KINDS}, with ?OPTION=VALUE&...; repeatable"
 
 _LISTEN = f"Endpoint to listen on; repeatable (default: {DEFAULT_ENDPOINT})"
 ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
-JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join")]
+_JOIN = "Router to join; repeatable"
+JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_JOIN)]
 
 
 @command

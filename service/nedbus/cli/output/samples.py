@@ -18,7 +18,6 @@ from .table import COLUMN_GAP, fit_columns, terminal_width
 _TIMES: Final = ("timestamp", "timestamp_sample")
 _DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
-
 _MIN_PAGE: Final = 10  # minimum number of lines between two headings
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
 _ADDRESS, _POSITION, _STATE = "VEHICLE/TOPIC", f"{'X m':>7} {'Y m':>7} {'Z m':>7}", "STATE"
