@@ -245,7 +245,7 @@ def test_payload_indices_are_correct_in_each_language() -> None:
 
 @pytest.mark.process
 @pytest.mark.parametrize("block", SHELLS, ids=str)
-def test_shell_is_valid(here: Path, block: Block) -> None:
+def test_shell_snippet_is_valid(here: Path, block: Block) -> None:
     """Every shell snippet parses, its nedbus commands have these options, and its sources and files exist."""
     subprocess.run(["bash", "-n", "-c", block.text], check=True, timeout=30)
     for command in nedbus_commands(block):
@@ -262,7 +262,7 @@ def test_shell_is_valid(here: Path, block: Block) -> None:
 
 
 @pytest.mark.parametrize("block", [each for each in BLOCKS if each.language in DATA], ids=str)
-def test_other_text_is_valid(block: Block, tmp_path: Path) -> None:
+def test_data_snippet_is_valid(block: Block, tmp_path: Path) -> None:
     """Settings pass `nedbus check`; JSON, Python and drop-ins of units parse."""
     if block.language == "toml":
         (tmp_path / "nedbus.toml").write_text(block.text)

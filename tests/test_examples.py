@@ -11,12 +11,12 @@ import pytest
 import nedbus
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import convert_replay
-from tests.nedbus.cli.commands.test_query import flying
+from tests.nedbus.cli.commands.test_query import simulation
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
 from tests.waits import wait_for
 
-__all__ = ["flying"]  # a fixture
+__all__ = ["simulation"]  # a fixture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTS = {
@@ -44,9 +44,9 @@ def test_all_examples_are_tested() -> None:
 
 
 @pytest.mark.parametrize("name", PRINTS)
-def test_example_runs(start: Start, flying: str, tmp_path: Path, name: str) -> None:
+def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) -> None:
     """Each example prints its result, and Ctrl-C ends it without an error message."""
-    process = run_example(start, name, flying, tmp_path)
+    process = run_example(start, name, simulation, tmp_path)
     wait_for(
         lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}"
     )

@@ -45,7 +45,7 @@ def test_modules_state_their_responsibility() -> None:
 
 
 @pytest.mark.parametrize("folder", sorted({path.parent for path in ALL}), ids=lambda path: str(path.relative_to(ROOT)))
-def test_folder_is_small(folder: Path) -> None:
+def test_folder_has_at_most_14_files(folder: Path) -> None:
     """A folder has at most 14 Python files."""
     assert len([*folder.glob("*.py")]) <= MAX_FILES
 

@@ -35,7 +35,7 @@ def sent(sample: nedbus.Sample) -> int:
     return sample.sent
 
 
-def test_router_is_killed_and_restarted(make_stack: StartStack, record: Record) -> None:
+def test_router_restart_is_recovered(make_stack: StartStack, record: Record) -> None:
     """Both sides reconnect; mode `every` loses nothing, `latest` continues with the newest, and counts are exact."""
     stack = make_stack("router")
     stack.up()
@@ -72,7 +72,7 @@ def test_router_is_killed_and_restarted(make_stack: StartStack, record: Record) 
         assert counts.lost == sum(sample.lost for sample in latest.samples)
 
 
-def test_link_between_hosts_is_interrupted(make_stack: StartStack, record: Record) -> None:
+def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Record) -> None:
     """An outage of 10 s loses nothing at 100 Hz; at 400 Hz the cache is too small, and the loss is counted exactly."""
     stack = make_stack("link", "docker-compose.hosts.yml", NEDBUS_SOURCE="sim:,sim:?vehicle=2&speed=4")
     stack.up()

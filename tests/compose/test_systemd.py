@@ -203,7 +203,7 @@ def test_template_runs_several_services(machine: Machine) -> None:
         assert_receives(machine, vehicle, "--connect tcp/127.0.0.1:7448")
 
 
-def test_mavlink_over_udp(machine: Machine) -> None:
+def test_mavlink_over_udp_works_in_hardened_unit(machine: Machine) -> None:
     """The unit's permissions suffice for MAVLink over UDP; the service is ready before a message arrives."""
     configure(machine, 'source = ["mavlink:udpin:127.0.0.1:14540"]\n')
     machine.run("systemctl start nedbus")
@@ -212,7 +212,7 @@ def test_mavlink_over_udp(machine: Machine) -> None:
     assert_receives(machine, "7")
 
 
-def test_mavlink_over_serial_port(machine: Machine) -> None:
+def test_mavlink_over_serial_port_works_with_drop_in(machine: Machine) -> None:
     """With the documented drop-in the service reads a serial port, here a pseudo-terminal."""
     addition = (ROOT / "docs" / "systemd.md").read_text().split("```ini\n[Service]\n")[1].split("```")[0]
     configure(machine, 'source = ["mavlink:serial:/dev/ttyACM0"]\n')

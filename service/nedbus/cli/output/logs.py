@@ -24,7 +24,7 @@ PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
 _MAX_KINDS: Final = 1000  # nedbus itself has about 40
-_MAX_TRACEBACK: Final = 20_000  # characters, the last ones: they name the error
+_MAX_TRACEBACK: Final = 20_000  # characters; the end is kept, which names the error
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
 LogFormat = Literal["text", "json"]

@@ -15,7 +15,7 @@ from .streams import write
 COLUMN_GAP: Final = "  "
 _LAST_WIDTH: Final = len("disconnected: no link")  # optional columns are removed to make the last one this wide
 _MIN_LAST_WIDTH: Final = 16  # the first column is folded to make the last one this wide
-_MAX_ROWS: Final = 50  # of a live table
+_MAX_ROWS: Final = 50  # rows of a live table
 _UNLIMITED: Final = 10_000  # width if stdout is not a terminal
 
 Rows = Sequence[Sequence[str]]
@@ -90,7 +90,7 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
     from rich.text import Text
 
     def show(rows: Rows) -> None:
-        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # minus header and the line with the rest
+        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # minus header and the line "N more"
         text = to_table(head, rows, optional=optional, max_rows=most)
         live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 

@@ -26,14 +26,14 @@ from nedbus.transport import Session
 from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import open_replay
-from tests.nedbus.cli.output.test_terminal import flying as standing
+from tests.nedbus.cli.output.test_terminal import publishing
 from tests.peers.command_line import CommandResult, fork_command, run_command
 from tests.peers.processes import ForkedProcess, ForkServer, Start
 from tests.waits import DEADLINE, wait_for
 
-from .test_query import flying
+from .test_query import simulation
 
-__all__ = ["flying"]  # a fixture
+__all__ = ["simulation"]  # a fixture
 
 pytestmark = pytest.mark.process
 
@@ -98,16 +98,16 @@ def pause_echo(
 
 
 @pytest.mark.parametrize("arguments", [["--topic", VLP], [VLP], ["/" + VLP], ["1/" + VLP], []])
-def test_echo_prints_one_line_per_message(flying: str, arguments: list[str]) -> None:
+def test_echo_prints_one_line_per_message(simulation: str, arguments: list[str]) -> None:
     """The topic is an option or an argument, by default vehicle_local_position; --count limits the lines."""
-    lines = echo(flying, "--count", "5", *arguments).out.splitlines()
+    lines = echo(simulation, "--count", "5", *arguments).out.splitlines()
     assert len(lines) == 5
     assert all(line.startswith("1/vehicle_local_position ") and " ned " in line for line in lines)
 
 
-def test_echo_json_can_be_parsed_by_the_model(flying: str) -> None:
+def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
     """Each line is JSON that the model validates, "Infinity" included; the topic "*" selects all topics."""
-    rows = [json.loads(line) for line in echo(flying, "--json", "-n", "50", "*").out.splitlines()]
+    rows = [json.loads(line) for line in echo(simulation, "--json", "-n", "50", "*").out.splitlines()]
     has = {each.address.topic: each.fields.keys() for each in open_replay("sim:?duration=15&speed=max").messages}
     assert len(rows) == 50
     for row in rows:
@@ -119,28 +119,28 @@ def test_echo_json_can_be_parsed_by_the_model(flying: str) -> None:
     assert len({row["topic"] for row in rows}) > 1
 
 
-def test_echo_full_prints_every_field(flying: str) -> None:
+def test_echo_full_prints_every_field(simulation: str) -> None:
     """--full prints all 53 fields, one per line."""
-    blocks = echo(flying, "--full", "-n", "2", VLP).out.split("---\n")
+    blocks = echo(simulation, "--full", "-n", "2", VLP).out.split("---\n")
     assert len(blocks) == 3
     names = [line.split(":")[0].strip() for line in blocks[0].splitlines()[1:]]
     assert names == list(VehicleLocalPosition.model_fields)
 
 
-def test_interrupt_exits_with_130(run_nedbus: Start, flying: str) -> None:
+def test_interrupt_exits_with_130(run_nedbus: Start, simulation: str) -> None:
     """Ctrl-C ends `nedbus echo` at once, without a traceback."""
-    process = run_nedbus("echo", "-c", flying, coverage=False)
+    process = run_nedbus("echo", "-c", simulation, coverage=False)
     wait_for(lambda: process.out, what="a line")
     process.signal(signal.SIGINT)
     assert process.wait() == 130
     assert "Traceback" not in process.err
 
 
-def test_closed_pipe_exits_with_0(flying: str, fork_server: ForkServer) -> None:
+def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> None:
     """`nedbus echo | head` ends without an error message."""
     read_end, write_end = os.pipe()
     with Path("err").open("wb") as err, os.fdopen(read_end) as head:
-        process = fork_command(fork_server, "echo", "-c", flying, out=write_end, err=err.fileno())
+        process = fork_command(fork_server, "echo", "-c", simulation, out=write_end, err=err.fileno())
         os.close(write_end)
         assert all(head.readline().startswith(f"1/{VLP} ") for _ in range(3))
     assert process.wait(DEADLINE) == 0
@@ -203,9 +203,9 @@ def test_echo_every_prints_all_messages(run_nedbus: Start, endpoint: str) -> Non
     assert {later - earlier for earlier, later in pairwise(timestamps)} == {10_000}
 
 
-def test_echo_csv_of_two_vehicles(endpoint: str, bus: nedbus.Bus) -> None:
+def test_echo_csv_has_a_row_per_message(endpoint: str, bus: nedbus.Bus) -> None:
     """--csv writes a header line and one row per message of all vehicles; arrays have one column per element."""
-    with standing(bus, "1", "2"):
+    with publishing(bus, "1", "2"):
         lines = echo(endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "10").out.splitlines()
         head, row = csv.reader(echo(endpoint, "--csv", "--once").out.splitlines())
     assert len(head) == len(row) == 5 + len(VehicleLocalPosition.model_fields) + 2 + 1
@@ -221,7 +221,7 @@ def test_echo_csv_of_two_vehicles(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
-    """Every row of a position has its state, whatever fields are selected; stderr counts the messages left out."""
+    """Every row of a position has its state, whatever fields are selected; stderr counts the missing messages."""
     bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
     shown = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
     [row] = csv.DictReader(shown.out.splitlines())
@@ -229,10 +229,10 @@ def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bu
     assert shown.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
 
 
-def test_echo_field_selects_fields(flying: str) -> None:
+def test_echo_field_selects_fields(simulation: str) -> None:
     """--field selects fields in every format; --once exits after one message."""
     for form, text in (([], "  x "), (["--full"], "\n  x: "), (["--json"], '"message": {"x":')):
-        out = echo(flying, "--once", "--field", "x,z", *form).out
+        out = echo(simulation, "--once", "--field", "x,z", *form).out
         assert text in out
         assert "vx" not in out
         assert out.count("vehicle_local_position") == 1

@@ -86,7 +86,7 @@ def lines_of(shown: CommandResult) -> list[tuple[str, str, str]]:
     return [(match[1], match[2] or "", match[3]) for match in found if match]
 
 
-def test_events_of_a_file(log: Path) -> None:
+def test_events_of_a_file_have_evidence(log: Path) -> None:
     """One line per event with its evidence; stderr names the clock of the times."""
     shown = run_command("events", str(log))
     assert (shown.exit_code, shown.err) == (0, "times: seconds since boot, no message contains UTC\n")
@@ -106,7 +106,7 @@ def test_origin_selects_events(log: Path, origin: str, count: int) -> None:
     assert len(run_command("events", str(log), "--origin", origin).out.splitlines()) == count
 
 
-def test_events_as_json_and_csv(log: Path) -> None:
+def test_json_and_csv_events_have_every_field(log: Path) -> None:
     """Both formats have every field; JSON contains no NaN, and CSV has one cell each for evidence and numbers."""
 
     def refuse(constant: str) -> None:
@@ -141,7 +141,7 @@ def test_converted_log_has_the_same_events(log: Path, tmp_path: Path) -> None:
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.slow
 @pytest.mark.usefixtures("read_once")
-def test_events_of_a_real_flight() -> None:
+def test_real_flight_has_expected_events() -> None:
     """A log of PX4 1.17 and the MCAP converted from it have the same events, with causes."""
     assert run_command("convert", str(REAL), "flight.mcap", "--topics", "*").exit_code == 0
 
@@ -163,7 +163,7 @@ def test_events_of_a_real_flight() -> None:
     assert "missing topics" not in story
 
 
-def test_why_of_a_file(log: Path) -> None:
+def test_why_prints_verdict_and_faults(log: Path) -> None:
     """`why` prints the verdict; --all also each fault with the preceding events and the topics missing in the log."""
     shown = run_command("why", str(log))
     assert (shown.exit_code, shown.out, shown.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
@@ -179,7 +179,7 @@ def test_why_of_a_file(log: Path) -> None:
     assert story["lacking"][0] == "vehicle_gps_position"
 
 
-def test_why_at_a_time_without_utc(log: Path) -> None:
+def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
     """Without UTC in the log, --at takes seconds since boot or since the start of the recording."""
     for moment in ("10", "+9"):
         assert run_command("why", str(log), "--at", moment, "--all").out == WHY
@@ -194,7 +194,7 @@ def test_why_at_a_time_without_utc(log: Path) -> None:
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.usefixtures("read_once")
-def test_why_at_a_time_in_both_clocks() -> None:
+def test_why_at_accepts_utc_and_seconds() -> None:
     """--at with UTC, and with the same time since boot, print the same."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
     assert "GPS fix 3D to none, 10 satellites to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
@@ -202,7 +202,7 @@ def test_why_at_a_time_in_both_clocks() -> None:
         assert run_command("why", str(REAL), "--at", moment).out == by_utc
 
 
-def test_flight_without_faults(tmp_path: Path) -> None:
+def test_flight_without_faults_reports_its_duration(tmp_path: Path) -> None:
     """Without faults both commands report the duration of the flight."""
     log = str(write_flight(tmp_path / "good.ulg", fault=False))
     shown = run_command("events", log)
@@ -294,7 +294,9 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
     wait_for(has_ended, what="the end of the flights")
 
 
-def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path) -> None:
+def test_why_live_uses_service_history(
+    run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path
+) -> None:
     """`why` uses the history of a service for all or one vehicle; a vehicle of a script has no history."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
@@ -374,7 +376,9 @@ def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint
         assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in shown
 
 
-def test_events_live(run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
+def test_events_live_are_printed_as_they_happen(
+    run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
+) -> None:
     """Events of a script's vehicle are shown as they happen; stderr names conditions that were active before."""
     fields: dict[str, object] = VALID | {"z_valid": False}
     with bus.publisher(VLP, vehicle="7") as publisher:
@@ -399,7 +403,9 @@ def test_events_live(run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session,
     assert lines[0][1].startswith("BAD    xy not valid")
 
 
-def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
+def test_events_live_filter_by_vehicle_and_severity(
+    run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
+) -> None:
     """--vehicle hides other vehicles, and --severity hides less severe events."""
     fields: dict[str, object] = dict(VALID)
     with bus.publisher(VLP, vehicle="7") as seven, bus.publisher(VLP, vehicle="8") as eight:

@@ -104,7 +104,7 @@ def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, healt
         assert health("--vehicle", "a/b").exit_code == 2
 
 
-def test_report_is_json(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
     """--json writes the result, the reason and the ages of the newest messages, healthy or not."""
     with serving(endpoint, "sim:"):
         wait_for(lambda: bus.latest() and health().exit_code == 0, what="health")
@@ -116,7 +116,7 @@ def test_report_is_json(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
     assert json.loads(missed.out)["reason"].startswith("1 of 5 services answer")
 
 
-def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
     """--expect requires vehicles by id and --vehicles by number, on any host, including those of scripts."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
         wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
@@ -137,7 +137,7 @@ def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Health) -> No
         ]
 
 
-def test_valid_and_within_options(endpoint: str, tmp_path: Path, health: Health) -> None:
+def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
     """--valid checks the current flags, --within past events; stderr has a line per fault, --json has all."""
     writer = UlogWriter()
     writer.define([VLP])

@@ -32,13 +32,13 @@ COMMANDS += [f"pki {each.name or getattr(each.callback, '__name__', None)}" for 
 
 
 @pytest.fixture(scope="module")
-def flying(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def simulation(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Run a router and a service with a simulated vehicle, for tests that only read."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, "-s", "sim:")
     environment = {name: value for name, value in without_coverage().items() if not name.startswith("NEDBUS_")}
-    service = Process(command, tmp_path_factory.mktemp("flying"), environment, fork_server)
+    service = Process(command, tmp_path_factory.mktemp("simulation"), environment, fork_server)
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: len(bus.latest(ANY)) == 12, what="twelve streams")
     yield endpoint
@@ -56,9 +56,9 @@ def test_command_starts(run_nedbus: Start, command: str, *, fresh: bool) -> None
 
 
 @pytest.mark.process
-def test_list_shows_published_streams(flying: str) -> None:
+def test_list_shows_published_streams(simulation: str) -> None:
     """`list` prints a row per stream with the age and state of its last message."""
-    listed = run_command("list", "-c", flying)
+    listed = run_command("list", "-c", simulation)
     assert listed.exit_code == 0, listed.err
     head, *lines = listed.out.splitlines()
     assert head.split() == ["VEHICLE/TOPIC", "AGE", "STATE"]
@@ -71,12 +71,12 @@ def test_list_shows_published_streams(flying: str) -> None:
     ]
     assert len(lines) == 12
     assert all(line.endswith("ok") for line in lines)
-    rows = [json.loads(line) for line in run_command("list", "-c", flying, "--json").out.splitlines()]
+    rows = [json.loads(line) for line in run_command("list", "-c", simulation, "--json").out.splitlines()]
     assert [row["instance"] for row in rows if "local" in row["topic"]] == [0, 1, None, None, None]
     assert all(row["vehicle"] == "1" and row["age"] >= 0 for row in rows)
 
 
-def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
+def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
     """--vehicle lists one vehicle, also one without a message yet, and fails for one that is not published."""
     for vehicle, topic in (("1", VLP), ("1", f"{VLP}_groundtruth"), ("2", VLP)):
         bus.publisher(topic, vehicle=vehicle).publish(message(1))
@@ -112,14 +112,14 @@ def test_late_list_is_not_reported_as_empty(
     assert "is published" not in listed.err
 
 
-def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, flying: str) -> None:
+def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
     """`hz` prints rate, jitter, latency and loss per stream, as a table, JSON or CSV; positions have about 100 Hz."""
-    table, csv_form = (run_nedbus("hz", "-c", flying, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
+    table, csv_form = (run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
     measured: list[dict[str, Any]] = []
 
     def is_near() -> bool:
         """Measure; return whether a rate is near 100 Hz, which takes several attempts on a busy machine."""
-        shown = run_command("hz", "-c", flying, "-d", "2.1", "--json", "-t", VLP)
+        shown = run_command("hz", "-c", simulation, "-d", "2.1", "--json", "-t", VLP)
         assert shown.exit_code == 0, shown.err
         measured[:] = [json.loads(line) for line in shown.out.splitlines()]
         return any(row["rate"] is not None and 20 < row["rate"] < 500 for row in measured)
@@ -142,11 +142,11 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, flying: str) -> No
 
 
 @pytest.mark.process
-def test_get_shows_the_last_message(flying: str) -> None:
+def test_get_shows_the_last_message(simulation: str) -> None:
     """`get` prints all fields of the last message, by default vehicle_local_position; without one it exits with 1."""
 
     def get(*arguments: str) -> str:
-        got = run_command("get", "-c", flying, *arguments)
+        got = run_command("get", "-c", simulation, *arguments)
         assert got.exit_code == 0, got.err
         return got.out
 
@@ -157,18 +157,18 @@ def test_get_shows_the_last_message(flying: str) -> None:
     assert [json.loads(line)["topic"] for line in get("--json").splitlines()] == [VLP]
     assert [line.split(":")[0] for line in get("--field", "x,eph").splitlines()[1:]] == ["  x", "  eph", "---"]
     assert json.loads(get("--json", "--field", "x"))["message"].keys() == {"x"}
-    nothing = run_command("get", "-c", flying, "--vehicle", "99")
+    nothing = run_command("get", "-c", simulation, "--vehicle", "99")
     assert nothing.exit_code == 1
     assert f"nothing is published on nedbus/99/{VLP}" in nothing.err
 
 
 @pytest.mark.process
-def test_info_shows_the_services(flying: str) -> None:
+def test_info_shows_the_services(simulation: str) -> None:
     """`info` prints the router, the vehicles, and the services with their sources."""
-    info = run_command("info", "-c", flying)
+    info = run_command("info", "-c", simulation)
     assert info.exit_code == 0, info.err
-    assert all(text in info.out for text in (f"router    {flying}", "vehicles  1", "SOURCE", "running"))
-    machine = run_command("info", "-c", flying, "--json")
+    assert all(text in info.out for text in (f"router    {simulation}", "vehicles  1", "SOURCE", "running"))
+    machine = run_command("info", "-c", simulation, "--json")
     assert json.loads(machine.out)["sources"][0]["source"] == "sim:"
 
 

@@ -1,4 +1,4 @@
-"""Terminals: tables of any width, hostile text, closed streams, signals at any moment."""
+"""Terminal output: tables of any width, malicious text, closed streams, and signals at any time."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class Terminal:
         return exit_code
 
     def _read(self) -> None:
-        with suppress(OSError):  # the other side is closed
+        with suppress(OSError):  # the terminal was closed
             while data := os.read(self._main, 4096):
                 self._output.extend(data)
         os.close(self._main)
@@ -181,7 +181,7 @@ def on_terminal(fork_server: ForkServer) -> OnTerminal:
 
 
 @contextmanager
-def flying(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
+def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
     """Publish topics of vehicles on the ground."""
     publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
 
@@ -196,7 +196,7 @@ def flying(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) ->
 @pytest.mark.process
 def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus) -> None:
     """At 80 columns a message is one line below a heading, with complete addresses in one column."""
-    with flying(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
+    with publishing(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
         assert terminal.wait() == 0
     shown = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
     assert len([line for line in shown if VLP in line]) == 40
@@ -237,7 +237,7 @@ def test_hz_redraws_in_place(
     Ctrl-C and SIGTERM, which `timeout` sends, stop the redrawing and show the cursor again.
     """
     vehicles = [str(vehicle) for vehicle in range(12)]
-    with flying(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
+    with publishing(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
         wait_for(lambda: terminal.shown.count("VEHICLE/TOPIC") >= 2, what="a second table")
         terminal.popen.send_signal(number)
         assert terminal.wait() == exit_code
@@ -370,7 +370,7 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
 
 def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
     """For 100 vehicles `hz` prints 50 rows a second and the number of the others."""
-    with flying(bus, *(f"flood-{number}" for number in range(100))):
+    with publishing(bus, *(f"flood-{number}" for number in range(100))):
         hz = run_command("hz", "-c", endpoint, "-n", "1000")  # each vehicle has sent by then
     assert hz.exit_code == 0
     assert "\n50 more\n" in hz.out
@@ -551,7 +551,7 @@ def on_controlling_terminal(log: Path, *command: str) -> Iterator[tuple[subproce
 def test_closed_terminal_stops_commands(bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str) -> None:
     """Closing the terminal stops a service, a recording and a web page, as Ctrl-C does."""
     log, arguments = tmp_path / "log", command.replace("PORT", str(free_port())).split()
-    with flying(bus, "9"), on_controlling_terminal(log, *arguments, "-c", endpoint) as (process, main):
+    with publishing(bus, "9"), on_controlling_terminal(log, *arguments, "-c", endpoint) as (process, main):
         begun = {
             "serve": lambda: "1" in bus.vehicles(),
             "record": lambda: Path("flight.mcap").exists() and Path("flight.mcap").stat().st_size > 1000,
