@@ -11,7 +11,7 @@ import time
 from typing import Any, Final
 
 import numpy as np
-from tests.flights.first_message import FIELD_TYPES, PAYLOAD_SIZE, encode_array
+from tests.flights.local_position import FIELD_TYPES, PAYLOAD_SIZE, encode_array
 
 import nedbus
 

@@ -1,4 +1,4 @@
-"""Raise an alarm when a vehicle's position is in doubt, or nothing arrives for 1 s; say when it is good again."""
+"""Print an alarm when a vehicle's position is in doubt or nothing arrives for 1 s, and when it is good again."""
 
 import sys
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ GOOD = {**dict.fromkeys(VALID, True), "dead_reckoning": False}
 
 
 def states(vehicle: str) -> Iterator[str]:
-    """Yield the state of a vehicle with each of its messages, and for each second without one."""
+    """Yield the state of a vehicle after each message, and after each second without one."""
     try:
         bus = nedbus.connect()
     except nedbus.ConnectError as exc:
         yield f"ALARM: {exc}"
-        bus = nedbus.connect(timeout=None)  # until there is a router
+        bus = nedbus.connect(timeout=None)  # wait for a router
     with bus, bus.subscribe(vehicle=vehicle) as subscription:
-        while True:  # the subscription outlives its service, and its router: it goes on when they are back
+        while True:  # the subscription survives restarts of the service and the router
             try:
                 sample = subscription.receive(timeout=1.0)
             except nedbus.NoDataError:

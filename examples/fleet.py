@@ -1,4 +1,4 @@
-"""Query once: which vehicles are there, where are they, and how old are their last messages?"""
+"""List all vehicles once: their streams, positions, and the age of their last messages."""
 
 from contextlib import suppress
 

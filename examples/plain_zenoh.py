@@ -1,4 +1,4 @@
-"""Read messages without nedbus, as a Zenoh client in any language can: a key, and one msgpack array.
+"""Read messages with Zenoh and msgpack alone, as a client in any language can.
 
 array[0] is the number of the layout; array[1], array[2], ... are PX4's fields in PX4's order.
 """

@@ -1,4 +1,4 @@
-"""The same with asyncio: print where every vehicle is, and once a second how many samples were lost."""
+"""Print the position of every vehicle with asyncio, and the message counts once a second."""
 
 import asyncio
 from contextlib import suppress

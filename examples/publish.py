@@ -1,4 +1,4 @@
-"""Publish an estimate of your own, at 50 Hz: a vehicle called "mine" that flies a circle."""
+"""Publish your own estimate at 50 Hz: a vehicle called "mine" flies a circle."""
 
 import math
 import time
@@ -11,5 +11,5 @@ with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     while True:
         now = time.monotonic()
         position = {"x": 10 * math.cos(now), "y": 10 * math.sin(now), "z": -5.0}
-        publisher.publish({**position, "xy_valid": True, "z_valid": True})  # its timestamp is the time since boot
+        publisher.publish({**position, "xy_valid": True, "z_valid": True})  # timestamp defaults to the time since boot
         time.sleep(0.02)

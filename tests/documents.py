@@ -24,7 +24,11 @@ import typer
 from nedbus.cli.app import app
 
 ROOT: Final = Path(__file__).parents[1]
-PAGES: Final = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("[!mr]*/*.md"))]
+PAGES: Final = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").glob("[!mr]*/**/*.md")),
+]
 """README and the hand-written pages: all but docs/messages and docs/reference."""
 
 _MARKER = r"(?: *<!-- ([a-z ]+?)(?:: ([^\n]*?))? -->\n)?"

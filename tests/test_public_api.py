@@ -22,7 +22,7 @@ OURS = {
     for name in re.findall(r"^ *class (\w+)", path.read_text(), re.MULTILINE)  # a hundred times faster than ast
 }
 # Generic over all messages, or used only in the definition of a message, which no script imports.
-ALLOWED = {"Definition", "FieldType", "Layout", "Older", "Rule"}
+ALLOWED = {"Definition", "FieldType", "Layout", "RenamedField", "Rule"}
 
 
 MODULES = {

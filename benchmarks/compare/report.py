@@ -27,7 +27,8 @@ HEAD: Final = (
 
 BYTES: Final = {  # payload size with the default flight and a timestamp in ns, without transport overhead
     "raw": 244, "batches": 244, "rows": 244, "models": 244, "fields_in": 244, "straightforward": 916,
-    "msgspec_array": 356, "pyzmq": 916, "rose": 953, "zrm": 250, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
+    "msgspec_array": 356, "pyzmq": 916, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
+    "mavsdk_telemetry": 40, "rclpy_odometry": 708,
 }  # fmt: skip
 
 
@@ -38,9 +39,8 @@ def table(results: Results) -> str:
     lines = [HEAD, "|---" * HEAD.count(" |") + "|"]
     for form, full in sorted(medians.items(), key=lambda item: -item[1]["rate"]):
         khz, slow = results.median(flight, KHZ, form), results.median(flight, SLOW, form)
-        lost = "" if full["kept"] == 1.0 else f" ({1 - full['kept']:.1%} lost)"
         lines.append(
-            f"| {title(form)} | {BYTES[form]} | {full['rate']:,.0f}{lost} |"
+            f"| {title(form)} | {BYTES[form]} | {full['rate']:,.0f}{_lost(full)} |"
             f" {results.ratio(flight, FULL, form, 'raw', 'rate'):.2f} |"
             f" {full['publish_cpu']:.1f} / {full['receive_cpu']:.1f} |"
             f" {khz['p50']:.0f} / {khz['p99']:.0f} | {slow['p50']:.0f} / {slow['p99']:.0f} |"
@@ -48,6 +48,11 @@ def table(results: Results) -> str:
         )
     lines += [f"| {form} | | {reason} | | | | | |" for form, reason in results.failed.items()]
     return "\n".join(lines)
+
+
+def _lost(measured: Measured) -> str:
+    """Return the share of lost messages, "" if there are none."""
+    return "" if measured["kept"] == 1.0 else f" ({1 - measured['kept']:.1%} lost)"
 
 
 def flight_table(results: Results) -> str:
@@ -114,10 +119,13 @@ def as_markdown(results: Results, rounds: int) -> str:
 
 
 SHOWN: Final = {
-    "raw": "raw Zenoh, bytes of the same size",
-    "batches": "batches, NumPy arrays",
-    "rows": "rows, named tuples",
-    "models": "models, Pydantic",
+    "batches": "nedbus, batches (NumPy arrays)",
+    "rows": "nedbus, rows (named tuples)",
+    "models": "nedbus, models (Pydantic)",
+    "straightforward": "a plain Pydantic and msgpack script on Zenoh",
+    "zenoh_ros2": "zenoh-ros2-sdk",
+    "mavsdk_telemetry": "MAVSDK, `position_velocity_ned`: 7 values, from MAVLink",
+    "rclpy_odometry": "rclpy, Fast DDS: `nav_msgs/Odometry`",
 }
 
 
@@ -130,7 +138,7 @@ def short_table(results: Results) -> str:
     for form, name in SHOWN.items():
         full, khz = (results.median(DEFAULT_FLIGHT, load, form) for load in (FULL, KHZ))
         lines.append(
-            f"| {name} | {full['rate']:,.0f} | {full['publish_cpu']:.1f} / {full['receive_cpu']:.1f} |"
+            f"| {name} | {full['rate']:,.0f}{_lost(full)} | {full['publish_cpu']:.1f} / {full['receive_cpu']:.1f} |"
             f" {khz['p50']:.0f} / {khz['p99']:.0f} |"
         )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Generated files: a page for each message, and the reference of the site."""
+"""Generated documentation: a page for each message, and the reference pages of the site."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ DOCS = ROOT / "docs"
 
 
 def committed() -> dict[Path, str]:
-    """Return the pages of messages, which are kept in the repository."""
+    """Return the pages of messages, which are committed to the repository."""
     return {DOCS / "messages" / f"{module_of(each)}.md": page(each) for each in MESSAGES.values()}
 
 
 def reference() -> dict[str, str]:
-    """Return the pages that are made for the site, by the name of their file."""
+    """Return the reference pages, which are generated for the site only, by file name."""
     return {
         "api.md": api_page(),
         "command-line.md": commands_page(),

@@ -1,4 +1,4 @@
-"""Write what is made from the code: `make generated`, after a message was added or changed, and `make docs`."""
+"""Write the generated pages: `make generated` after a change of a message, `make docs` for the site."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of the Python API: each public name with its signature and what its docstring says."""
+"""The page of the Python API: each public name with its signature and docstring."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ import nedbus_msgs
 
 from .markdown import cell, code, docstring, page, section, table
 
-_SECTIONS: Final = {  # the packages whose names they have
+_SECTIONS: Final = {  # by title: the packages of the names
     "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.transport"),
     "Files": ("nedbus.recording",),
     "Events": ("nedbus.events",),
     "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
     "Messages, arrays, frames and resets": ("nedbus_msgs",),
 }
-_CONSTANTS: Final = {  # of which no line of the code says more
+_CONSTANTS: Final = {  # without a docstring in the code
     "ANY": "Any topic, or any vehicle",
     "Mode": "A slow reader gets the newest message of each key, or every message",
-    "Quantity": "What an estimator resets",
+    "Quantity": "A quantity that an estimator can reset",
     "frames.Vector": "Three components",
-    "Session": "Zenoh's own session, for what nedbus does not do",
+    "Session": "Zenoh's own session, for features that nedbus does not cover",
 }
 
 
 def api_page() -> str:
-    """Return the page of what `nedbus` and its public modules have, each name as scripts write it after `nedbus.`."""
+    """Return the page of all public names, written relative to `nedbus`."""
     named = {name: getattr(nedbus, name) for name in nedbus.__all__}
     for module in (nedbus.frames, nedbus.health, nedbus.errors):
         short = module.__name__.removeprefix("nedbus.")
@@ -50,10 +50,10 @@ def api_page() -> str:
     return page(
         "Python API",
         "Everything is in `nedbus`, or in its modules `frames`, `health` and `errors`.",
-        "Units are SI and the frame is NED unless a line says otherwise.",
-        "The classes of messages have [a page each](../messages.md).",
+        "Units are SI and the frame is NED unless stated otherwise.",
+        "Message classes have [their own pages](../messages.md).",
         *parts,
-        section("Constants and types", table(["name", "is", "meaning"], map(_constant, constants.items()))),
+        section("Constants and types", table(["name", "value", "meaning"], map(_constant, constants.items()))),
     )
 
 
@@ -88,7 +88,7 @@ def _members(cls: type) -> Iterator[str]:
             routine = getattr(cls, name)
             texts = _signature(name, routine), docstring(inspect.getdoc(routine))
             methods.append(section(f"`{cls.__name__}.{name}`", *texts, level=4))
-    yield table(["property", "is"], properties)
+    yield table(["property", "meaning"], properties)
     yield from methods
 
 
@@ -126,9 +126,9 @@ def _meaning(name: str) -> str:
 
 
 def constants_of(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Yield each name that is assigned in a module, and the string that stands below it."""
+    """Yield each name assigned in a module with the string below it."""
     for statement, below in zip(tree.body, tree.body[1:], strict=False):
         target = getattr(statement, "target", None) or next(iter(getattr(statement, "targets", ())), None)
         is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
         if isinstance(target, ast.Name) and is_text:
-            yield target.id, str(below.value.value)  # type: ignore[attr-defined]  # what is_text says
+            yield target.id, str(below.value.value)  # type: ignore[attr-defined]  # is_text ensures it

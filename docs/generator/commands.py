@@ -1,4 +1,4 @@
-"""The page of the command line, from Typer's tree of commands."""
+"""The page of the command line, from Typer's command tree."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def commands_page() -> str:
     """Return the page of all commands, with their arguments, options and defaults."""
     return page(
         "Command line",
-        "Exit codes: 0 for success, 1 for failure, 2 for wrong usage, 130 for Ctrl-C.",
-        "Without `--connect` and `--config` [the settings](settings.md) decide.",
+        "Exit codes: 0 for success, 1 for failure, 2 for a usage error, 130 for Ctrl-C.",
+        "Without `--connect` and `--config`, [the settings](settings.md) apply.",
         *(_command(name, command) for name, command in commands()),
     )
 

@@ -1,4 +1,4 @@
-"""Markdown of the generated pages: tables, lists, and texts of the code."""
+"""Markdown of the generated pages: tables, sections, and text from docstrings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table, or nothing where it has no rows."""
+    """Return a table, or an empty string without rows."""
     lines = [" | ".join(cells) for cells in rows]
     if not lines:
         return ""
@@ -17,7 +17,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def section(title: str, *parts: str, level: int = 2) -> str:
-    """Return a heading with what is below it, or nothing where nothing is."""
+    """Return a heading with its content, or an empty string without content."""
     below = [part for part in parts if part]
     return "\n\n".join([f"{'#' * level} {title}", *below]) if below else ""
 
@@ -28,25 +28,25 @@ def page(title: str, *parts: str) -> str:
 
 
 def cell(text: object) -> str:
-    """Return a text of the code as the cell of a table."""
+    """Return text as a table cell."""
     return plain(" ".join(str(text).split())).replace("|", "\\|")
 
 
 def code(text: object) -> str:
-    """Return a text as code in the cell of a table; nothing for an empty one."""
+    """Return text as code in a table cell, or an empty string."""
     shown = str(text).replace("|", "\\|")
     return f"`{shown}`" if shown else ""
 
 
 def plain(text: str) -> str:
-    """Escape what Markdown would take for HTML, emphasis or links, outside of code."""
+    """Escape HTML, emphasis and links outside of code."""
     parts = re.split(r"(`[^`\n]*`)", text)
     special = r"([<*\[\]]|(?<!\w)_|_(?!\w))"
     return "".join(part if number % 2 else re.sub(special, r"\\\1", part) for number, part in enumerate(parts))
 
 
 def docstring(text: str | None) -> str:
-    """Return a docstring as Markdown: lines that begin with a name become a list, indented ones stay as they are."""
+    """Convert a docstring to Markdown: lines that start with a name become list items, indented lines are kept."""
     lines: list[str] = []
     for line in inspect.cleandoc(text or "").splitlines():
         before = lines[-1] if lines else ""

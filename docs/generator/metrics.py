@@ -1,4 +1,4 @@
-"""The page of the metrics of services and exporters, from their table in the code."""
+"""The page of the metrics of services and exporters."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def metrics_page() -> str:
     ]
     return page(
         "Metrics",
-        "A service shows them at `/metrics` with `--http`, and `nedbus export` those of a reader; "
-        "[operating it](../operate.md) has dashboards and alerts.",
-        "Metrics named `process_*` are those of every Prometheus client.",
+        "A service exposes them at `/metrics` with `--http`, and `nedbus export` those of a reader; "
+        "dashboards and alerts: [Operations](../operate.md).",
+        "Metrics named `process_*` are the standard ones of Prometheus clients.",
         table(["metric", "kind", "labels", "meaning"], rows),
     )

@@ -1,4 +1,4 @@
-"""The pages of settings and sources, events, keys, payloads and limits: tables of what the code has."""
+"""The pages of settings and sources, events, keys and payloads, and limits, as tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nedbus_msgs import MESSAGES, TOPICS, Address, codec_of, encoding_of
 from .api import constants_of
 from .markdown import cell, code, page, section, table
 
-_PARTS: Final = {  # of the limits, by the package that holds them
+_LIMIT_SECTIONS: Final = {  # by title: the packages of the constants
     "Readers and publishers": ("client",),
     "Services and sources": ("daemon", "sources"),
     "Events": ("events",),
@@ -33,7 +33,7 @@ _PARTS: Final = {  # of the limits, by the package that holds them
 
 
 def settings_page() -> str:
-    """Return the page of the settings of a service, and of the options of its sources."""
+    """Return the page of the settings of a service and the options of its sources."""
     rows = []
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True)
@@ -52,28 +52,28 @@ def settings_page() -> str:
         sources.append(section(title, needs, table(["option", "default", "meaning"], options), level=3))
     return page(
         "Settings",
-        "Flags win over the environment, which wins over `nedbus.toml`, or the file that `--config` or `NEDBUS_CONFIG` "
-        "names. An empty default is none.",
+        "Flags override environment variables, which override `nedbus.toml`, or the file given by `--config` or "
+        "`NEDBUS_CONFIG`. An empty default means none.",
         table(["in `nedbus.toml`", "environment", "flag", "default", "meaning"], rows),
-        section("Sources", "A source is `KIND:TARGET?OPTION=VALUE&OPTION=VALUE`, or a table of TOML.", *sources),
+        section("Sources", "A source is `KIND:TARGET?OPTION=VALUE&OPTION=VALUE`, or a TOML table.", *sources),
     )
 
 
 def events_page() -> str:
-    """Return the page of the events of the log, and of those of vehicles."""
-    rows = [[code(name), cell(each.doc), "yes" if each.limited else "never"] for name, each in EVENTS.items()]
+    """Return the page of log events and vehicle events."""
+    rows = [[code(name), cell(each.doc), "yes" if each.limited else "no"] for name, each in EVENTS.items()]
     kinds = [[code(name), ", ".join(map(code, kind.causes))] for name, kind in KINDS.items()]
     return page(
-        "Events of the log, and of vehicles",
+        "Log events and vehicle events",
         section(
-            "Of the log",
-            "The `event` of a line with `--log-format json`. "
-            "Of one that is limited, 50 lines of a kind are logged at once and 6 a minute after that.",
-            table(["event", "meaning", "limited"], rows),
+            "Log events",
+            "The `event` of each line with `--log-format json`. "
+            "Of each rate-limited kind, up to 50 lines are logged at once, then 6 a minute.",
+            table(["event", "meaning", "rate-limited"], rows),
         ),
         section(
-            "Of vehicles",
-            "The `kind` of an event, and the kinds that may explain it; [what they mean](../events.md#events).",
+            "Vehicle events",
+            "The `kind` of each event, and the kinds that may explain it; [what they mean](../events.md#events).",
             table(["kind", "evidence"], kinds),
         ),
     )
@@ -90,14 +90,14 @@ def keys_page() -> str:
         [
             code(f"{one.key()}/@ack"),
             (
-                "queryable of each reader of mode `every`, with `?publisher=<zid>:<eid>;number=<sequence number>;"
-                "read=<0 or 1>`: it answers when that message of that publisher has arrived, with `read=1` when its "
-                "script has taken it; the key is that of the subscription"
+                "queryable of each subscription in mode `every`, below its key expression, with "
+                "`?publisher=<zid>:<eid>;number=<sequence number>;read=<0 or 1>`: it replies when that message of that "
+                "publisher has arrived, or with `read=1` when the script has read it"
             ),
         ],
         [
             code("nedbus/@schema/*/VehicleLocalPosition"),
-            "queryable: JSON Schema and layouts of a message, of each definition of its name, or of that of `?hash=`",
+            "queryable: JSON Schema and layouts of each definition with this name, or of the one with `?hash=`",
         ],
         [code("nedbus/@service/*/status"), "queryable: status of each service, in JSON"],
         [code(one.rejected_key()), "rejected messages, with the reason, in JSON"],
@@ -125,47 +125,47 @@ def keys_page() -> str:
             "`[layout, field 1, ... field n]` as msgpack, the fields in the order of "
             "[the message's page](../messages.md)."
             "\nEvery field is written at its full width, so a payload of a message always has the same size, with "
-            "every field at a fixed offset; any other valid msgpack of the array is read too."
-            "\nThe encoding begins with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
-            "number with a bit for each field that was not provided, the lowest for `timestamp`."
-            "\nThe name of any message that is not in this table is followed by `;hash=...`: the first 32 hexadecimal "
-            "digits of the RIHS01 hash of its fields as ROS 2 computes it (`nedbus_msgs.short_hash`), as builds of "
-            "PX4 may differ in a message of the same name."
-            "\nA reader queries `nedbus/@schema/*/<Message>?hash=...`, computes the hash of the fields in each answer, "
-            "and decodes a payload only with the fields of its own hash; without it, the message is invalid.",
+            "every field at a fixed offset; any other valid msgpack encoding of the array is accepted too."
+            "\nThe Zenoh encoding starts with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
+            "mask with one bit for each field that was not provided, the lowest for `timestamp`."
+            "\nFor any message that is not in this table, `;hash=...` follows the name: the first 32 hexadecimal "
+            "digits of its RIHS01 hash as ROS 2 computes it (`nedbus_msgs.short_hash`), as builds of PX4 may define "
+            "the same message differently."
+            "\nA reader queries `nedbus/@schema/*/<Message>?hash=...`, computes the hash of the fields in each reply, "
+            "and decodes a payload only with the fields that match its hash; without a match the message is invalid.",
             table(["message", "fields", "bytes", "encoding"], messages),
         ),
-        section("Topics", table(["topic", "Hz", "messages kept", "priority"], topics)),
+        section("Topics", table(["topic", "Hz", "messages cached", "priority"], topics)),
     )
 
 
-_CODES = {
+_NOT_LIMITS = {
     "ARMED",
     "MIN_FIX_TYPE",
     "EARTH_RADIUS",
     "FOXGLOVE_PORT",
     "NUMBERS",
     "PALETTE",
-}  # constants that limit nothing
+}
 
 
 def limits_page() -> str:
-    """Return the page of limits: the numbers of the code that a line of it explains."""
-    parts: dict[str, list[list[str]]] = {title: [] for title in _PARTS}
+    """Return the page of limits: all public numeric constants with a docstring."""
+    parts: dict[str, list[list[str]]] = {title: [] for title in _LIMIT_SECTIONS}
     for package in (nedbus, nedbus_msgs):
         root = Path(package.__path__[0])
         for path in sorted(root.rglob("*.py")):
             folder = "nedbus_msgs" if package is nedbus_msgs else path.relative_to(root).parts[0]
-            title = next((title for title, folders in _PARTS.items() if folder in folders), "Others")
+            title = next((title for title, folders in _LIMIT_SECTIONS.items() if folder in folders), "Others")
             tree = ast.parse(path.read_text())
             numbers = dict(_numbers(tree))
             for name, text in constants_of(tree):
-                if name in numbers and not name.startswith("_") and name not in _CODES:
+                if name in numbers and not name.startswith("_") and name not in _NOT_LIMITS:
                     parts[title].append([cell(text), code(numbers[name]), code(name)])
     return page(
         "Limits and constants",
-        "The limits in the code, with the names of their constants; a vehicle's name is 1 to 64 of `A-Z a-z 0-9 _ -`, "
-        "and an instance 0 to 255.",
+        "The limits in the code, with the names of their constants. A vehicle name is 1 to 64 of `A-Z a-z 0-9 _ -`, "
+        "an instance 0 to 255.",
         *(section(title, table(["limit", "value", "constant"], rows)) for title, rows in parts.items()),
         section("Durations", table(["duration [s]", "value", "field of `nedbus.timings.TIMINGS`"], _durations())),
     )

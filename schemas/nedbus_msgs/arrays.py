@@ -12,22 +12,22 @@ from typing import Any, Final, Generic
 import numpy as np
 import numpy.typing as npt
 
-from .codecs.cdr import HEAD, cdr_layout
+from .codecs.cdr import HEADER, cdr_layout
 from .codecs.msgpack import codec_of
 from .definitions import DEFAULT, M, definition_of
 from .errors import InvalidMessageError
-from .model.declaration import Layout, kept
+from .model.declaration import Layout, cached_on_owner
 from .model.definition import MESSAGES, Definition
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, encode_text
-from .model.rules import passes_all, wrong_columns
+from .model.rules import column_checks, compile_rules
 from .model.validation import Values
 
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
-_COLUMNS_FROM: Final = 20
-"""Number of messages from which checking rules by column is faster than by message."""
+_MIN_COLUMNAR: Final = 20
+"""Number of messages from which column-wise rule checks are faster than one message at a time."""
 
 
 def _numpy_type(kind: FieldType) -> Any:
@@ -35,9 +35,9 @@ def _numpy_type(kind: FieldType) -> Any:
 
 
 class Arrays(Generic[M]):
-    """Conversion of the messages of one definition to and from structured arrays.
+    """Converter between the messages of one definition and structured arrays.
 
-    `dtype`: the fields in the order of the model, with PX4's types; texts are UTF-8, such as `S127`.
+    `dtype`: the fields in model order, with PX4's types; text is UTF-8, such as `S127`.
     """
 
     def __init__(self, definition: Definition[M]) -> None:
@@ -46,7 +46,7 @@ class Arrays(Generic[M]):
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size
-        # The offset in a payload of each byte of an element.
+        # Payload offset of each byte of an element.
         self._from_wire = np.array([], np.intp)
         for name, _, offset in self._codec.offsets:
             bytes_of = np.arange(offset, offset + types[name].size)
@@ -58,25 +58,25 @@ class Arrays(Generic[M]):
         self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
         self._value_mask = ~self._tag_mask
         self._has_text = any(kind.is_text for kind in types.values())
-        ruled = {name for rule in definition.rules for name in rule.fields}
-        # A struct that unpacks the fields with rules from the bytes of an element, and the index of each.
-        form, places, index = "=", dict[str, str](), 0
+        checked = {name for rule in definition.rules for name in rule.fields}
+        # Struct that unpacks the fields with rules from an element's bytes, and an expression for each of them.
+        form, accessors, index = "=", dict[str, str](), 0
         for name, kind in types.items():
-            form += kind.form if name in ruled else f"{self.dtype[name].itemsize}x"
-            if name in ruled:
-                places[name] = f"values[{index}:{index + kind.values}]" if kind.is_array else f"values[{index}]"
+            form += kind.form if name in checked else f"{self.dtype[name].itemsize}x"
+            if name in checked:
+                accessors[name] = f"values[{index}:{index + kind.values}]" if kind.is_array else f"values[{index}]"
                 index += kind.values
-        self._ruled, self._passes_rules = struct.Struct(form), passes_all(definition.rules, places)
-        self._wrong_columns = wrong_columns(
+        self._checked, self._passes_rules = struct.Struct(form), compile_rules(definition.rules, accessors)
+        self._column_checks = column_checks(
             definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
         )
 
     def decode(self, payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-        """Return the messages of concatenated payloads of the codec's size, and a mask of the valid ones.
+        """Decode concatenated full-width payloads; return the messages and a mask of the valid ones.
 
-        A payload that is False in the mask may still be valid: the codec decides.
+        False in the mask is not final: such a payload may still be valid for the codec.
         """
-        # Zero where the tags are right, and 0 or 1 for bools.
+        # The XOR turns correct tags into 0, and bools into 0 or 1.
         wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
         wrong = wire & self._tag_mask
         is_damaged = np.count_nonzero(wrong) > 0
@@ -87,16 +87,17 @@ class Arrays(Generic[M]):
         return array, valid & ~wrong.any(axis=1) if is_damaged else valid
 
     def encode(self, array: MessageArray) -> bytes:
-        """Return the concatenated payloads of messages, without validating them."""
+        """Encode messages as concatenated payloads, without validating them."""
         native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
         return (native.take(self._to_wire, axis=1) & self._value_mask | self._tags).tobytes()
 
     def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
-        """Return a mask of the messages in an array of this dtype that pass the rules."""
-        if len(array) < _COLUMNS_FROM:
-            return np.fromiter(map(self._passes_rules, self._ruled.iter_unpack(array.tobytes())), np.bool_, len(array))
+        """Return a mask of the messages that pass the rules."""
+        if len(array) < _MIN_COLUMNAR:
+            rows = self._checked.iter_unpack(array.tobytes())
+            return np.fromiter(map(self._passes_rules, rows), np.bool_, len(array))
         invalid = np.zeros(len(array), np.bool_)
-        for is_wrong in self._wrong_columns:
+        for is_wrong in self._column_checks:
             invalid |= is_wrong(array)
         return ~invalid
 
@@ -115,7 +116,7 @@ class Arrays(Generic[M]):
         return np.array([self.to_element(tuple(message.__dict__.values())) for message in messages], self.dtype)
 
     def absent(self, count: int) -> MessageArray:
-        """Return `count` messages with no field provided: NaN, false and 0."""
+        """Return `count` messages with every field "not provided": NaN, false or 0."""
         return np.repeat(np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype), count)
 
     def to_row(self, element: np.void) -> Values:
@@ -123,7 +124,7 @@ class Arrays(Generic[M]):
         return self.definition.validation.unpack(element.tobytes())
 
     def to_element(self, row: Values) -> Values:
-        """Return the values of all fields as an array takes them: NumPy would reject a text that is not ASCII."""
+        """Convert a row for assignment to an array: text becomes UTF-8, as NumPy rejects non-ASCII strings."""
         if not self._has_text:
             return row
         return tuple(encode_text(value) if isinstance(value, str) else value for value in row)
@@ -134,7 +135,7 @@ class Arrays(Generic[M]):
         return self.definition.model(**fields)
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
-        """Return unvalidated CDR payloads, one per element; all fields of the layout are the model's."""
+        """Return unvalidated CDR payloads, one per element; the model must have all fields of the layout."""
         cdr = self._cdr(layout)
         payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), cdr)
         for name in layout.types:
@@ -142,20 +143,20 @@ class Arrays(Generic[M]):
         return payloads
 
     def decode_cdr(self, payloads: Sequence[bytes], layout: Layout) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-        """Return the messages of CDR payloads, and a mask of the valid ones.
+        """Decode CDR payloads; return the messages and a mask of the valid ones.
 
-        Fields of the layout that the model lacks are left out, all others have the types of the model.
-        A payload that is False in the mask may still be valid: `decode_with` and the model decide.
+        Fields that the model lacks are dropped; the others are converted to the model's types.
+        False in the mask is not final: such a payload may still be valid for `decode_with` and the model.
         """
         zeros = cdr_layout(layout).zeros
-        fits = np.array([len(each) == len(zeros) and each[:2] == HEAD[:2] for each in payloads], bool)
+        fits = np.array([len(each) == len(zeros) and each[:2] == HEADER[:2] for each in payloads], bool)
         data = b"".join(each if fit else zeros for each, fit in zip(payloads, fits.tolist(), strict=True))
         packed = np.frombuffer(data, self._cdr(layout))
         bytes_of = np.frombuffer(data, np.uint8).reshape(-1, len(zeros))
-        whole = layout is self.definition.current
-        array = packed.astype(self.dtype) if whole else self.absent(len(payloads))
+        is_current = layout is self.definition.current
+        array = packed.astype(self.dtype) if is_current else self.absent(len(payloads))
         for name, kind in layout.types.items():
-            if not whole and name in self.definition.types:
+            if not is_current and name in self.definition.types:
                 array[name] = packed[name]
             if kind.base == "bool":
                 offset = cdr_layout(layout).offsets[name]
@@ -175,14 +176,14 @@ class Arrays(Generic[M]):
         )
 
 
-@kept
+@cached_on_owner
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
-    """Return the array conversion of a definition, cached."""
+    """Return the cached array converter of a definition."""
     return Arrays(definition)
 
 
 def _squared_norms(quaternions: npt.NDArray[np.float32]) -> Any:
-    """Return the squares of the norms, in float64, of quaternions of shape (4, n)."""
+    """Return the squared norms, in float64, of quaternions of shape (4, n)."""
     w, x, y, z = quaternions.astype(float)
     return w * w + x * x + y * y + z * z
 
@@ -201,7 +202,7 @@ def to_array(messages: Sequence[M]) -> MessageArray:
     return arrays_of(messages[0].DEFINITION if messages else DEFAULT).of(messages)
 
 
-def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # any, by default
+def to_message(element: np.void, message: type[M] = DEFAULT.model) -> M:  # type: ignore[assignment] # default of M
     """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
     return arrays_of(definition_of(message)).to_message(element)
 

@@ -1,4 +1,4 @@
-"""Definitions: of messages with a file, by class, name or topic, and of others at run time, by their fields."""
+"""Look up definitions of built-in messages, and define other messages at run time."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ from .model.rules import Rule
 
 _NAME = re.compile(r"[A-Z][A-Za-z0-9]{0,63}")
 _FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}")
-_MOST: Final = 256  # fields per message; PX4's largest has a third of that
+_MAX_FIELDS: Final = 256  # three times the fields of PX4's largest message
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 
 
@@ -29,7 +29,7 @@ def definition_of(message: type[M] | str) -> Definition[M]:
 
 
 DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
-"""The default message of functions that take one."""
+"""Definition of the default message, VehicleLocalPosition."""
 
 
 def define(
@@ -39,7 +39,7 @@ def define(
     meanings: Mapping[str, str] = {},
     rules: Sequence[Rule] = (),
 ) -> Definition[Message]:
-    """Define a message without a file, from a log, a .msg file or a publisher; `fields`: in the order of its CDR.
+    """Define a message that is not built in, from a log, a .msg file or a publisher; `fields`: in CDR order.
 
     `meanings`: unit and meaning of fields, by name.
 
@@ -50,24 +50,24 @@ def define(
     types: dict[str, FieldType] = {}
     for field, kind in fields:
         if not _FIELD.fullmatch(field):
-            raise ValueError(f"a field cannot be called {field!r:.100}: expected lower_snake_case")
+            raise ValueError(f"invalid field name {field!r:.100}: expected lower_snake_case")
         if hasattr(Message, field):
-            raise ValueError(f"a field cannot be called {field!r}: a message has a method of that name in Python")
+            raise ValueError(f"invalid field name {field!r}: the Python class Message has a member with this name")
         if field in types:
-            raise ValueError(f"two fields are called {field!r}, including those of nested messages")
+            raise ValueError(f"duplicate field {field!r}, after flattening nested messages")
         types[field] = kind
-    if len(types) > _MOST:
-        raise ValueError(f"{len(types)} fields, more than the {_MOST} that a message can have")
+    if len(types) > _MAX_FIELDS:
+        raise ValueError(f"{len(types)} fields, more than the limit of {_MAX_FIELDS}")
     if str(types.get("timestamp")) != "uint64":
-        raise ValueError("it lacks the field 'uint64 timestamp'")
+        raise ValueError("missing field 'uint64 timestamp'")
     size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
     if size > PAYLOAD_LIMIT:
-        raise ValueError(f"{size} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
+        raise ValueError(f"{size} bytes, more than the limit of {PAYLOAD_LIMIT}")
     annotated: dict[str, Any] = {
         name: (Timestamp if name == "timestamp" else kind.annotation, Field(description=meanings.get(name)))
         for name, kind in types.items()
     }
-    model = create_model(name, __base__=Message, __doc__="A message of PX4 that has no file in nedbus.", **annotated)
+    model = create_model(name, __base__=Message, __doc__="A message defined at run time.", **annotated)
     model.LAYOUTS, model.RULES = (Layout("PX4", "*"),), rules
     model.DEFINITION = Definition(model)
     return model.DEFINITION

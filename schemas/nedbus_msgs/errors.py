@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-_MAX_SHOWN: Final = 200  # characters of a value, as a peer's key may have 64 kB
+_MAX_SHOWN: Final = 200  # characters of a value; a peer's key may have 64 kB
 
 
 class NedbusError(Exception):
@@ -42,7 +42,7 @@ class DecodeError(NedbusError, ValueError):
 
 
 class UnknownLayoutError(DecodeError):
-    """Raised when a payload has a layout number that this reader does not know.
+    """Raised when a payload has a layout number that this version does not support.
 
     `layout`: that number; `count`: the number of fields after it; `known`: the numbers that can be decoded.
     """
@@ -50,7 +50,7 @@ class UnknownLayoutError(DecodeError):
     def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
         readable = ", ".join(map(str, known))
         super().__init__(
-            f"layout {layout} with {count} fields; this reader knows layouts {readable}: update nedbus_msgs", message
+            f"unknown layout {layout} with {count} fields (known: {readable}): update nedbus_msgs", message
         )
         self.layout = layout
         self.count = count

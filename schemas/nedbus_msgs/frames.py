@@ -1,8 +1,8 @@
 """Frame conversions as in PX4: NED and ENU, FRD and FLU, local and global positions.
 
 Angles are radians, latitudes and longitudes degrees, lengths metres.
-Source: PX4's MapProjection (azimuthal equidistant, on a sphere); a position agrees with PX4's own
-`vehicle_global_position` to the last digits.
+Source: PX4's MapProjection (azimuthal equidistant, on a sphere); results agree with PX4's own
+`vehicle_global_position` within 1e-10 degrees.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = [
 ]  # fmt: skip
 
 EARTH_RADIUS: Final = 6_371_000.0
-"""Radius of PX4's sphere [m]."""
+"""Earth radius in PX4's MapProjection [m]."""
 
 Vector = tuple[float, float, float]
 _Quaternion = tuple[float, float, float, float]
@@ -98,7 +98,7 @@ def quaternion_to_euler(q: Sequence[float]) -> Vector:
 
 @dataclass(frozen=True, slots=True)
 class MapProjection:
-    """Projection to the plane that touches PX4's sphere at an origin: latitude, longitude [deg] <-> north, east [m]."""
+    """PX4's azimuthal equidistant projection around an origin: latitude, longitude [deg] <-> north, east [m]."""
 
     latitude: float
     longitude: float
@@ -140,7 +140,7 @@ def to_global(message: Message) -> GlobalPosition | None:
     """Return the global position of a message, None without a global origin (`xy_global` is false) or x and y.
 
     The altitude is NaN while only the horizontal origin is known.
-    The position is that of x, y and z, valid or not; `message.global_position` is None while one of them is invalid.
+    x, y and z are converted whether valid or not; `message.global_position` is None while one of them is invalid.
     """
     if not message.xy_global or not math.isfinite(message.x + message.y):
         return None
@@ -149,7 +149,7 @@ def to_global(message: Message) -> GlobalPosition | None:
 
 
 def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
-    """Return x, y and z of a global position in the local frame of a message, None while that has no origin.
+    """Return x, y and z of a global position in the local frame of a message, None without a global origin.
 
     z is NaN while only the horizontal origin is known.
     """

@@ -1,12 +1,12 @@
-"""Type and provenance of messages in their Zenoh encoding: the source, and the fields that it does not provide.
+"""Message type and provenance in the Zenoh encoding: the source, and the fields that it does not provide.
 
     application/msgpack;px4_msgs/VehicleLocalPosition;source=mavlink;missing=fffff00000000
     application/msgpack;px4_msgs/WheelEncoders;hash=0123456789abcdef0123456789abcdef;source=ulog
 
-`hash`: identifies the definition of any message but the first twelve, as builds of PX4 may differ; see `short_hash`.
-`missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; it is left out if no
-field is missing.
-Both directions are cached, as almost all messages of a publisher have the same encoding.
+`hash` identifies the definition, as builds of PX4 may differ (see `short_hash`); the twelve messages of the first
+version of nedbus omit it.
+`missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; omitted if 0.
+Encoding and parsing are cached, as almost all messages of a publisher have the same encoding.
 """
 
 import math
@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 from .errors import ArgumentError
-from .model.declaration import Layout, kept
+from .model.declaration import Layout, cached_on_owner
 from .model.definition import MESSAGES, Definition
 from .model.px4_types import FieldType
 from .ros2.types import PACKAGE, hash_of
@@ -25,7 +25,7 @@ from .ros2.types import PACKAGE, hash_of
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
 _MISSING = re.compile(r"[0-9a-f]+")
 _IDENTITY = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?")
-# The messages with a file in the first version, which every reader has; other versions may lack a file.
+# Built in since the first version, so every reader has their definitions.
 _WITHOUT_HASH: Final = re.compile(
     "BatteryStatus|EstimatorStatusFlags|FailsafeFlags|HomePosition|SensorGps|TimesyncStatus|VehicleAttitude"
     "|VehicleGlobalPosition|VehicleLandDetected|VehicleLocalPosition|VehicleOdometry|VehicleStatus"
@@ -50,7 +50,7 @@ class Provenance:
             raise ArgumentError("source", self.source, "1 to 32 of a-z 0-9 _ -")
 
 
-@kept
+@cached_on_owner
 def encoding_of(definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None) -> str:
     """Return the Zenoh encoding for a source that provides these fields; None means all fields."""
     names = definition.names
@@ -72,14 +72,14 @@ def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
 
 @lru_cache(1024)
 def identity_of(encoding: str) -> tuple[str, str] | None:
-    """Return name and hash of a message without a file from its encoding; None if it lacks one of them."""
+    """Return message name and hash from an encoding; None if it has no hash."""
     found = _IDENTITY.fullmatch(encoding)
     return (found[1], found[2]) if found else None
 
 
-@kept
+@cached_on_owner
 def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
-    """Parse the provenance in an encoding; unknown or invalid parts are ignored, as other programs also publish."""
+    """Parse the provenance in an encoding; unknown or invalid parts, perhaps of other programs, are ignored."""
     parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])
     source, missing = parts.get("source", ""), parts.get("missing", "")
     fits = _MISSING.fullmatch(missing) and len(missing) <= math.ceil(len(definition.names) / 4)

@@ -2,8 +2,8 @@
 
 When an estimator corrects itself, its position jumps, and the message holds the delta.
 A delta explains a jump only if its counter rose by exactly one since the previous message.
-A new origin also counts as a reset, but its delta may describe a jump that did not happen, so it is compared with the
-values. Source: real logs, in one of which `delta_z` is -179.5 m and z moved by 2 mm.
+A new origin also counts as a reset, but its delta may describe a jump that did not happen, so it is checked against
+the values. Source: real logs, in one of which `delta_z` is -179.5 m and z moved by 2 mm.
 """
 
 import math
@@ -26,12 +26,12 @@ _VALUES: Final[Mapping[Quantity, tuple[str, ...]]] = {
 RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" for name in _VALUES}
 """The field that counts the resets of each quantity, modulo 256."""
 
-_TOLERANCE: Final = 2.0  # m between an observed jump at a new origin and a candidate that explains it
+_TOLERANCE: Final = 2.0  # m between the observed jump at a new origin and a candidate explanation
 
 
 @dataclass(frozen=True, slots=True)
 class Continuous:
-    """One point of a continuous track: the values of a message without the jumps of all resets since its beginning.
+    """One point of a continuous track: a message's values without the jumps of all resets since the track began.
 
     Frame and units are those of the message; `heading` is within [-pi, pi].
     `reset`: quantities that were reset just before this message, explained or not.
@@ -55,9 +55,9 @@ class Continuous:
 
 
 class ResetTracker:
-    """Tracker of one stream, that is, one address; each EKF has its own resets and its own origin.
+    """Tracker of one stream, that is, one address; each EKF has its own resets and origin.
 
-    PX4's selector of several EKFs does not report resets of `dist_bottom`, so that track may jump.
+    PX4's EKF2 selector does not report resets of `dist_bottom`, so that track may jump.
     """
 
     def __init__(self) -> None:
@@ -138,6 +138,6 @@ def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: 
 
 
 def _origin(message: Message) -> tuple[float | None, ...]:
-    """Return the origin with None for NaN, which makes two missing origins equal."""
+    """Return the origin with None for NaN, so that missing origins compare equal."""
     values = (message.ref_lat, message.ref_lon, message.ref_alt)
     return tuple(value if math.isfinite(value) else None for value in values)

@@ -16,13 +16,13 @@ from .model.message import Message
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"
 RATE: Final = "/@rate/"
-"""Between the key of a stream and its downsampled rate [messages per second]."""
+"""Separator between the key of a stream and its downsampled rate [messages per second]."""
 REJECTED: Final = "/@rejected"
-"""Addition to the prefix in the keys of reports on rejected messages."""
+"""Appended to the prefix in the keys of reports on rejected messages."""
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TOPIC_LENGTH: Final = 64
-_SIMILAR: Final = 0.9  # similarity from which a name counts as a misspelling of another
+_TYPO_SIMILARITY: Final = 0.9  # from which a name counts as a misspelling
 _STREAM = re.compile(r"/([^/]*)/([^/]*)(?:/(0|[1-9][0-9]{0,2}))?")
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
@@ -36,7 +36,7 @@ _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 class Address:
     """The address of a stream: vehicle, topic and, where the topic has instances, the uORB instance.
 
-    Sorted in this order, without an instance before instance 0.
+    Addresses sort by these fields; no instance sorts before instance 0.
 
     Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, a topic that `get_topic` rejects, a
     missing instance where the topic has instances, or an instance where it has none.
@@ -86,7 +86,6 @@ class Address:
 
     @property
     def _order(self) -> tuple[str, str, int]:
-        """The order by parts, in which an address without an instance is before those with one."""
         return self.vehicle, self.topic, -1 if self.instance is None else self.instance
 
     def __str__(self) -> str:
@@ -111,7 +110,7 @@ class Selection:
             get_topic(self.topic)
             _check_instance(self.topic, self.instance)
         elif self.instance is not None:
-            raise AddressError("instance", self.instance, "none: give the topic as well")
+            raise AddressError("instance", self.instance, "none without a topic")
 
     def matches(self, address: Address) -> bool:
         """Return whether an address is selected."""
@@ -163,12 +162,12 @@ def ack_key(key_expr: str) -> str:
 
 
 def get_topic(name: object) -> Topic:
-    """Return a topic by name; an unknown name counts as another topic of PX4's.
+    """Return a topic by name; an unknown name counts as a PX4 topic that is not built in.
 
     Raises AddressError for a name that is not lower_snake_case, or looks like a misspelling of a known topic.
     """
     if not isinstance(name, str):
-        raise AddressError("topic", name, 'one name: make a call for each of several topics, or give "*" to read all')
+        raise AddressError("topic", name, 'one topic name (call once per topic), or "*" for all')
     return TOPICS.get(name) or _other_topic(name)
 
 
@@ -177,11 +176,11 @@ def _other_topic(name: str) -> Topic:
     if not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
         topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
         base, _, instance = name.partition("/")
-        expected = f"one of {', '.join(topics)}" + ", or another of PX4's in lower_snake_case" * (topics is TOPICS)
-        raise AddressError("topic", name, f"{base}, and {instance} as its instance" if base in TOPICS else expected)
-    if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
+        expected = f"one of {', '.join(topics)}" + ", or another PX4 topic in lower_snake_case" * (topics is TOPICS)
+        raise AddressError("topic", name, f"{base} with instance {instance}" if base in TOPICS else expected)
+    if meant := get_close_matches(name, TOPICS, 3, _TYPO_SIMILARITY):
         raise AddressError("topic", name, f"{' or '.join(meant)} (looks like a misspelling)")
-    return Topic(name, 0.0, "another topic of PX4's", instances=None)
+    return Topic(name, 0.0, "another PX4 topic", instances=None)
 
 
 def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
@@ -190,7 +189,7 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
     `px4_1/fmu/out/estimator_local_position_0` has namespace `px4_1` and instance 0.
     `/fmu/in/...` are inputs of the same vehicle. The `_v1` of a versioned topic is ignored.
 
-    Raises AddressError for a name that is not a topic of PX4's.
+    Raises AddressError for a name that no PX4 topic can have.
     """
     *path, name = topic.strip("/").split("/")
     if tuple(path[-2:]) in (_OUT, _IN):
@@ -203,7 +202,7 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
 
 
 def is_vehicle_input(topic: str) -> bool:
-    """Return whether the name of a ROS 2 topic is that of an input of a vehicle, `/fmu/in/...`."""
+    """Return whether a ROS 2 topic is an input of a vehicle, `/fmu/in/...`."""
     return tuple(topic.split("/")[-3:-1]) == _IN
 
 
@@ -220,7 +219,7 @@ def vehicle_name(vehicle: str | int) -> str:
 
 
 def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
-    """Return the topic of a message: the first one of its class, or `topic`, another one of it; a name as it is.
+    """Return the topic of a message: a name as given; for a class, `topic` or its first topic.
 
     Raises AddressError for a topic of another message, and for a class that declares no topics.
     """
@@ -236,7 +235,7 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 def check_vehicle(vehicle: object) -> str:
     """Return a valid vehicle name; raise AddressError for any other."""
     if not isinstance(vehicle, str):
-        expected = 'one name, such as "7": make a call for each of several vehicles, or give "*" to read all'
+        expected = 'one name, such as "7" (call once per vehicle), or "*" for all'
         raise AddressError("vehicle", vehicle, expected)
     if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
@@ -247,7 +246,7 @@ def _check_instance(topic: str, instance: int | None) -> None:
     if instance is None:
         return
     if get_topic(topic).instances is False:
-        raise AddressError("instance", instance, f"none: {topic} has no instances")
+        raise AddressError("instance", instance, f"none, as {topic} has no instances")
     if type(instance) is not int or not 0 <= instance < _INSTANCES:
         raise AddressError("instance", instance, f"0 to {_INSTANCES - 1} for {topic}")
 

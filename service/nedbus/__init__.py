@@ -1,4 +1,4 @@
-"""nedbus: PX4's local position estimate, validated, on every host.
+"""nedbus: PX4 messages, validated with Pydantic, on Zenoh.
 
 import nedbus
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         define_msg,
     )
     from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, mask_invalid, to_array, to_message
-    from nedbus_msgs.messages import *  # noqa: F403 - each by its name
+    from nedbus_msgs.messages import *  # noqa: F403 - one class per PX4 message
 
     from . import errors as errors
     from . import frames as frames
@@ -74,13 +74,13 @@ __all__ = [
     "define_msg", "dtype_of", "mask_invalid", "missing_of", "read", "to_array", "to_message", "utc_of",
 ]  # fmt: skip
 
-# Imported on first use of a name: `nedbus --version` needs none of them, and only the last two load NumPy.
+# Imported on first use of a name, for fast start: `nedbus --version` needs none; only the last two load NumPy.
 _MODULES = "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client", "nedbus_msgs.arrays", "nedbus.recording"
 _SUBMODULES = "errors", "frames", "health"
 
 
 def __dir__() -> list[str]:
-    """Return the public names, loaded or not, for completion."""
+    """Return all public names, also those not imported yet, for tab completion."""
     messages = _import_module("nedbus_msgs").MESSAGES
     return sorted({*__all__, *messages, *_SUBMODULES, *(name for name in globals() if name.startswith("__"))})
 
@@ -88,7 +88,7 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # otherwise type checkers would accept any name
 
     def __getattr__(name: str) -> object:
-        """Import the module of a public name on first use."""
+        """Import a public name on first use."""
         if name in __all__:
             module = next(each for each in map(_import_module, _MODULES) if hasattr(each, name))
             return globals().setdefault(name, getattr(module, name))

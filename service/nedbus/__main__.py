@@ -1,4 +1,4 @@
-"""`python -m nedbus` is `nedbus`."""
+"""Entry point of `python -m nedbus`, the same as the command `nedbus`."""
 
 from nedbus.cli import main
 

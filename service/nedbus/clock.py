@@ -1,6 +1,6 @@
-"""The clocks of this host: a steady one that all decisions use, and the settable one, which only labels.
+"""Clocks of this host: monotonic time for all decisions, Unix time only for labels.
 
-NTP, a GNSS receiver or a person may set the host's clock at any time, forth or back.
+NTP, a GNSS receiver or a user may step the Unix clock forward or back at any time.
 """
 
 import time
@@ -10,24 +10,24 @@ from typing import Final
 _START: Final = time.time() - time.monotonic()
 
 utc_ns = time.time_ns
-"""Return the Unix time by the host's clock [ns]; not a function of ours, as each sample calls it."""
+"""Unix time of the host's clock [ns]; an alias, not a wrapper, as it is called for every sample."""
 
 
 def steady() -> float:
-    """Return a monotonic time [s] that equals the host's Unix time when this process starts."""
+    """Return a monotonic time [s] that starts at the host's Unix time when this process starts."""
     return _START + time.monotonic()
 
 
 def utc() -> float:
-    """Return the Unix time by the host's clock [s]."""
+    """Return the Unix time of the host's clock [s]."""
     return utc_ns() / 1e9
 
 
 def now() -> datetime:
-    """Return the UTC date and time by the host's clock."""
+    """Return the UTC date and time of the host's clock."""
     return datetime.fromtimestamp(utc(), UTC)
 
 
 def to_utc() -> float:
-    """Return what to add to a steady time to label it with the Unix time [s], in ms."""
+    """Return the offset from `steady` to Unix time [s], rounded to ms."""
     return round(utc() - steady(), 3)

@@ -4,23 +4,23 @@
     ├── the caller's arguments
     │   ├── ArgumentError (ValueError)       an invalid argument, such as mode, max_rate or on
     │   │   └── AddressError                 ... a vehicle, topic, instance, key or prefix
-    │   ├── LayoutError (ValueError)         a layout that is unknown
+    │   ├── LayoutError (ValueError)         an unknown layout
     │   ├── InvalidMessageError (ValueError) a message to publish with an invalid field
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
-    │   ├── ConfigError (ValueError)         a setting, a flag or a line of a file
-    │   ├── PkiError                         a key or certificate that cannot be made
+    │   ├── ConfigError (ValueError)         an invalid setting, flag or line of a file
+    │   ├── PkiError                         a key or certificate that cannot be created
     │   └── OutputError (OSError)            a recording or a picture that cannot be written
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            cannot listen on the endpoint: the port is taken, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
     │   ├── ClosedError (RuntimeError)       the bus was closed
-    │   ├── ReceiveError (RuntimeError)      a subscription that its session or its thread ended
-    │   └── ForkError (RuntimeError)         this process was forked from one that was connected
+    │   ├── ReceiveError (RuntimeError)      a subscription ended by its session or thread
+    │   └── ForkError (RuntimeError)         this process was forked from a connected one
     └── the data
         ├── DecodeError (ValueError)         a payload that is not a valid message
-        │   └── UnknownLayoutError           ... because its layout is newer than this reader
+        │   └── UnknownLayoutError           ... with a layout newer than this version of nedbus
         └── SourceError                      a source that cannot be opened or read
 
 `VehicleLocalPosition(...)` and `to_message` raise Pydantic's ValidationError, which is also a ValueError.
@@ -55,7 +55,7 @@ class AddressInUseError(NedbusError, ValueError):
     """Raised for a second publisher of the same address in one process."""
 
     def __init__(self, address: Address) -> None:
-        super().__init__(f"this process already publishes {address}: give one of the publishers another vehicle")
+        super().__init__(f"this process already publishes {address}: use another vehicle for one of the publishers")
         self.address = address
 
 
@@ -73,13 +73,13 @@ class ConfigError(NedbusError, ValueError):
 
     @classmethod
     def in_file(cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None) -> ConfigError:
-        """Create the error for a position in a file."""
+        """Return the error for a position in a file."""
         position = f", line {line}, column {column}" if line else ""
         return cls(f"{path}{position}", reason)
 
 
 class ConnectError(NedbusError, ConnectionError):
-    """Raised when no endpoint answered in time."""
+    """Raised when no endpoint answers in time."""
 
     def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
         self.endpoints = tuple(endpoints)
@@ -87,15 +87,15 @@ class ConnectError(NedbusError, ConnectionError):
         where = " or ".join(endpoints)
         if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
             advice = reason or (
-                "check that tls_ca is the router's authority and signed tls_certificate, that neither has expired, and"
-                " that the router's certificate names this host"
+                "check that tls_ca signed the router's certificate and tls_certificate, that none of them has expired,"
+                " and that the router's certificate names this host"
             )
             super().__init__(f"no TLS connection to {where}: {advice}; 'nedbus doctor' finds the cause")
         else:
             super().__init__(
                 f"nothing answers at {where} ({tried}): start 'nedbus serve' or a Zenoh router there, or name another"
-                " endpoint with --connect or NEDBUS_CONNECT; a router with no room for more sessions does not answer"
-                " either: 'nedbus doctor' finds the cause"
+                " endpoint with --connect or NEDBUS_CONNECT; a router at its session limit does not answer either:"
+                " 'nedbus doctor' finds the cause"
             )
 
 
@@ -114,26 +114,26 @@ class ListenError(NedbusError, OSError):
 
 
 class NoDataError(NedbusError, TimeoutError):
-    """Raised when nothing arrived in time."""
+    """Raised when no message arrives in time."""
 
     def __init__(self, what: str, seconds: float) -> None:
-        super().__init__(f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows what there is")
+        super().__init__(f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows the published streams")
 
 
 class PkiError(NedbusError):
-    """Raised when a key or certificate cannot be created, or would overwrite an existing one."""
+    """Raised when a key or certificate cannot be created, read or renewed, or would overwrite an existing one."""
 
 
 class OutputError(NedbusError, OSError):
-    """Raised when a file cannot be written; messages of a recording that were flushed before can be read."""
+    """Raised when a file cannot be written; messages of a recording flushed before the error remain readable."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         hints = {
             errno.EEXIST: "choose another name, or remove it",
-            errno.ENOSPC: "free some space, or write elsewhere",
+            errno.ENOSPC: "free some space, or write to another disk",
             errno.ESTALE: "the written data is lost; write to a folder that is not cleaned up",
         }
-        hint = hints.get(error.errno or 0, "check that its folder exists and that this user may write there")
+        hint = hints.get(error.errno or 0, "check that its folder exists and is writable by this user")
         super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")
         self.path = path
 
@@ -146,7 +146,7 @@ class ClosedError(NedbusError, RuntimeError):
 
 
 class ReceiveError(NedbusError, RuntimeError):
-    """Raised when a subscription ended although neither it nor its bus was closed."""
+    """Raised when a subscription ends although neither it nor its bus was closed."""
 
     def __init__(self, what: str, reason: str) -> None:
         super().__init__(f"{what}: receiving has ended ({reason}): close the bus, and connect and subscribe again")

@@ -1,4 +1,4 @@
-"""Optional dependencies: import modules on first use."""
+"""Optional dependencies, imported on first use."""
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -7,11 +7,11 @@ from typing import Any, Final
 from .errors import ConfigError
 
 EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pki", "web"})
-"""The extras of this package, as in `pip install ".[mcap]"` in a clone."""
+"""The extras of the nedbus package, as in `pip install ".[mcap]"` in a clone."""
 
 
-def needs(extra: str, module: str) -> Any:
-    """Import and return a module that requires an extra or another package.
+def import_optional(extra: str, module: str) -> Any:
+    """Import and return a module that requires an extra, or a package that belongs to no extra.
 
     Raises ConfigError, with the package to install, if a dependency of the module is missing.
     """
@@ -19,21 +19,21 @@ def needs(extra: str, module: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
-        # Never install by name alone: on PyPI the name belongs to another project.
+        # Never install nedbus by its name alone, which on PyPI belongs to another project.
         hint = f"in a clone of nedbus, pip install '.[{extra}]'" if extra in EXTRAS else f"pip install {extra}"
         raise ConfigError(missing, f"not installed: {hint}") from exc
 
 
 def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:
-    """Return a `__getattr__` for a package whose names are imported on first use.
+    """Return a `__getattr__` for a package that imports its exported names on first use.
 
-    `modules`: the extra ("" for none) and the module of each name.
+    `modules`: extra ("" for none) and module of each exported name.
     """
 
     def get(name: str) -> object:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         extra, module = modules[name]
-        return getattr(needs(extra, f"{package}.{module}"), name)
+        return getattr(import_optional(extra, f"{package}.{module}"), name)
 
     return get

@@ -1,4 +1,4 @@
-"""Health of streams, and what a bus returns about services, publishers, vehicles, events and rejected messages."""
+"""Stream health, and the status types that a bus returns: services, publishers, vehicles, events, rejections."""
 
 from .client import (
     Health,

@@ -1,4 +1,4 @@
-"""The closed list of log events, and the structured data of a log record: stream, source, reason."""
+"""The closed list of log events, and the structured data of a log record."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ class Event:
     """One kind of log event.
 
     `doc`: its meaning, for the manual.
-    `limited`: rate-limited, as a peer can cause it at any rate. Events of the process's own lifecycle, and those that
-    its own pauses limit, are always logged.
+    `limited`: rate-limited, because peers can trigger it at any rate. Lifecycle events of the process, and events that
+    its own backoff already limits, are always logged.
     """
 
     doc: str
@@ -24,53 +24,53 @@ EVENTS: Final[Mapping[str, Event]] = {
     # the process
     "router": Event("a router listens, or ignores part of its configuration file", limited=False),
     "client": Event("the service is a client of a router", limited=False),
-    "http": Event("metrics, health or the page are served, and to which hosts; or too many clients", limited=False),
-    "setting": Event("a setting or an environment variable looks wrong", limited=False),
-    "reload": Event("SIGHUP was received: the changes, or the reason for none", limited=False),
-    "ending": Event("the process stops on a signal, or fails to stop in time", limited=False),
-    "notice": Event("information for a user at a terminal", limited=False),
-    "error": Event("the command failed and exits", limited=False),
-    "bug": Event("an unexpected error, a bug in nedbus; one message, answer or page is skipped"),
-    "left-out": Event("`count` lines of the event `of` were left out", limited=False),
+    "http": Event("the HTTP server listens, is open to other hosts, or refuses a client", limited=False),
+    "setting": Event("an environment variable looks like a misspelled setting", limited=False),
+    "reload": Event("settings were reloaded (SIGHUP) or rejected, or a removed source stopped", limited=False),
+    "shutdown": Event("the process stops on a signal, or did not stop in time", limited=False),
+    "notice": Event("a hint for a user at a terminal", limited=False),
+    "error": Event("a command failed and exits, or a subscription ended unexpectedly", limited=False),
+    "internal_error": Event("a bug in nedbus: an unexpected error; one message, reply or page is skipped"),
+    "suppressed": Event("`count` lines of the event `of` were suppressed by the rate limit", limited=False),
     # a source
-    "listening": Event("a live source is open", limited=False),
-    "opened": Event("a replay is open: its content", limited=False),
-    "waiting": Event("a replay waits for its first reader", limited=False),
-    "damaged": Event("a file is damaged, or part of it is left out", limited=False),
-    "late": Event("a replay fell behind, and continues without catching up"),
-    "retrying": Event("a source failed, and restarts after a pause", limited=False),
+    "listening": Event("a live source is open and receives", limited=False),
+    "replay_opened": Event("a replay is open; the text summarizes its content", limited=False),
+    "replay_waiting": Event("a replay waits for its first subscriber", limited=False),
+    "damaged": Event("a file or a definition is damaged, or part of it is skipped", limited=False),
+    "replay_late": Event("a replay fell behind its schedule, and continues from there without catching up"),
+    "retrying": Event("a source failed, and restarts after a backoff", limited=False),
     "done": Event("a source has ended", limited=False),
-    "failed": Event("a source has failed for good", limited=False),
+    "failed": Event("a source has failed, and is not restarted", limited=False),
     "progress": Event("the number of messages that a source has published", limited=False),
     # a stream
     "published": Event("a live stream is published"),
-    "back": Event("a stale stream is published again"),
-    "stale": Event("a live stream received no message for 3 s: it is no longer published"),
-    "silent": Event("a vehicle announces a topic, but sends no messages on it while others arrive"),
-    "rejected": Event("a message from a source is not published: it cannot be decoded, or violates a rule"),
-    "duplicate": Event("another process publishes the same stream, or another MAVLink sender has the same system id"),
+    "stream_resumed": Event("a stale stream is published again"),
+    "stale": Event("a live stream has received no message for 3 s, and is no longer published"),
+    "topic_silent": Event("a vehicle advertises a topic but sends no message on it, while other topics arrive"),
+    "rejected": Event("a message from a source is not published, because it cannot be decoded or violates a rule"),
+    "duplicate": Event("another process publishes the same vehicle, or two MAVLink senders share a system id"),
     "rebooted": Event("a vehicle rebooted"),
-    "log-stream": Event("the ULog stream of a vehicle begins, ends or is refused, or its file is opened or given up"),
-    "unsupported": Event("a vehicle does not send a requested message"),
-    "looped": Event("a key comes from `nedbus ros2`, and is ignored"),
+    "log_stream": Event("the ULog stream of a vehicle starts, ends or is refused, or its file is opened or abandoned"),
+    "unsupported": Event("a vehicle, a publisher or ROS 2 does not support a requested message or rate"),
+    "bridge_loop": Event("a topic published by `nedbus ros2` is ignored, as it would loop back"),
     # a reader
-    "invalid": Event("a received message or answer cannot be decoded"),
-    "newer-layout": Event("messages have a layout that is newer than this reader"),
-    "described": Event("a message that nedbus has no file for is decoded as its publisher describes it"),
-    "dropped": Event("a reader is slower than the data: messages are dropped"),
-    "incomplete": Event("not all vehicles are known, or not all answers were kept"),
-    "slow-reader": Event("a lossless publisher waits for a reader, or gives up on it"),
+    "invalid": Event("a received message or reply cannot be decoded"),
+    "newer_layout": Event("messages have a newer layout than this version of nedbus supports"),
+    "runtime_definition": Event("a message without a .msg file in nedbus is decoded with its publisher's definition"),
+    "dropped": Event("a reader is too slow, and messages are dropped"),
+    "incomplete": Event("a limit or a timeout was reached: vehicles, streams or replies are missing"),
+    "slow_reader": Event("a lossless publisher waits for a slow reader, or gives up on it"),
     # a link
-    "link-broken": Event("the link to a router broke, or does not come up"),
-    "link-back": Event("the link to a router is up, or up again"),
-    "client-refused": Event("a router refuses a client, usually for its certificate"),
-    "refused": Event("the router's access rules drop the messages of a vehicle"),
-    "accepted": Event("the router accepts the messages of a vehicle that it refused before"),
+    "link_lost": Event("the link to a router is lost, or does not come up"),
+    "link_up": Event("the link to a router is up, for the first time or again"),
+    "client_refused": Event("a router refuses a client, usually for its certificate"),
+    "access_denied": Event("the router's access rules drop the messages of a vehicle"),
+    "access_granted": Event("the router accepts the messages of a vehicle that it dropped before"),
     # nedbus ros2
-    "bridged": Event("a stream is published in ROS 2"),
-    "conflict": Event("a stream is not published in ROS 2: another stream or node has its topic"),
-    "withdrawn": Event("a stream is no longer published in ROS 2"),
-    "held-back": Event("messages were too late for ROS 2"),
+    "bridged": Event("a stream is published to ROS 2"),
+    "conflict": Event("a stream is not published to ROS 2, because another stream or node publishes its topic"),
+    "withdrawn": Event("a stream is no longer published to ROS 2"),
+    "bridge_late": Event("messages arrived too late to be published to ROS 2"),
 }
 """All events logged above DEBUG, by stable name."""
 

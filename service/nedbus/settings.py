@@ -1,4 +1,4 @@
-"""Settings from `nedbus.toml`, the environment and flags, each overriding the previous one; read here alone."""
+"""Settings from `nedbus.toml`, the environment and flags, each overriding the previous; no other module reads them."""
 
 import difflib
 import logging
@@ -22,13 +22,13 @@ from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_nam
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-_MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters from which a variable counts as the beginning of a setting's name
+_MIN_PREFIX: Final = len("NEDBUS_TLS")  # length from which a variable's name counts as a truncated setting
 
-_Place = tuple[int | None, int | None]  # line and column, counted from 1; None if unknown
+_Position = tuple[int | None, int | None]  # line and column from 1; None if unknown
 
 
 def split_sources(value: object) -> object:
-    """Split at semicolons and line breaks; if there are none, at commas followed by `KIND:`."""
+    """Split a text at semicolons and line breaks; without any, at commas followed by `KIND:`."""
     if not isinstance(value, str):
         return value
     parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
@@ -50,12 +50,12 @@ def split_http(where: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a server on this address can be reached from this host only."""
+    """Return whether a server on this address is reachable from this host only."""
     return host in {"127.0.0.1", "::1", "localhost"}
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that runs a check, which raises for an invalid value, and keeps the value."""
+    """Return a validator that calls `check`, which raises for an invalid value, and keeps the value."""
 
     def validate(value: str) -> str:
         check(value)
@@ -69,31 +69,31 @@ Endpoints = Annotated[tuple[_Endpoint, ...], NoDecode, BeforeValidator(split_val
 
 
 class Settings(BaseSettings):
-    """All settings. Each is also NEDBUS_<FIELD> in the environment, with several values separated by commas.
+    """All settings, also read from the environment as NEDBUS_<FIELD>, with multiple values separated by commas.
 
     Separate sources by semicolons if their options contain commas.
-    Create it with `load_settings`, whose errors name the flag, the variable, or file, line and column.
+    Create an instance with `load_settings`, whose errors name the flag, the variable, or file, line and column.
     """
 
     model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
 
-    connect: Endpoints = Field((), description="Endpoints of Zenoh routers; the first one that answers is joined")
-    tls_ca: Path | None = Field(None, description="Authority that signed the routers of tls/ endpoints, PEM")
+    connect: Endpoints = Field((), description="Endpoints of Zenoh routers; the first that answers is used")
+    tls_ca: Path | None = Field(None, description="CA certificate for the routers of tls/ endpoints, PEM")
     tls_certificate: Path | None = Field(None, description="Certificate that this client presents to routers, PEM")
-    tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
+    tls_key: Path | None = Field(None, description="Private key of that certificate, PEM")
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
     router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
-    prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
+    prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="Prefix of every key expression")
     vehicle: Annotated[str, BeforeValidator(vehicle_name), _checked(check_vehicle)] = Field(
-        "1", description="Vehicle of sources that name none"
+        "1", description="Default vehicle id of sources"
     )
     source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
-        (), description="Published sources: texts, or tables of TOML"
+        (), description="Sources to publish: texts, or TOML tables"
     )
     http: Annotated[str, _checked(split_http)] | None = Field(
-        None, description="HOST:PORT of /metrics, /healthz, /readyz, /vehicles and /status"
+        None, description="HOST:PORT of the HTTP server for /metrics, /healthz, /readyz, /vehicles and /status"
     )
-    until_done: bool = Field(False, description="End when every finite source has ended")
+    until_done: bool = Field(False, description="Exit when every finite source has ended")
 
     _set_by: dict[str, str] = PrivateAttr(default_factory=dict)
     _file: Path | None = PrivateAttr(None)
@@ -101,17 +101,17 @@ class Settings(BaseSettings):
 
     @property
     def routers(self) -> tuple[str, ...]:
-        """The endpoints for a client to join: `connect`, else those of the router that these settings start."""
+        """Endpoints that a client dials: `connect`, else those of the embedded router of these settings."""
         return self.connect or tuple(map(dial_endpoint, self.router_endpoints))
 
     @property
     def router_endpoints(self) -> tuple[str, ...]:
-        """The endpoints that the embedded router of a service listens on."""
+        """Endpoints that the embedded router of a service listens on."""
         return router_endpoints(self.listen, self.router_config)
 
     @property
     def is_client(self) -> bool:
-        """True if a service joins other routers without being one itself."""
+        """True if a service connects to routers without running one itself."""
         return bool(self.connect) and not (self.listen or self.router_config)
 
     def set_by(self, name: str) -> str:
@@ -120,15 +120,15 @@ class Settings(BaseSettings):
 
     @property
     def left_out(self) -> frozenset[str]:
-        """The settings that `find_mistakes` left out, in whole or in part, as they are invalid or cannot be read."""
+        """Settings that `find_mistakes` dropped, in whole or in part, as invalid or unreadable."""
         return self._left_out
 
     @property
     def tls(self) -> Tls | None:
-        """The files for tls/ endpoints; raises ConfigError if some are missing."""
+        """TLS files for tls/ endpoints; raises ConfigError if some are missing."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
-                raise ConfigError("tls_ca", "a certificate is set, but not the authority to trust: set both")
+                raise ConfigError("tls_ca", "a certificate is set, but not the CA to trust: set both")
             return None
         return Tls(self.tls_ca, self.tls_certificate, self.tls_key)
 
@@ -151,7 +151,7 @@ def load_settings(
 def load_client_settings(
     file: str | Path | None, *, connect: str | Sequence[str] | None, prefix: str | None, tls: Tls | None
 ) -> Settings:
-    """Return the settings of a client; with `connect`, those that it does not need may be wrong in the file."""
+    """Return the settings of a client; with `connect`, settings that a client ignores may be invalid in the file."""
     needed: set[str] | None = None
     if connect is not None:
         needed = {"prefix"} if prefix is None else set()
@@ -163,7 +163,7 @@ def load_client_settings(
 def find_mistakes(
     file: str | Path | None = None, needed: Collection[str] | None = None, /, **given: object
 ) -> tuple[Settings, list[ConfigError]]:
-    """Return the settings as `load_settings` does, without invalid values, and the errors for those."""
+    """Return the settings as `load_settings` does, without invalid values, and an error for each invalid value."""
     flags = {name: value for name, value in given.items() if value is not None}
     mistakes: list[ConfigError] = []
     path, content = None, dict[str, object]()
@@ -180,7 +180,7 @@ def find_mistakes(
     except ValidationError as exc:
         details = exc.errors()
         settings = Settings(**_without_mistakes(values, details))
-    _warn_of_misspelt_variables()
+    _warn_about_misspelled_variables()
     settings._file, wrong = path, {str(detail["loc"][0]) for detail in details}
     settings._set_by.update({name: _set_by(name, path, flags) for name in wrong | settings.model_fields_set})
     mistakes += [_setting_error(settings, detail) for detail in details]
@@ -189,7 +189,7 @@ def find_mistakes(
 
 
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
-    """Return an error for a setting with its location: file, line and column, or the name of the flag or variable."""
+    """Return the error for a setting, located by file, line and column, or by the name of the flag or variable."""
     path, setter = settings._file, settings.set_by(name) or name
     if path is None or setter != str(path):
         return ConfigError(setter, reason)
@@ -198,7 +198,7 @@ def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
 
 
 def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
-    """Return the error of a source with its location: file, line and column, or the name of the variable."""
+    """Return the error of a source, located by file, line and column, or by the name of the variable."""
     setter = settings.set_by("source")
     if settings._file is None or setter != str(settings._file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
@@ -207,7 +207,7 @@ def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigE
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
-    """Return the file to read, None if there is none; raise ConfigError if a named one does not exist."""
+    """Return the settings file, None if there is none; raise ConfigError if a given file does not exist."""
     named = given or os.environ.get("NEDBUS_CONFIG")
     if not named:
         return DEFAULT_FILE if DEFAULT_FILE.is_file() else None
@@ -225,7 +225,7 @@ def _from_environment(name: str) -> str | None:
 
 
 def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
-    """Return the values with each invalid setting replaced by its default, or without the invalid items of a list."""
+    """Return the values with invalid settings replaced by their defaults; of a list, only invalid items are dropped."""
     wrong: dict[str, set[int | str]] = defaultdict(set)
     for detail in details:
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
@@ -241,13 +241,12 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
 
 
 def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
-    """Return the origin of a setting: the name of the flag, the environment variable or the file."""
     if name in flags:
         return name
     return _variable(name) if _from_environment(name) else str(path or name)
 
 
-def _warn_of_misspelt_variables() -> None:
+def _warn_about_misspelled_variables() -> None:
     known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
     for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
         longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)
@@ -288,31 +287,31 @@ def _read_toml(path: Path) -> dict[str, object]:
         raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
 
 
-def _find_key(text: str, name: str) -> _Place:
-    """Return line and column of a key or a table, which TOML parsers do not keep."""
+def _find_key(text: str, name: str) -> _Position:
+    """Return line and column of a key or table, which `tomllib` does not report."""
     found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
-    return place_at(text, found.start(1)) if found else (None, None)
+    return position_at(text, found.start(1)) if found else (None, None)
 
 
-def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Place:
-    """Return line and column of the source with this index, a table or a text in a list, or of one of its options."""
+def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Position:
+    """Return line and column of a source, a table or a text in a list, or of one of its options."""
     source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
     if not isinstance(source, str) and index < len(headers):
         start = headers[index].start(1)
         end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
         option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
-        return place_at(text, start + option.start(1) if option else start)
+        return position_at(text, start + option.start(1) if option else start)
     if isinstance(source, str):
         found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
         before = sources[:index].count(source)
         if before < len(found):
-            return place_at(text, found[before])
+            return position_at(text, found[before])
     return _find_key(text, "source")
 
 
-def place_at(text: str, start: int) -> _Place:
-    """Return line and column of an index into a text; unknown for a negative index, as from `str.find`."""
+def position_at(text: str, start: int) -> _Position:
+    """Return line and column of an index into a text; (None, None) for -1, as `str.find` returns."""
     if start < 0:
         return None, None
     return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

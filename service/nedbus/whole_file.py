@@ -1,4 +1,4 @@
-"""Atomic writes: a file is written completely or not at all."""
+"""Atomic file writes: the complete file or nothing."""
 
 import errno
 import os
@@ -11,9 +11,9 @@ from pathlib import Path
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield the path of a temporary file in the same folder, and rename it to `path` on success.
 
-    On failure nothing is left behind, and with `replace` the previous file is unchanged.
+    On failure the temporary file is removed, and with `replace` the previous file is unchanged.
 
-    Raises FileExistsError if the file exists and `replace` is false, and any other OSError of the disk.
+    Raises FileExistsError if the file exists and `replace` is false, OSError if it cannot be written.
     """
     target = Path(os.path.realpath(path))
     exists = FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
@@ -32,9 +32,9 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
             return
         try:
             target.hardlink_to(part)
-        except FileExistsError:  # another process was faster
+        except FileExistsError:  # another process created it first
             raise exists from None
-        except OSError:  # a file system without links, as of SD cards
+        except OSError:  # a file system without hard links, such as FAT on SD cards
             part.rename(target)
     finally:
         part.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ import zenoh
 
 import nedbus
 from nedbus_msgs import Address
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.waits import DEADLINE, wait_for
 

@@ -1,1 +1,1 @@
-"""Messages and logs that tests send and read."""
+"""Sample messages, replays and ULog files for tests."""

@@ -1,4 +1,4 @@
-"""The message that most tests send, and the names that they send it under."""
+"""The message that most tests publish, and its topic."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ VALID: Final[dict[str, Any]] = {
     **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True),
     **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz", "heading"), 0.0),
 }
-"""Fields of a vehicle that knows where it is, and stands there."""
+"""Fields of a stationary vehicle with a valid position."""
 
 
 def message(timestamp: int = 1, **fields: object) -> VehicleLocalPosition:
-    """Return a message with these fields; what is not given is invalid or zero."""
+    """Return a message with these fields; the others are not provided."""
     return VehicleLocalPosition.model_validate({"timestamp": timestamp, **fields})

@@ -8,12 +8,12 @@ from nedbus.sources import LiveSource, ReplayRun, convert, parse_source
 
 
 def open_replay(text: str) -> ReplayRun:
-    """Return one run of a source that is a replay."""
+    """Open one run of a replay source."""
     source = parse_source(text).open_source(vehicle="1")
     assert not isinstance(source, LiveSource)
     return source.open()
 
 
 def convert_replay(text: str, path: Path) -> str:
-    """Write one run of a source to a recording, as `nedbus convert` does; return its summary."""
+    """Convert a replay source to a recording, as `nedbus convert` does; return its summary."""
     return convert(open_replay(text), path, source=text.partition(":")[0], on_progress=lambda _: None)

@@ -1,4 +1,4 @@
-"""Write small ULog files in PX4's documented format, so that the suite needs no real ones."""
+"""Write small ULog files in PX4's documented format, to test without real logs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from nedbus.sources import FileAccount, read_account
 from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
 from nedbus_msgs import VehicleLocalPosition
-from tests.flights.first_message import FIELD_TYPES, LAYOUTS, downgrade
+from tests.flights.local_position import FIELD_TYPES, LAYOUTS, downgrade
 
 LOGS = Path(__file__).parents[3] / "shared" / "data" / "ulog"
-"""Real flight logs, which tests marked `logs` read where they are."""
+"""Real flight logs, for tests marked `logs`."""
 _NAMES = {"uint64": "uint64_t", "uint8": "uint8_t", "bool": "bool", "float32": "float", "float64": "double"}
 _CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": "d"}
 
@@ -24,22 +24,22 @@ def _type(name: str, field_types: Mapping[str, str]) -> str:
 
 @cache
 def account_of(log: Path) -> FileAccount:
-    """Return the account of a real log, read once for all tests of a worker: a large one takes more than a second."""
+    """Return the events of a real log, cached per worker, as reading a large one takes more than a second."""
     return read_account(log)
 
 
-def said_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:
-    """Return timestamp, severity and text of each of PX4's statements in a log."""
+def log_messages_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:
+    """Return timestamp, severity and text of each log message in a log."""
     parser = UlogParser(verify=True)
     records = [*parser.feed(log if isinstance(log, bytes) else log.read_bytes()), *parser.close()]
     messages = (texts or Texts()).merge(records)
-    spoken = (each for each in messages if isinstance(each, Data) and each.subscription is SPOKEN)
-    found = [SPOKEN.layout.decode(each.payload) for each in spoken]
+    logged = (each for each in messages if isinstance(each, Data) and each.subscription is SPOKEN)
+    found = [SPOKEN.layout.decode(each.payload) for each in logged]
     return [tuple(fields.values()) for fields in found]
 
 
 class UlogWriter:
-    """Write one log, message by message; fields are sorted by size, as PX4 sorts them."""
+    """Writer of one log; fields are sorted by size, as in PX4."""
 
     def __init__(self, *, layout: str = "1.16", system_id: int | None = 1) -> None:
         fields = LAYOUTS[layout].fields
@@ -54,7 +54,7 @@ class UlogWriter:
         self._defined: set[str] = set()
 
     def define(self, topics: Iterable[str], *, without: Sequence[str] = ()) -> None:
-        """Write the format of these topics, without some fields if given."""
+        """Write the format of these topics, omitting the fields in `without`."""
         self._fields = [name for name in self._fields if name not in without]
         for topic in topics:
             text = "".join(f"{self._field_type(name)} {name};" for name in self._fields) + "uint8_t[3] _padding0;"
@@ -62,7 +62,7 @@ class UlogWriter:
             self._defined.add(topic)
 
     def add(self, topic: str, message: VehicleLocalPosition, *, instance: int = 0, **raw: object) -> None:
-        """Write one message; `raw` overrides fields with values that the model rejects."""
+        """Write one message; `raw` overrides fields, even with invalid values."""
         if (topic, instance) not in self._ids:
             self._ids[topic, instance] = len(self._ids)
             self.put("A", struct.pack("<BH", instance, self._ids[topic, instance]) + topic.encode())
@@ -86,14 +86,14 @@ class UlogWriter:
         return struct.pack(f"<{'B' if code == '?' else code}", value)
 
     def put(self, kind: str, body: bytes) -> None:
-        """Write one message of the format itself."""
+        """Write one ULog message of this type."""
         self.data += struct.pack("<HB", len(body), ord(kind)) + body
 
 
 def write_log(
     path: Path, timestamps: Sequence[int], *, topic: str = "vehicle_local_position", **fields: object
 ) -> Path:
-    """Write a log of one topic with messages at these times [us]; x counts them from 0."""
+    """Write a log of one topic with messages at these times [us]; x is their index."""
     writer = UlogWriter()
     writer.define([topic])
     for number, timestamp in enumerate(timestamps):
@@ -105,7 +105,7 @@ def write_log(
 def write_raw_log(
     path: Path, topics: Mapping[str, tuple[str, str]], messages: Iterable[tuple[str, Sequence[object]]]
 ) -> Path:
-    """Write a log of topics with any format: fields as ULog text, and the struct code of a message, by topic."""
+    """Write a log with any topics; `topics`: ULog field list and struct format of each."""
     writer, names = UlogWriter(), list(topics)
     for number, (topic, (fields, _)) in enumerate(topics.items()):
         writer.put("F", f"{topic}:{fields}".encode())

@@ -1,4 +1,4 @@
-"""Optional dependencies: the error where one is missing."""
+"""Optional dependencies: the error for a missing package, and thread safety of the import."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import gc
 import pytest
 
 from nedbus.errors import ConfigError
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 
 
 @pytest.mark.parametrize(
     ("extra", "command"),
     [("mcap", "in a clone of nedbus, pip install '.[mcap]'"), ("polars", "pip install polars")],
 )
-def test_missing_package_is_named_with_its_cure(extra: str, command: str) -> None:
-    """An extra is never installed by the name of nedbus alone, which is not ours on PyPI; another package is."""
+def test_missing_package_raises_with_install_command(extra: str, command: str) -> None:
+    """The error suggests the extra of a clone, as the name nedbus belongs to another project on PyPI."""
     with pytest.raises(ConfigError) as caught:
-        needs(extra, "gone")
+        import_optional(extra, "gone")
     assert str(caught.value) == f"gone: not installed: {command}"
 
 
-def test_import_leaves_garbage_collection_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program that turns garbage collection off while a module is imported, in another thread, finds it off."""
+def test_import_does_not_change_garbage_collection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If another thread disables garbage collection during an import, it stays disabled."""
     seen = list[bool]()
 
     def import_slowly(_: str) -> None:
@@ -31,7 +31,7 @@ def test_import_leaves_garbage_collection_alone(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr("nedbus.extras.import_module", import_slowly)
     try:
-        needs("web", "slow")
+        import_optional("web", "slow")
         assert (seen, gc.isenabled()) == ([True], False)
     finally:
         gc.enable()

@@ -1,14 +1,14 @@
-"""Imports: a command and a script load only the packages that they use."""
+"""Lazy imports: commands and scripts load only the packages that they use."""
 
 from __future__ import annotations
 
 from tests.peers.processes import Start
 
 
-def test_what_is_not_used_is_not_loaded(start: Start) -> None:
-    """A command is there at once: what it does not need is not imported.
+def test_unused_packages_are_not_imported(start: Start) -> None:
+    """Commands start fast, as they import only the packages they use.
 
-    dir() of a fresh import has all public names, and loads only the contract, so that a plain REPL completes them.
+    `dir(nedbus)` lists all public names without importing Zenoh, for tab completion.
     """
     program = """
 import sys

@@ -1,4 +1,4 @@
-"""Settings: nedbus.toml below the environment below flags; every mistake names its place, in a router's file too."""
+"""Settings from nedbus.toml, the environment and flags; errors have file, line and column, also for router files."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from tests.peers.ports import free_endpoint
 from tests.waits import wait_for
 
 
-def test_order_is_file_environment_flag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each beats the one before it; None is no flag. Without any setting a client joins loopback.
+def test_flag_overrides_environment_overrides_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flag of None is ignored; without any setting a client connects to loopback.
 
-    A variable is the place of its mistake.
+    An error in a variable names the variable.
     """
     settings = load_settings()
     assert settings.routers == ("tcp/127.0.0.1:7447",)
@@ -42,8 +42,8 @@ def test_order_is_file_environment_flag(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("is_async", [False, True])
-def test_script_with_an_endpoint_reads_what_it_needs(tmp_path: Path, endpoint: str, *, is_async: bool) -> None:
-    """With an endpoint only `prefix` and, for tls/, the files of TLS are read from ./nedbus.toml."""
+def test_connect_with_endpoint_ignores_unrelated_settings(tmp_path: Path, endpoint: str, *, is_async: bool) -> None:
+    """With an endpoint only `prefix` and, for tls/, the TLS files are read from ./nedbus.toml."""
 
     async def connect_async(where: str | None, prefix: str | None) -> str:
         async with nedbus.connect_async(where, prefix=prefix) as bus:
@@ -68,8 +68,8 @@ def test_script_with_an_endpoint_reads_what_it_needs(tmp_path: Path, endpoint: s
     assert connect(prefix="other") == "other"
 
 
-def test_file_is_the_named_one_or_the_one_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """--config, else NEDBUS_CONFIG, else ./nedbus.toml."""
+def test_settings_file_is_found_by_flag_variable_or_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file is --config, else NEDBUS_CONFIG, else ./nedbus.toml."""
     for name in ("a", "b", "nedbus"):
         (tmp_path / f"{name}.toml").write_text(f'prefix = "{name}"\n')
     assert load_settings().prefix == "nedbus"
@@ -79,7 +79,7 @@ def test_file_is_the_named_one_or_the_one_beside(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize(
-    ("text", "place", "reason"),
+    ("text", "position", "reason"),
     [
         ('connect = ["tcp/a:1"', "line 1, column 21", "Unclosed array"),
         ("vehicle = 1\nx y", "line 2, column 3", "Expected '=' after a key"),
@@ -93,18 +93,18 @@ def test_file_is_the_named_one_or_the_one_beside(tmp_path: Path, monkeypatch: py
         ("{ transport: {link: {tls: {bad: 3}}}}", "line 1, column 28", "unknown field 'bad'"),
     ],
 )
-def test_mistake_in_a_file_is_found(tmp_path: Path, text: str, place: str, reason: str) -> None:
-    """File, line, column, and what to write instead; of a router's, without paths of another program's sources."""
+def test_error_in_a_file_has_line_and_column(tmp_path: Path, text: str, position: str, reason: str) -> None:
+    """The error has file, line, column and remedy; for a router file, without Zenoh's source paths."""
     file = tmp_path / ("router.json5" if text.startswith("{") else "nedbus.toml")
     file.write_text(text)
     with pytest.raises(ConfigError) as info:
         load_settings(file) if file.suffix == ".toml" else open_router(config_file=file)
-    assert re.match(rf"{re.escape(str(file))}, {place}: {reason}", str(info.value))
+    assert re.match(rf"{re.escape(str(file))}, {position}: {reason}", str(info.value))
     assert not re.search(r"/root/|\.rs", str(info.value))
 
 
-def test_file_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file that was asked for must be there, and be one; one that another user owns is no "cannot write"."""
+def test_missing_or_unreadable_settings_file_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A given file must exist and be a regular file; a read error is reported as one."""
     (tmp_path / "folder.toml").mkdir()
     for name in ("no.toml", "folder.toml"):
         with pytest.raises(ConfigError, match=rf"{name}: there is no such file"):
@@ -117,8 +117,8 @@ def test_file_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.M
         load_settings()
 
 
-def test_mark_of_windows_editors_is_read_over(tmp_path: Path) -> None:
-    """A BOM before the first line is no mistake, and lines and columns are counted without it."""
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
+    """A UTF-8 byte order mark is accepted and not counted in columns; other encodings raise."""
     file = tmp_path / "nedbus.toml"
     file.write_bytes(b'\xef\xbb\xbfprefix = "own"\n')
     assert load_settings().prefix == "own"
@@ -135,17 +135,17 @@ def test_mark_of_windows_editors_is_read_over(tmp_path: Path) -> None:
     [
         ("NEDBUS_CONECT", "NEDBUS_CONNECT"),
         ("NEDBUS_SOURCES", "NEDBUS_SOURCE"),
-        # What begins as a setting is more like it than one that differs in fewer letters.
+        # A truncated name takes precedence over a similar name.
         ("NEDBUS_TLS_CERT", "NEDBUS_TLS_CERTIFICATE"),
         ("NEDBUS_TLS_K", "NEDBUS_TLS_KEY"),
         ("NEDBUS_TLS", "NEDBUS_TLS_CA or NEDBUS_TLS_CERTIFICATE or NEDBUS_TLS_KEY"),
         *((f"NEDBUS_{name}", None) for name in ("PUBLISH", "ROUTER_IMAGE", "PKI")),  # of the compose files
     ],
 )
-def test_misspelt_variable_is_reported(
+def test_misspelled_variable_is_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str, meant: str | None
 ) -> None:
-    """A variable that is nearly a setting, or its beginning, is warned of; other variables are not."""
+    """A NEDBUS_ variable similar to a setting, or a truncated setting, causes a warning; other variables do not."""
     monkeypatch.setenv(name, "x")
     load_settings()
     assert caplog.messages == [f"{name} is not a setting: did you mean {meant}?"] * (meant is not None)
@@ -163,14 +163,14 @@ def test_misspelt_variable_is_reported(
         ("px4-zenoh:?vehicles=left:a,right:b\nsim:\n", ["px4-zenoh:?vehicles=left:a,right:b", "sim:"]),
     ],
 )
-def test_sources_in_the_environment(monkeypatch: pytest.MonkeyPatch, text: str, sources: list[str]) -> None:
-    """Commas inside options are theirs; semicolons or lines separate sources whatever their options contain."""
+def test_sources_variable_is_split(monkeypatch: pytest.MonkeyPatch, text: str, sources: list[str]) -> None:
+    """A comma separates sources only before `KIND:`; semicolons and line breaks always separate sources."""
     monkeypatch.setenv("NEDBUS_SOURCE", text)
     assert load_settings().source == tuple(sources)
 
 
-def test_name_without_an_address_is_reported() -> None:
-    """The reason is found on this host, and no other is guessed."""
+def test_unresolvable_host_name_is_reported() -> None:
+    """ConnectError reports a host name that cannot be resolved, but only if all endpoints fail to resolve."""
     with pytest.raises(ConnectError, match=r"cannot resolve no-such-host\.invalid"):
         nedbus.connect("tcp/no-such-host.invalid:7447", timeout=0.1)
     assert explain_endpoints(["tcp/no-such-host.invalid:1", "tcp/127.0.0.1:1"]) is None
@@ -179,7 +179,7 @@ def test_name_without_an_address_is_reported() -> None:
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make an authority, the certificates of two clients, one that expires at once, and files that hold none."""
+    """Create a CA, two client certificates, an expired one, and files without a valid certificate."""
     folder = tmp_path_factory.mktemp("keys")
     make_authority(folder)
     for name, days in (("wing", 100), ("tail", 100), ("old", 0)):
@@ -193,55 +193,55 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("ca", "certificate", "key", "reason"),
     [
-        ("wing.key", "wing.crt", "wing.key", "wing.key holds a private key, where a certificate is needed: check"),
-        ("ca.crt", "wing.key", "wing.crt", "wing.key holds a private key, where a certificate is needed: check"),
-        ("ca.crt", "wing.crt", "ca.crt", "ca.crt holds a certificate, where a private key is needed: check"),
+        ("wing.key", "wing.crt", "wing.key", "wing.key contains a private key, but a certificate is required: check"),
+        ("ca.crt", "wing.key", "wing.crt", "wing.key contains a private key, but a certificate is required: check"),
+        ("ca.crt", "wing.crt", "ca.crt", "ca.crt contains a certificate, but a private key is required: check"),
         ("ca.crt", "wing.crt", "tail.key", "tail.key is not the key of "),
-        ("ca.crt", "empty", "wing.key", "empty holds nothing, where a certificate is needed: 'nedbus pki' makes"),
-        ("text", "wing.crt", "wing.key", "text holds no PEM, where a certificate is needed"),
+        ("ca.crt", "empty", "wing.key", "empty is empty, but a certificate is required: create one with 'nedbus pki'"),
+        ("text", "wing.crt", "wing.key", "text is not PEM, but a certificate is required"),
         ("ca.crt", "cut", "wing.key", "is damaged, or the key has a password"),
         ("gone", "wing.crt", "wing.key", "gone cannot be read"),
         ("ca.crt", ".", "wing.key", "cannot be read"),
     ],
 )
-def test_mistaken_certificate_is_found_locally(keys: Path, ca: str, certificate: str, key: str, reason: str) -> None:
-    """Files that are swapped, empty, damaged, or do not belong together, need no router to be found."""
+def test_invalid_tls_file_raises_without_a_router(keys: Path, ca: str, certificate: str, key: str, reason: str) -> None:
+    """Swapped, empty, damaged or mismatched TLS files raise without a router."""
     with pytest.raises(ConfigError) as info:
         nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=Tls(keys / ca, keys / certificate, keys / key))
     assert reason in str(info.value)
 
 
-def test_certificate_that_is_refused_is_explained(keys: Path, tmp_path: Path) -> None:
-    """A certificate that is expired, or of another authority, is named when nothing answers."""
+def test_expired_or_foreign_certificate_is_explained(keys: Path, tmp_path: Path) -> None:
+    """If no router answers, the error names a certificate that is expired or signed by another CA."""
     other = tmp_path / "other"
     make_authority(other)
     tls = Tls(keys / "ca.crt", keys / "wing.crt", keys / "wing.key")
     assert tls.explain() is None
     assert Tls(keys / "ca.crt").explain() is None
-    assert "not the certificate of an authority" in str(Tls(keys / "wing.crt").explain())
+    assert "not a CA certificate" in str(Tls(keys / "wing.crt").explain())
     old = Tls(keys / "ca.crt", keys / "old.crt", keys / "old.key")
-    wait_for(lambda: "old.crt or its authority has expired" in str(old.explain()), what="its end")
+    wait_for(lambda: "old.crt or its CA has expired" in str(old.explain()), what="expiry")
     foreign = Tls(other / "ca.crt", keys / "wing.crt", keys / "wing.key")
-    assert "wing.crt is not signed by the authority in tls_ca" in str(foreign.explain())
-    with pytest.raises(ConnectError, match=r"wing\.crt is not signed by the authority"):
+    assert "wing.crt is not signed by the CA in tls_ca" in str(foreign.explain())
+    with pytest.raises(ConnectError, match=r"wing\.crt is not signed by the CA"):
         nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=foreign)
 
 
-# What a router refuses to start with
+# Router files and endpoints
 
 
-def test_router_file_must_be_one(tmp_path: Path) -> None:
-    """A missing file and a foreign ending are named."""
-    for name, said in (
+def test_missing_or_foreign_router_file_raises(tmp_path: Path) -> None:
+    """A missing file and an unknown file suffix raise ConfigError."""
+    for name, reason in (
         ("no.json5", "there is no such file"),
         ("router.conf", r"expected a \.json5, \.json, \.yaml or \.yml"),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=reason):
             open_router(config_file=tmp_path / name)
 
 
 def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Zenoh's Python library ignores them without a word: each is named, and one that is required is an error."""
+    """Ignored plugins are logged, as Zenoh's Python library ignores them silently; a required plugin raises."""
     file = tmp_path / "router.json5"
     file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
     open_router(listen=(free_endpoint(),), config_file=file).close()
@@ -255,15 +255,15 @@ def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.
             open_router(config_file=Path(__file__).parents[2] / "config" / name)
 
 
-def test_help_names_every_source() -> None:
-    """`nedbus serve --help` derives from the table of sources: none is forgotten."""
+def test_serve_help_lists_every_source() -> None:
+    """`nedbus serve --help` is generated from the table of sources."""
     help_ = run_command("serve", "--help", COLUMNS="300")
     assert help_.exit_code == 0
     assert all(f" {name}:{kind.target or ''}" in help_.out for name, kind in SOURCE_KINDS.items())
 
 
-def test_address_that_cannot_be_listened_on_names_the_reason(endpoint: str) -> None:
-    """ListenError is an OSError, with what the system said: the port is taken, or the address another host's."""
+def test_listen_error_has_the_reason_of_the_system(endpoint: str) -> None:
+    """ListenError is an OSError with the reason: the port is in use, or the address belongs to another host."""
     for where, reason in ((endpoint, "address already in use"), ("tcp/192.0.2.1:7447", "cannot assign requested")):
         with pytest.raises(ListenError, match=rf"cannot listen on {where} \({reason}") as info:
             open_router(listen=(where,))
@@ -271,8 +271,8 @@ def test_address_that_cannot_be_listened_on_names_the_reason(endpoint: str) -> N
 
 
 @pytest.mark.parametrize("endpoint", ["7447", "localhost:7447", "foo/localhost:7447", "tcp/", ""])
-def test_malformed_endpoint_is_refused(endpoint: str) -> None:
-    """Zenoh's own form of an endpoint is told."""
+def test_malformed_endpoint_raises(endpoint: str) -> None:
+    """The error has the syntax of Zenoh endpoints."""
     with pytest.raises(ConfigError, match=r"write PROTOCOL/HOST:PORT, as in tcp/127\.0\.0\.1:7447"):
         open_client((endpoint,), timeout=0)
     with pytest.raises(ConfigError, match="is not an endpoint"):

@@ -1,1 +1,1 @@
-"""Tests of nedbus_msgs: no network, no processes."""
+"""Tests of nedbus_msgs, mostly without network and processes."""

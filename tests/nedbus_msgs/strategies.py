@@ -1,4 +1,4 @@
-"""Hypothesis strategies for valid messages, with the rules spelled out once more, independently of nedbus_msgs."""
+"""Hypothesis strategies for valid messages, with the rules restated independently of nedbus_msgs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 
 from nedbus_msgs import VehicleLocalPosition
-from tests.flights.first_message import FIELD_TYPES, encode
+from tests.flights.local_position import FIELD_TYPES, encode
 
 DATA = Path(__file__).parents[1] / "data"
 FLIGHTS = [VehicleLocalPosition(**each["fields"]) for each in json.loads((DATA / "flights.json").read_text()).values()]
-"""A message of each of four real flights: with everything, without an origin, and without some fields."""
+"""One message from each of four real flights: with all fields, without an origin, and with fields missing."""
 REAL = [encode(message) for message in FLIGHTS]
 
 FLAG_FIELDS: Mapping[str, tuple[str, ...]] = {
@@ -46,7 +46,7 @@ BREAKING: list[Mapping[str, object]] = [
     *({name: value} for name, bound in BEYOND.items() for value in (bound, -bound, math.inf)),
     {"timestamp": 2**63, "timestamp_sample": 2**63 + 1},
 ]
-"""For each rule, values that just break it; the last one is at fault."""
+"""For each rule, values that just break it; the last one breaks the rule."""
 KEEPING: list[Mapping[str, object]] = [
     *({flag: True, **dict.fromkeys(names, 1.0)} for flag, names in FLAG_FIELDS.items()),
     *({flag: False, name: math.nan} for flag, names in FLAG_FIELDS.items() for name in names),
@@ -54,7 +54,7 @@ KEEPING: list[Mapping[str, object]] = [
     *({name: value} for name, bound in WITHIN.items() for value in (bound, -bound)),
     {"timestamp": 2**64 - 1, "timestamp_sample": 2**64 - 1},
 ]
-"""Values that break no rule, though they are extremes."""
+"""Extreme values that break no rule."""
 
 float32s = st.floats(width=32)
 TYPES: Mapping[str, st.SearchStrategy[object]] = {
@@ -65,7 +65,7 @@ TYPES: Mapping[str, st.SearchStrategy[object]] = {
     "float32[2]": st.tuples(float32s, float32s),
     "float64": st.floats(),
 }
-# Values that the field's own type allows, but perhaps not the rules.
+# Values of the right type that may break a rule.
 SAME_TYPE = {
     **TYPES,
     "float32": float32s | st.sampled_from([-1.0, 3.2, math.nan]),
@@ -75,11 +75,11 @@ FLAGGED = [name for names in FLAG_FIELDS.values() for name in names]
 RULED = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FLAGGED, *NOT_NEGATIVE, *WITHIN]
 BROKEN = st.sampled_from(RULED).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
 MANY = settings(max_examples=10 * settings().max_examples)
-"""For hostile input, which is quickly made and of which little is found with few examples."""
+"""For hostile input, which is fast to generate and needs many examples."""
 
 
 def make_valid(fields: dict[str, object]) -> dict[str, object]:
-    """Change any fields of the right types so that they pass every rule between fields."""
+    """Change fields of the right types to pass every rule."""
     for name in NOT_NEGATIVE:
         value = fields[name]
         assert isinstance(value, float)
@@ -110,12 +110,12 @@ def messages() -> st.SearchStrategy[VehicleLocalPosition]:
 
 
 def bits(message: VehicleLocalPosition) -> dict[str, str]:
-    """Return the values of a message as text: NaN equals NaN, and -0.0 does not equal 0.0."""
+    """Return the values of a message as text, where NaN equals NaN but -0.0 differs from 0.0."""
     return {name: repr(value) for name, value in message.model_dump().items()}
 
 
 def pack_full_width(values: Mapping[str, object]) -> bytes:
-    """Return the payload of values of the right types, whether they pass the rules or not."""
+    """Return the full-width payload of values of the right types, without checking the rules."""
     forms = {"uint64": ">BQ", "uint8": ">BB", "float32": ">Bf", "float64": ">Bd"}
     tags = {"uint64": 0xCF, "uint8": 0xCC, "float32": 0xCA, "float64": 0xCB}
     parts = [b"\xdc\x00\x36\x01"]

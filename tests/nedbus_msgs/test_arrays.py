@@ -1,4 +1,4 @@
-"""Arrays of any length: the same messages, and the same ones valid, as one by one."""
+"""Arrays of any length decode, encode and validate exactly like single messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from nedbus_msgs import DecodeError, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, mask_invalid, to_array
 from nedbus_msgs.messages import HomePosition, VehicleAttitude
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     PAYLOAD_SIZE,
     decode_array,
     decode_cdr_array,
@@ -35,9 +35,9 @@ from tests.nedbus_msgs.strategies import (
     pack_full_width,
 )
 
-# On both sides of each length at which arrays are decoded, encoded or validated in another way.
+# On both sides of each length at which another algorithm is used.
 SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
-Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and what is broken in it
+Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and values that may break its rules
 CASES = st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4)
 
 
@@ -49,8 +49,8 @@ def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
 
 
 @given(st.sampled_from(SIZES), CASES, st.randoms(use_true_random=False))
-def test_array_of_any_length_is_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
-    """Valid and invalid messages among each other: each is what it is alone, whatever the length of the array."""
+def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
+    """Mixed valid and invalid messages are decoded as one by one, for any array length."""
     choices = [*REAL, *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases)]
     payloads = order.choices(choices, k=size)
     rows = {payload: row_or_none(payload) for payload in choices}
@@ -64,8 +64,8 @@ def test_array_of_any_length_is_its_rows(size: int, cases: list[Case], order: ra
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize(("changes", "expected"), [(BREAKING, False), (KEEPING, True)], ids=["breaking", "keeping"])
-def test_each_rule_holds_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
-    """A message that breaks any one rule is invalid, one that just keeps it is valid, and its neighbours always are."""
+def test_each_rule_is_checked_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
+    """A message that breaks a rule is invalid, one on its bound is valid, and neither affects other messages."""
     for change in changes:
         payload = pack_full_width({**FLIGHTS[0].model_dump(), **change})
         assert (row_or_none(payload) is not None) == expected, change
@@ -77,8 +77,8 @@ def test_each_rule_holds_at_any_length(size: int, changes: list[Mapping[str, obj
 
 
 @given(st.sampled_from(SIZES), st.integers(0, PAYLOAD_SIZE - 1), st.integers(0, 255), st.sampled_from(REAL))
-def test_damage_of_one_payload_stays_in_it(size: int, offset: int, byte: int, flight: bytes) -> None:
-    """A payload of which one byte has become another is valid only if it decodes; all others are as they were."""
+def test_corrupt_payload_does_not_affect_others(size: int, offset: int, byte: int, flight: bytes) -> None:
+    """A payload with one changed byte is valid only if it decodes; all other messages are unchanged."""
     damaged = bytearray(flight)
     damaged[offset] = byte
     payloads = [flight] * size
@@ -88,19 +88,19 @@ def test_damage_of_one_payload_stays_in_it(size: int, offset: int, byte: int, fl
     if valid[size // 2]:
         assert row is not None
         assert repr(to_row(array[size // 2])) == repr(tuple(row))  # as text, NaN equals NaN
-    elif row is not None:  # in another width than `encode` writes
+    elif row is not None:  # not full-width
         assert encode_row(row) != payloads[size // 2]
     others = np.arange(size) != size // 2
     assert valid[others].all()
     assert array[others].tobytes() == np.array([decode_row(flight)] * (size - 1), DTYPE).tobytes()
     for name in DTYPE.names or ():
         if DTYPE[name] == np.bool_:
-            assert array[name].view(np.uint8).max() <= 1, "a bool with another byte than 0 and 1 is undefined"
+            assert array[name].view(np.uint8).max() <= 1, "bools other than 0 and 1 are undefined"
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_array_belongs_to_its_reader(size: int) -> None:
-    """The array can be written, and writing to it leaves the payloads as they are."""
+def test_decoded_array_is_a_writable_copy(size: int) -> None:
+    """Writing to the array does not change the payloads."""
     payloads = REAL[0] * size
     array, _ = decode_array(payloads)
     array["x"] = 5.0
@@ -112,7 +112,7 @@ def test_array_belongs_to_its_reader(size: int) -> None:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("step", [-1, 2])
 def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> None:
-    """All backwards, or every second message, need no copy first."""
+    """Reversed and strided views are supported."""
     payloads = [REAL[index % len(REAL)] for index in range(size * abs(step))]
     part = decode_array(b"".join(payloads))[0][::step]
     assert encode_array(part) == b"".join(payloads[::step])
@@ -121,14 +121,14 @@ def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> No
 
 
 @pytest.mark.parametrize("excess", [-1, 1])
-def test_part_of_a_payload_is_an_error(excess: int) -> None:
-    """Bytes that are no whole number of payloads are not cut silently."""
+def test_incomplete_payload_raises(excess: int) -> None:
+    """Bytes that are not a whole number of payloads raise ValueError."""
     with pytest.raises(ValueError, match="reshape"):
         decode_array(bytes(2 * PAYLOAD_SIZE + excess))
 
 
-def test_cdr_that_is_not_certain_is_not_valid() -> None:
-    """A bool that is neither 0 nor 1, another length or another encapsulation is not valid in an array."""
+def test_malformed_cdr_is_not_valid() -> None:
+    """A bool other than 0 or 1, a wrong length or another encapsulation makes only that message invalid."""
     payload = encode_cdr(FLIGHTS[0].model_dump(), layout="1.16")
     first_bool = 4 + 16
     assert payload[first_bool] == 1
@@ -140,8 +140,8 @@ def test_cdr_that_is_not_certain_is_not_valid() -> None:
 
 
 @given(st.lists(messages(), max_size=5))
-def test_invalid_fields_are_masked(sent: list[VehicleLocalPosition]) -> None:
-    """A column is NaN exactly where its flag is false; all others are unchanged, and so is the array itself."""
+def test_mask_invalid_sets_nan_where_the_flag_is_false(sent: list[VehicleLocalPosition]) -> None:
+    """All other values, and the original array, are unchanged."""
     array = to_array(sent)
     before, masked = array.tobytes(), mask_invalid(array)
     assert array.tobytes() == before
@@ -153,8 +153,8 @@ def test_invalid_fields_are_masked(sent: list[VehicleLocalPosition]) -> None:
         assert np.isnan(masked[name][~known]).all()
 
 
-def test_flags_of_any_message_are_masked() -> None:
-    """The flags are those of the message in the array; one without flags is copied as it is."""
+def test_mask_invalid_supports_any_message() -> None:
+    """The array's own flags are used; a message without flags is copied unchanged."""
     home = mask_invalid(to_array([HomePosition(timestamp=1, lat=0.0, lon=0.0, x=1.0, y=2.0, z=3.0, valid_lpos=True)]))
     assert np.isnan([home["lat"], home["lon"]]).all()
     assert [home[name].tolist() for name in "xyz"] == [[1.0], [2.0], [3.0]]

@@ -1,4 +1,4 @@
-"""Flags: how doubts are shown, and positions, velocities and the like, which are None while their flags are false."""
+"""Validity flags: their description in words, and properties that are None while their flags are false."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
 from nedbus_msgs.messages import HomePosition, SensorGps, VehicleGlobalPosition
-from tests.flights.first_message import row_of
+from tests.flights.local_position import row_of
 
 from .strategies import FLAG_FIELDS, messages
 
@@ -37,8 +37,8 @@ EACH = pytest.mark.parametrize(
 )
 
 
-def test_doubts_are_validity_and_dead_reckoning() -> None:
-    """Validity and dead reckoning are shown; global references, terrain and heading are not."""
+def test_doubt_flags_are_validity_and_dead_reckoning() -> None:
+    """Flags of global reference, terrain and heading are not included."""
     assert DOUBT_FLAGS == ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning")
 
 
@@ -60,13 +60,13 @@ def test_doubts_are_validity_and_dead_reckoning() -> None:
     ],
 )  # fmt: skip
 def test_shares_are_described(shares: dict[str, float], text: str) -> None:
-    """Flags that are bad in all messages are grouped; others have a percentage, which is never 0 or 100."""
+    """Flags that are bad in all messages are grouped; others have a percentage, which is never 0 or 100 %."""
     assert describe_flags(shares) == text
 
 
 @given(messages(), st.booleans())
-def test_doubts_have_no_percentage_in_one_message(message: VehicleLocalPosition, as_row: bool) -> None:
-    """A message, or a row, is described by its own flags: it either has a doubt or not."""
+def test_doubts_of_one_message_have_no_percentage(message: VehicleLocalPosition, as_row: bool) -> None:
+    """A message or row is described by its own flags."""
     either = row_of(message) if as_row else message
     assert message_doubts(either) == describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})
     assert "%" not in message_doubts(either)
@@ -77,8 +77,8 @@ def model_and_row(message: Message) -> tuple[Any, Any]:
 
 
 @EACH
-def test_value_is_none_unless_every_flag_is_true(definition: Definition[Any], name: str, flags: list[str]) -> None:
-    """Each flag alone makes a value None, also one that is not provided; zeros with all flags set are a value."""
+def test_property_is_none_unless_all_flags_are_true(definition: Definition[Any], name: str, flags: list[str]) -> None:
+    """Any flag that is false or not provided makes it None; zeros are returned if all flags are set."""
     fields = {field: 0.0 for flag in flags for field in definition.flags[flag]}
     for each in model_and_row(definition.model(timestamp=1, **fields, **dict.fromkeys(flags, True))):
         assert getattr(each, name) is not None
@@ -90,23 +90,23 @@ def test_value_is_none_unless_every_flag_is_true(definition: Definition[Any], na
 
 
 @EACH
-def test_name_of_a_value_is_no_field(definition: Definition[Any], name: str, flags: list[str]) -> None:
-    """No layout of PX4 has a field of that name, nor had one that PX4 renamed."""
+def test_property_name_is_not_a_field(definition: Definition[Any], name: str, flags: list[str]) -> None:
+    """No PX4 layout has a current or renamed field with the name of a property."""
     assert name not in definition.known_types.keys() | definition.older.keys()
     assert name not in definition.row._fields
 
 
-def test_every_flag_guards_a_value() -> None:
-    """A field that a rule FiniteWhile names can be read with its flag checked."""
+def test_every_flag_guards_a_property() -> None:
+    """For every flag of a FiniteWhile rule there is a property that checks it."""
     guarded = {(definition.name, flag) for definition, _, flags in GUARDED for flag in flags}
     flags = {(definition.name, flag) for definition in MESSAGES.values() for flag in definition.flags}
-    assert flags - guarded == {("SensorGps", "vel_ned_valid")}  # its velocity needs a fix as well
+    assert flags - guarded == {("SensorGps", "vel_ned_valid")}  # its velocity also requires a fix
     assert VehicleLocalPosition.DEFINITION.flags == FLAG_FIELDS
 
 
 @given(messages(), st.booleans())
-def test_valid_values_are_those_of_the_fields(message: VehicleLocalPosition, as_row: bool) -> None:
-    """A position has x, y and z in this order, bit for bit; its height points up."""
+def test_properties_return_the_fields(message: VehicleLocalPosition, as_row: bool) -> None:
+    """Each property returns its fields in order, bit for bit; height is positive up."""
     either = row_of(message) if as_row else message
     has_position, has_origin = message.xy_valid and message.z_valid, message.xy_global and message.z_global
     assert either.position == (Ned(message.x, message.y, message.z) if has_position else None)
@@ -120,10 +120,10 @@ def test_valid_values_are_those_of_the_fields(message: VehicleLocalPosition, as_
     assert either.global_position == (to_global(message) if has_position and has_origin else None)
 
 
-def test_other_messages_have_their_positions() -> None:
-    """A global position, home, and the ground below."""
-    where = VehicleGlobalPosition(timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True)
-    assert (where.global_position, where.ground_altitude) == (GlobalPosition(47.0, 8.0, 400.0), None)
+def test_properties_of_global_and_home_position() -> None:
+    """They return position and global position, and None while a flag is false."""
+    estimate = VehicleGlobalPosition(timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True)
+    assert (estimate.global_position, estimate.ground_altitude) == (GlobalPosition(47.0, 8.0, 400.0), None)
     home = HomePosition(timestamp=1, x=1.0, y=2.0, z=-3.0, lat=0.0, lon=0.0, alt=0.0, valid_lpos=True)
     assert (home.position, home.global_position) == (Ned(1.0, 2.0, -3.0), None)
 
@@ -133,9 +133,7 @@ def test_other_messages_have_their_positions() -> None:
     [(0, True, False, False), (1, True, False, False), (2, True, False, True), (3, True, True, True),
      (6, False, True, False)],
 )  # fmt: skip
-def test_gnss_has_a_position_with_a_fix_alone(
-    fix_type: int, flag: bool, has_position: bool, has_velocity: bool
-) -> None:
+def test_gnss_position_requires_a_fix(fix_type: int, flag: bool, has_position: bool, has_velocity: bool) -> None:
     """Receivers without a fix send zeros or an old position, and may set vel_ned_valid."""
     position = {"latitude_deg": 47.0, "longitude_deg": 8.0, "altitude_msl_m": 400.0}
     velocity = {"vel_n_m_s": 1.0, "vel_e_m_s": 2.0, "vel_d_m_s": 3.0}
@@ -145,9 +143,9 @@ def test_gnss_has_a_position_with_a_fix_alone(
         assert each.velocity == (Ned(1.0, 2.0, 3.0) if has_velocity else None)
 
 
-def test_position_of_no_estimate_cannot_be_computed_with() -> None:
-    """A vehicle whose estimator has not begun sends zeros: a script that forgets the flags fails, and does not fly."""
+def test_arithmetic_on_an_invalid_position_raises() -> None:
+    """Before its estimator starts, a vehicle sends zeros: a script that does not check for None fails at once."""
     message = VehicleLocalPosition(timestamp=1, x=0.0, y=0.0, z=0.0)
     assert math.hypot(message.x, message.y, message.z) == 0.0
     with pytest.raises(TypeError):
-        math.dist(message.position, (0.0, 0.0, 0.0))  # type: ignore[arg-type] # None, as mypy says
+        math.dist(message.position, (0.0, 0.0, 0.0))  # type: ignore[arg-type] # may be None

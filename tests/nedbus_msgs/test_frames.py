@@ -1,4 +1,4 @@
-"""Frames and global positions, compared with PX4's own tests and with vehicle_global_position of real logs."""
+"""Frame conversions and global positions, compared with PX4's tests and vehicle_global_position of real logs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from nedbus_msgs.frames import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
-from tests.flights.first_message import row_of
+from tests.flights.local_position import row_of
 from tests.flights.ulogs import LOGS
 
 RADIUS = 6_371_000.0
@@ -46,15 +46,15 @@ def with_origin(**fields: object) -> VehicleLocalPosition:
     return VehicleLocalPosition.model_validate({"timestamp": 1, **origin, **fields})
 
 
-def test_known_projections() -> None:
-    """A degree of latitude at the equator, on PX4's sphere."""
+def test_projection_of_one_degree_of_latitude() -> None:
+    """The distance is that on PX4's sphere."""
     north, east = MapProjection(0.0, 0.0).project(1.0, 0.0)
     assert north == pytest.approx(111194.9266, abs=0.01)
     assert east == pytest.approx(0.0, abs=0.01)
 
 
-def test_local_position_is_global_as_px4_has_it() -> None:
-    """PX4's test values, in both directions."""
+def test_global_and_local_positions_equal_px4s() -> None:
+    """Both directions reproduce the values of PX4's own tests."""
     position = to_global(with_origin(x=0.5, y=1.0, z=-2.0))
     assert position
     assert position.latitude == pytest.approx(47.3566138966073, abs=1e-11)
@@ -64,22 +64,22 @@ def test_local_position_is_global_as_px4_has_it() -> None:
     assert local == pytest.approx((0.842, 2.026, -12.4), abs=1e-3)
 
 
-def test_row_has_a_global_position_too() -> None:
-    """The functions accept rows and models alike."""
+def test_to_global_accepts_a_row() -> None:
+    """A row and its model have the same global position."""
     message = with_origin(x=0.5, y=1.0, z=-2.0)
     assert to_global(row_of(message)) == to_global(message)
 
 
 @pytest.mark.parametrize("fields", [{"x": 1.0, "y": 2.0}, {"xy_global": True, "ref_lat": 1.0, "ref_lon": 2.0}])
 def test_position_without_origin_is_none(fields: dict[str, object]) -> None:
-    """Without a global origin, or without x and y, there is no global position; without an origin no local one."""
+    """to_global needs a global origin, x and y; to_local needs a global origin."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
     assert to_global(message) is None
     assert "xy_global" in fields or to_local(GlobalPosition(47.0, 8.0, 0.0), message) is None
 
 
-def test_altitude_needs_its_own_origin() -> None:
-    """With a horizontal origin alone the altitude is NaN."""
+def test_altitude_without_vertical_origin_is_nan() -> None:
+    """With a horizontal origin only, altitude and z are NaN."""
     message = with_origin(x=1.0, y=1.0, z=1.0, z_global=False)
     position = to_global(message)
     assert position
@@ -91,10 +91,10 @@ def test_altitude_needs_its_own_origin() -> None:
 
 @pytest.mark.logs
 @pytest.mark.parametrize("name", ["sitl_1.15_events.ulg", "nxp_v0_ekf_failure.ulg"])
-def test_real_log_agrees_with_px4s_own_global_position(name: str) -> None:
+def test_to_global_agrees_with_px4_in_real_logs(name: str) -> None:
     """At equal timestamp_sample, to_global and PX4's vehicle_global_position differ by less than 1e-10 degrees."""
     if not (LOGS / name).exists():
-        pytest.skip(f"the real logs are not here: {LOGS}")
+        pytest.skip(f"real logs not found: {LOGS}")
     log = ULog(str(LOGS / name), ["vehicle_local_position", "vehicle_global_position"])
     tables = {data.name: data.data for data in log.data_list if data.multi_id == 0}
     local, px4_global = tables["vehicle_local_position"], tables["vehicle_global_position"]
@@ -119,7 +119,7 @@ def test_real_log_agrees_with_px4s_own_global_position(name: str) -> None:
 @example(10.0, -179.9, 100_000.0, -math.pi / 2)
 @example(90.0, 0.0, 100_000.0, 1.0)
 def test_projection_round_trip(latitude: float, longitude: float, distance: float, bearing: float) -> None:
-    """Within 100 km of any origin, poles and antimeridian included, the round trip is within 1 mm."""
+    """The round trip is exact to 1 mm within 100 km of any origin, including poles and antimeridian."""
     origin = MapProjection(latitude, longitude)
     north, east = distance * math.cos(bearing), distance * math.sin(bearing)
     projected = origin.reproject(north, east)
@@ -129,8 +129,8 @@ def test_projection_round_trip(latitude: float, longitude: float, distance: floa
 
 
 @given(st.floats(-89, 89), st.floats(-180, 180), st.floats(1, 100_000), angles)
-def test_distance_is_kept(latitude: float, longitude: float, distance: float, bearing: float) -> None:
-    """The projection is equidistant: the great circle is as long as the line in the plane."""
+def test_projection_is_equidistant(latitude: float, longitude: float, distance: float, bearing: float) -> None:
+    """The great-circle distance from the origin equals the distance in the plane."""
     other = MapProjection(latitude, longitude).reproject(distance * math.cos(bearing), distance * math.sin(bearing))
     one, two = (unit(*map(math.radians, each)) for each in ((latitude, longitude), other))
     # The chord is well conditioned where an arc cosine is not.
@@ -141,8 +141,8 @@ def unit(latitude: float, longitude: float) -> tuple[float, float, float]:
     return (math.cos(latitude) * math.cos(longitude), math.cos(latitude) * math.sin(longitude), math.sin(latitude))
 
 
-def test_known_frames() -> None:
-    """PX4's and ROS's conventions, by hand."""
+def test_known_frame_conversions() -> None:
+    """Values worked out by hand from the conventions of PX4 and ROS."""
     assert ned_to_enu((1.0, 2.0, 3.0)) == (2.0, 1.0, -3.0)
     assert frd_to_flu((1.0, 2.0, 3.0)) == (1.0, -2.0, -3.0)
     assert variances_ned_to_enu((1.0, 2.0, 3.0)) == (2.0, 1.0, 3.0)
@@ -183,8 +183,8 @@ def rotate(q: Sequence[float], vector: tuple[float, float, float]) -> tuple[floa
 
 
 @given(angles, angles, angles)
-def test_attitude_rotates_as_before(roll: float, pitch: float, yaw: float) -> None:
-    """A converted attitude turns a vector in FLU to where the original turns the same vector in FRD, and back."""
+def test_converted_attitude_rotates_vectors_alike(roll: float, pitch: float, yaw: float) -> None:
+    """The converted attitude rotates an FLU vector as the original rotates the same vector in FRD."""
     q = euler_to_quaternion(roll, pitch, yaw)
     enu = quaternion_ned_to_enu(q)
     for vector in ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.5, -1.0, 3.0)):

@@ -1,4 +1,4 @@
-"""Provenance of messages in their encoding."""
+"""Provenance of messages in their Zenoh encoding."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nedbus_msgs import ArgumentError, Provenance
-from tests.flights.first_message import ENCODING, FIELD_TYPES, encoding_of, provenance_of
+from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, provenance_of
 
 
 @given(st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True), st.sets(st.sampled_from(list(FIELD_TYPES))))
 def test_provenance_round_trip(source: str | None, provided: set[str]) -> None:
-    """Any source and any set of fields can be written in an encoding and parsed again."""
+    """Any source and set of fields is encoded and parsed again."""
     encoding = encoding_of(source, frozenset(provided))
     assert encoding.startswith(ENCODING)
     assert provenance_of(encoding) == Provenance(source, frozenset(FIELD_TYPES.keys() - provided))
 
 
-def test_all_fields_add_nothing() -> None:
-    """A source of all fields adds only its name; without a source the encoding is the plain one."""
+def test_encoding_without_missing_fields_has_no_mask() -> None:
+    """A source that provides all fields adds only its name, and no source adds nothing."""
     assert encoding_of(None) == ENCODING
     assert encoding_of("sim") == f"{ENCODING};source=sim" == encoding_of("sim", frozenset(FIELD_TYPES))
     assert encoding_of("x", frozenset(FIELD_TYPES.keys() - {"timestamp", "x"})) == f"{ENCODING};source=x;missing=41"
@@ -31,18 +31,18 @@ def test_all_fields_add_nothing() -> None:
     + [f"{ENCODING};{rest}" for rest in ("", "source=", "source=Ä", "a=b;=;;", f"source={'x' * 33}", "source=a b")]
     + [f"{ENCODING};missing={mask}" for mask in ("-1", "f" * 15)],
 )
-def test_invalid_parts_are_ignored(encoding: str) -> None:
-    """An encoding may be another program's: its unknown or invalid parts are ignored."""
+def test_invalid_parts_of_an_encoding_are_ignored(encoding: str) -> None:
+    """Unknown or invalid parts may come from other programs."""
     assert provenance_of(encoding) == Provenance()
 
 
-def test_bits_without_a_field_are_ignored() -> None:
-    """A mask may be of a newer layout."""
+def test_mask_bits_beyond_the_last_field_are_ignored() -> None:
+    """They may belong to a newer layout."""
     assert provenance_of(f"{ENCODING};missing={'f' * 14};new=1").missing == FIELD_TYPES.keys()
 
 
 @pytest.mark.parametrize("source", ["", "A", "a b", "x" * 33, "a;b"])
-def test_source_is_a_plain_name(source: str) -> None:
-    """A source that could not be written in an encoding is rejected."""
+def test_invalid_source_raises(source: str) -> None:
+    """A source that cannot be part of an encoding raises ArgumentError."""
     with pytest.raises(ArgumentError, match="1 to 32 of a-z"):
         Provenance(source)

@@ -1,4 +1,4 @@
-"""Tracks without jumps: rules by hand, real logs with resets, and a simulation with known ground truth."""
+"""Tracks without jumps: constructed cases, real logs with resets, and a simulation with ground truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from nedbus_msgs import Continuous, ResetTracker, VehicleLocalPosition
 from nedbus_msgs.frames import MapProjection
-from tests.flights.first_message import upgrade
+from tests.flights.local_position import upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
@@ -32,8 +32,8 @@ def track(*messages: VehicleLocalPosition) -> list[Continuous]:
     return [tracker.add(message) for message in messages]
 
 
-def test_complete_delta_is_removed() -> None:
-    """When a counter rises by one the delta is the jump."""
+def test_delta_is_removed_when_counter_rises_by_one() -> None:
+    """The delta then equals the jump."""
     first, second, third = track(
         at(1, x=1.0, y=1.0),
         at(2, x=11.5, y=-3.5, xy_reset_counter=1, delta_xy=(10.0, -5.0)),
@@ -61,7 +61,7 @@ def test_complete_delta_is_removed() -> None:
 def test_every_quantity_has_its_own_delta(
     values: tuple[str, ...], delta: str, counter: str, jump: float | tuple[float, float]
 ) -> None:
-    """Each counter belongs to its own delta only."""
+    """Each counter applies to its own delta only."""
     steps = jump if isinstance(jump, tuple) else (jump,)
     jumped = {name: cast("float", PLAIN[name]) + step for name, step in zip(values, steps, strict=True)}
     first, second = track(at(1), at(2, **jumped, **{delta: jump, counter: 1}))
@@ -70,15 +70,15 @@ def test_every_quantity_has_its_own_delta(
             assert getattr(second, name) == getattr(first, name), name
 
 
-def test_counter_wraps() -> None:
-    """255 to 0 is one reset."""
+def test_counter_wrap_counts_as_one_reset() -> None:
+    """A counter wraps from 255 to 0."""
     _, second = track(at(1, z_reset_counter=255), at(2, z=5.0, z_reset_counter=0, delta_z=5.0))
     assert second.z == 0.0
     assert second.resets["z"] == 1
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """Two resets between two messages: the delta is that of the last one, so the track is discontinued."""
+    """After two resets between two messages, the delta is that of the last one, so the track is discontinued."""
     _, second, third = track(
         at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
     )
@@ -88,14 +88,14 @@ def test_incomplete_delta_is_not_used() -> None:
     assert not third.discontinued
 
 
-def test_delta_that_is_not_provided_is_not_used() -> None:
-    """Without a delta, as in old layouts and from some sources, a jump is unexplained."""
+def test_reset_without_delta_discontinues_the_track() -> None:
+    """Old layouts and some sources do not provide a delta."""
     _, second = track(at(1), at(2, heading=1.0, heading_reset_counter=1))
     assert second.discontinued == {"heading"}
 
 
-def test_timestamp_that_goes_back_starts_a_new_track() -> None:
-    """A vehicle that rebooted has no relation to the track before."""
+def test_backward_timestamp_restarts_the_track() -> None:
+    """After a reboot the vehicle starts a new track."""
     _, second, third = track(
         at(100, x=5.0), at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)), at(1, x=0.5, xy_reset_counter=0)
     )
@@ -104,8 +104,8 @@ def test_timestamp_that_goes_back_starts_a_new_track() -> None:
     assert third.x == 0.5
 
 
-def test_origin_that_is_set_moves_nothing() -> None:
-    """The origin's altitude becomes known, delta_z is -179.5 m, and z moved by 2 mm: the values decide."""
+def test_delta_without_a_jump_at_a_new_origin_is_ignored() -> None:
+    """When the origin's altitude is set, delta_z is -179.5 m but z moves by 2 mm, as in a real log."""
     first, second = track(
         at(21.574, z=-0.2), at(21.674, z=-0.198, z_reset_counter=1, delta_z=-179.5362, z_global=True, ref_alt=179.5362)
     )
@@ -116,8 +116,8 @@ def test_origin_that_is_set_moves_nothing() -> None:
 
 
 @pytest.mark.parametrize("counted", [0, 1])
-def test_origin_that_moves_shifts_the_frame(counted: int) -> None:
-    """A new origin elsewhere shifts all coordinates by the distance of the origins, counted as a reset or not."""
+def test_moved_origin_is_compensated(counted: int) -> None:
+    """Coordinates shift by the distance between the origins, whether or not this is counted as a reset."""
     old, new = (47.0, 8.0, 400.0), (47.001, 8.002, 410.0)
     north, east = MapProjection(new[0], new[1]).project(old[0], old[1])
 
@@ -137,15 +137,15 @@ def test_origin_that_moves_shifts_the_frame(counted: int) -> None:
     assert (second.x, second.y, second.z) == pytest.approx((first.x + 0.1, 0.0, 0.0), abs=1e-3)
 
 
-def test_origin_with_an_unexplained_jump_is_a_new_track() -> None:
-    """A jump that neither the delta nor the origins explain is not removed."""
+def test_unexplained_jump_at_a_new_origin_discontinues_the_track() -> None:
+    """A jump explained neither by the delta nor by the origins is kept."""
     _, second = track(at(1), at(2, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
     assert second.discontinued == {"xy"}
     assert second.x == 500.0
 
 
-def test_simulated_truth_is_followed() -> None:
-    """Through a GPS outage and the resets of a lap of the simulation the track follows the ground truth."""
+def test_track_follows_simulated_ground_truth() -> None:
+    """The track follows the ground truth through a GPS outage and the resets of a simulated lap."""
     truth: dict[object, tuple[float, ...]] = {}
     tracker = ResetTracker()
     estimates: list[tuple[VehicleLocalPosition, Continuous]] = []
@@ -160,9 +160,9 @@ def test_simulated_truth_is_followed() -> None:
     for (before, smooth), (after, smooth_after) in pairwise(estimates[::2]):
         then, now = truth[before.timestamp], truth[after.timestamp]
         raw = (after.x - before.x, after.y - before.y, after.z - before.z)
-        came = (smooth_after.x - smooth.x, smooth_after.y - smooth.y, smooth_after.z - smooth.z)
+        moved = (smooth_after.x - smooth.x, smooth_after.y - smooth.y, smooth_after.z - smooth.z)
         real = tuple(map(operator.sub, now, then))
-        raw_worst, worst = max(raw_worst, math.dist(raw, real)), max(worst, math.dist(came, real))
+        raw_worst, worst = max(raw_worst, math.dist(raw, real)), max(worst, math.dist(moved, real))
     resets = estimates[-1][1].resets
     assert {name for name, count in resets.items() if count} == {"xy", "z", "vxy", "heading"}
     assert raw_worst > 1.0
@@ -174,10 +174,10 @@ def test_simulated_truth_is_followed() -> None:
 @pytest.mark.parametrize(
     ("name", "raw", "smooth"), [("fmuv6c_1.17_selector_whipsaw.ulg", 130.0, 3.0), ("nxp_v0_ekf_failure.ulg", 25.0, 6.0)]
 )
-def test_real_resets_are_removed(name: str, raw: float, smooth: float) -> None:
-    """Steps that velocity does not explain are resets in the raw track, and motion between messages in ours."""
+def test_resets_in_real_logs_are_removed(name: str, raw: float, smooth: float) -> None:
+    """Steps that velocity does not explain are large in the messages and small in the track."""
     if not (LOGS / name).exists():
-        pytest.skip(f"the real logs are not here: {LOGS}")
+        pytest.skip(f"real logs not found: {LOGS}")
     worst: dict[str, float] = defaultdict(float)
     tracker = ResetTracker()
     last: tuple[VehicleLocalPosition, Continuous] | None = None
@@ -190,11 +190,11 @@ def test_real_resets_are_removed(name: str, raw: float, smooth: float) -> None:
         if last is not None:
             before, smooth_before = last
             seconds = (message.timestamp - before.timestamp) / 1e6
-            moved = (before.vx * seconds, before.vy * seconds, before.vz * seconds)
+            expected = (before.vx * seconds, before.vy * seconds, before.vz * seconds)
             step = (message.x - before.x, message.y - before.y, message.z - before.z)
-            came = (track.x - smooth_before.x, track.y - smooth_before.y, track.z - smooth_before.z)
-            worst["raw"] = max(worst["raw"], math.dist(step, moved))
-            worst["smooth"] = max(worst["smooth"], math.dist(came, moved))
+            smooth_step = (track.x - smooth_before.x, track.y - smooth_before.y, track.z - smooth_before.z)
+            worst["raw"] = max(worst["raw"], math.dist(step, expected))
+            worst["smooth"] = max(worst["smooth"], math.dist(smooth_step, expected))
         last = message, track
     assert worst["raw"] > raw
     assert worst["smooth"] < smooth

@@ -1,4 +1,4 @@
-"""The topic table, addresses and selections, and their key expressions."""
+"""Topics, addresses and selections, and their key expressions."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def addresses(draw: st.DrawFn) -> Address:
     return Address(draw(CHUNK), topic.name, instance)
 
 
-def test_topics_of_the_first_message_are_px4s_four() -> None:
-    """The four uORB topics of VehicleLocalPosition; only the estimators' has instances; EKF2's is the default."""
+def test_vehicle_local_position_has_px4s_four_topics() -> None:
+    """Only estimator_local_position has instances, and vehicle_local_position is the default."""
     assert DEFAULT_TOPIC == "vehicle_local_position"
     alone = ("vehicle_local_position", "vehicle_local_position_groundtruth", "external_ins_local_position")
     instances = {**dict.fromkeys(alone, False), "estimator_local_position": True}
@@ -45,7 +45,7 @@ def test_topics_of_the_first_message_are_px4s_four() -> None:
 
 
 def test_keys_are_as_documented() -> None:
-    """These strings are the contract with clients in any language."""
+    """Clients in other languages depend on these strings."""
     assert Address("7", "vehicle_local_position").key() == "nedbus/7/vehicle_local_position"
     estimator = Address("7", "estimator_local_position", 2)
     assert estimator.key() == "nedbus/7/estimator_local_position/2"
@@ -59,8 +59,8 @@ def test_keys_are_as_documented() -> None:
     assert ack_key(Selection("vehicle_local_position").key_expr()) == "nedbus/*/vehicle_local_position/@ack"
 
 
-def test_topic_without_a_file_has_instances_or_not() -> None:
-    """Any topic of PX4 has keys; a selection of one that is not known matches it with an instance and without."""
+def test_selection_of_an_unknown_topic_matches_all_instances() -> None:
+    """A topic that is not built in has keys with and without an instance, and a selection matches both."""
     alone, second = Address("7", "wheel_encoders"), Address("7", "wheel_encoders", 1)
     assert (alone.key(), second.key()) == ("nedbus/7/wheel_encoders", "nedbus/7/wheel_encoders/1")
     selection = Selection("wheel_encoders")
@@ -73,7 +73,7 @@ def test_topic_without_a_file_has_instances_or_not() -> None:
 
 @given(addresses(), PREFIXES)
 def test_address_and_key_round_trip(address: Address, prefix: str) -> None:
-    """Every address has a valid key, and the key parses to the same address."""
+    """Every address has a valid key, which is parsed to the same address."""
     zenoh.KeyExpr(address.key(prefix=prefix))
     assert Address.from_key(address.key(prefix=prefix), prefix=prefix) == address
     assert address_of_alive_key(address.alive_key("1a", prefix=prefix), prefix=prefix) == address
@@ -84,8 +84,8 @@ def test_address_and_key_round_trip(address: Address, prefix: str) -> None:
 @given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from([
     "nedbus", "7", "*", "**", "@alive", "vehicle_local_position", "estimator_local_position", "0", "01", "256", "", "é",
 ]), max_size=6).map("/".join)))  # fmt: skip
-def test_any_key_is_an_address_or_an_error(key: str) -> None:
-    """Any string parses to an address with the same key, or raises AddressError."""
+def test_random_key_is_parsed_or_raises_address_error(key: str) -> None:
+    """A string is parsed to an address with the same key, or raises AddressError."""
     try:
         assert Address.from_key(key).key() == key
     except AddressError as exc:
@@ -94,7 +94,7 @@ def test_any_key_is_an_address_or_an_error(key: str) -> None:
 
 @st.composite
 def selections(draw: st.DrawFn, near: Address) -> Selection:
-    """Return a strategy for selections that have parts of an address, or others."""
+    """Return selections that share parts with an address."""
     topic = draw(st.sampled_from([ANY, near.topic, *TOPICS]))
     vehicle = draw(st.sampled_from([ANY, near.vehicle, near.vehicle[:-1] + "Q"]))
     instances = topic != ANY and TOPICS[topic].instances
@@ -103,7 +103,7 @@ def selections(draw: st.DrawFn, near: Address) -> Selection:
 
 @given(addresses(), PREFIXES, st.data())
 def test_selection_matches_what_its_key_expression_includes(address: Address, prefix: str, data: st.DataObject) -> None:
-    """A selection matches exactly the addresses whose keys its key expression includes, by Zenoh's own rules."""
+    """A selection matches exactly the addresses whose keys are included in its key expression, as Zenoh decides."""
     selection = data.draw(selections(address))
     key_expr = zenoh.KeyExpr(selection.key_expr(prefix=prefix))
     assert selection.matches(address) == key_expr.includes(address.key(prefix=prefix))
@@ -112,8 +112,8 @@ def test_selection_matches_what_its_key_expression_includes(address: Address, pr
 
 
 @given(addresses(), PREFIXES)
-def test_selection_does_not_include_other_keys(address: Address, prefix: str) -> None:
-    """The liveliness tokens, rejections and acknowledgements of an address are not messages."""
+def test_selection_excludes_tokens_rejections_and_acknowledgements(address: Address, prefix: str) -> None:
+    """A subscription to all messages does not receive liveliness tokens, rejections or acknowledgements."""
     assert zenoh.KeyExpr(Selection().alive_key_expr(prefix=prefix)).includes(address.alive_key("1a", prefix=prefix))
     key_expr = zenoh.KeyExpr(Selection().key_expr(prefix=prefix))
     assert not key_expr.intersects(address.alive_key("1a", prefix=prefix))
@@ -134,8 +134,8 @@ def test_selection_does_not_include_other_keys(address: Address, prefix: str) ->
         *(("7", "estimator_local_position", instance, "instance") for instance in (None, 256, -1)),
     ],
 )
-def test_invalid_address_is_rejected(vehicle: str, topic: str, instance: int | None, what: str) -> None:
-    """The error names the part, the given value and the expected ones."""
+def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, what: str) -> None:
+    """The error names the invalid part, its value and what is expected."""
     with pytest.raises(AddressError, match=rf"{what} .* is not valid: expected"):
         Address(vehicle, topic, instance)
 
@@ -150,28 +150,28 @@ def test_invalid_address_is_rejected(vehicle: str, topic: str, instance: int | N
         *(("estimator_local_position", "*", instance, "instance") for instance in (-1, 256, True, "0")),
     ],
 )
-def test_invalid_selection_is_rejected(topic: str, vehicle: str, instance: int | None, what: str) -> None:
-    """A typo in a topic, or an instance that no address has, must not become a subscription without messages."""
+def test_invalid_selection_raises(topic: str, vehicle: str, instance: int | None, what: str) -> None:
+    """A typo in a topic, or an impossible instance, must not result in a subscription without messages."""
     with pytest.raises(AddressError, match=what):
         Selection(topic, vehicle, instance)
 
 
 @pytest.mark.parametrize("prefix", ["", "/", "a/", "a//b", "*", "a/**", "@a", "a b"])
-def test_invalid_prefix_is_rejected(prefix: str) -> None:
-    """Prefixes are plain chunks."""
+def test_invalid_prefix_raises(prefix: str) -> None:
+    """A prefix consists of plain chunks."""
     with pytest.raises(AddressError, match="prefix"):
         check_prefix(prefix)
 
 
 def test_errors_can_be_pickled() -> None:
-    """Errors cross process pools with their text and their facts."""
+    """In process pools, errors keep their text and attributes."""
     with pytest.raises(AddressError) as info:
         Address("a b", "vehicle_local_position")
     again = pickle.loads(pickle.dumps(info.value))
     assert (type(again), str(again), again.given) == (AddressError, str(info.value), "a b")
 
 
-def test_addresses_with_and_without_instance_are_sorted() -> None:
-    """A topic without a file has a plain first instance, and numbers for the others."""
+def test_address_without_instance_sorts_first() -> None:
+    """The first instance of a topic that is not built in has no number."""
     plain, second, other = Address("1", "logger_status"), Address("1", "logger_status", 1), Address("1", "event")
     assert sorted([second, plain, other]) == [other, plain, second]

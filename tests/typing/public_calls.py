@@ -1,6 +1,6 @@
-"""Public calls of scripts: mypy must accept them, and reject those with an ignore.
+"""Public calls for type checkers: mypy must accept them, and reject each line with a `type: ignore`.
 
-mypy reports an unused ignore as an error, so a wrong call that it accepts fails `make check`.
+An unneeded ignore is an error in mypy, so a wrong call that it accepts fails `make check`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from nedbus_msgs.model.px4_types import Float32, field
 
 
 def subscribe(bus: nedbus.Bus) -> None:
-    """The kind of iteration determines the type of `message`."""
+    """Iteration yields models, rows or batches, each with its own type."""
     with bus.subscribe(vehicle="7", mode="every") as subscription:
         for sample in subscription:
             assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
@@ -31,9 +31,9 @@ def subscribe(bus: nedbus.Bus) -> None:
             assert_type(batch.of(nedbus.Address("7", "vehicle_local_position")), nedbus.MessageArray)
         assert_type(subscription.receive(1.0), nedbus.Sample)
     assert_type(bus.subscribe(max_rate=5), nedbus.Subscription)
-    bus.subscribe(max_rate="5")  # type: ignore[call-overload] # a number
-    bus.subscribe(mode="newest")  # type: ignore[call-overload] # latest or every
-    bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-overload] # the vehicle by name only
+    bus.subscribe(max_rate="5")  # type: ignore[call-overload] # not a number
+    bus.subscribe(mode="newest")  # type: ignore[call-overload] # neither "latest" nor "every"
+    bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-overload] # vehicle is keyword-only
 
 
 class WheelEncoders(nedbus.Message):
@@ -44,11 +44,11 @@ class WheelEncoders(nedbus.Message):
 
 
 def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
-    """A class determines the fields of the messages; a topic name yields any message."""
+    """By class, the message type is known; by topic name, it is any message."""
     for sample in bus.subscribe(nedbus.VehicleAttitude):
         assert_type(sample, nedbus.Sample[nedbus.VehicleAttitude])
         assert_type(sample.message.q, tuple[float, float, float, float])
-        sample.message.x  # type: ignore[attr-defined] # an attitude has no position
+        sample.message.x  # type: ignore[attr-defined] # VehicleAttitude has no x
     assert_type(bus.subscribe(nedbus.SensorGps, mode="every").receive().message.fix_type, int)
     gps = bus.subscribe(nedbus.SensorGps, topic="vehicle_gps_position", vehicle=7, max_rate=5)
     assert_type(gps, nedbus.Subscription[nedbus.SensorGps])
@@ -56,20 +56,20 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
     assert_type(bus.subscribe(WheelEncoders).receive().message.wheel_speed, float)
     assert_type(bus.subscribe("*"), nedbus.Subscription[nedbus.Message])
     assert_type(bus.subscribe(any_topic).receive().message.timestamp, int)
-    bus.subscribe(any_topic).receive().message.x  # type: ignore[attr-defined] # of which message
+    bus.subscribe(any_topic).receive().message.x  # type: ignore[attr-defined] # unknown message type
     assert_type(bus.latest(nedbus.HomePosition)[0].message.alt, float)
     assert_type(bus.latest("*", vehicle=7), list[nedbus.Sample[nedbus.Message]])
     assert_type(bus.latest(), list[nedbus.Sample[nedbus.VehicleLocalPosition]])
 
 
 def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
-    """Functions that accept a message accept a row as well."""
+    """Functions that accept a message also accept a row."""
     assert_type(nedbus.frames.to_global(sample.message), nedbus.frames.GlobalPosition | None)
     assert_type(nedbus.frames.to_global(row.message), nedbus.frames.GlobalPosition | None)
     nedbus.frames.to_global(row.message).latitude  # type: ignore[union-attr] # None without a global origin
     assert_type(sample.message.position, nedbus.frames.Ned | None)
     assert_type(row.message.global_position, nedbus.frames.GlobalPosition | None)
-    nedbus.frames.ned_to_enu(sample.message.position)  # type: ignore[arg-type] # None while it is invalid
+    nedbus.frames.ned_to_enu(sample.message.position)  # type: ignore[arg-type] # may be None
     assert_type(nedbus.ResetTracker().add(row.message), nedbus.Continuous)
     nedbus.health.Monitor().add(row)
     nedbus.health.Monitor().add(sample)
@@ -78,18 +78,18 @@ def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) 
 
 
 def publish(bus: nedbus.Bus) -> None:
-    """Publish a message, fields by name, or an array."""
+    """Publish a message, its fields by name, or an array."""
     publisher = bus.publisher("external_ins_local_position", vehicle="mine", source="ins")
     publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x=2.0))
     publisher.publish({"timestamp": 1, "x": 2.0})
     publisher.publish_many(np.zeros(3, nedbus.DTYPE))
     publisher.publish(1.0)  # type: ignore[arg-type] # not a message
     nedbus.VehicleLocalPosition(timestamp=1, X=2.0)  # type: ignore[call-arg] # no such field
-    bus.publisher("external_ins_local_position")  # type: ignore[call-arg] # of which vehicle?
+    bus.publisher("external_ins_local_position")  # type: ignore[call-arg] # vehicle is missing
 
 
 async def read_and_publish() -> None:
-    """The asyncio client has the same methods as coroutines."""
+    """The asyncio client has the same calls, with await."""
     tls = nedbus.Tls("ca.crt", "reader.crt", "reader.key")
     async with nedbus.connect_async("tls/10.0.0.1:7447", tls=tls) as bus:
         async for sample in bus.subscribe():
@@ -99,9 +99,9 @@ async def read_and_publish() -> None:
         assert_type(bus.subscribe(max_rate=0.5), nedbus.AsyncSubscription)
         async for attitude in bus.subscribe(nedbus.VehicleAttitude):
             assert_type(attitude.message.q, tuple[float, float, float, float])
-            attitude.message.x  # type: ignore[attr-defined] # an attitude has no position
+            attitude.message.x  # type: ignore[attr-defined] # VehicleAttitude has no x
         assert_type(bus.subscribe("*"), nedbus.AsyncSubscription[nedbus.Message])
-        for _ in bus.subscribe():  # type: ignore[attr-defined] # async for
+        for _ in bus.subscribe():  # type: ignore[attr-defined] # needs async for
             pass
         publisher = await bus.publisher("external_ins_local_position", vehicle="mine")
         assert_type(publisher, nedbus.AsyncPublisher)
@@ -109,7 +109,7 @@ async def read_and_publish() -> None:
         await publisher.publish(nedbus.VehicleAttitude(timestamp=1))
         await publisher.publish_row(nedbus.VehicleLocalPosition(timestamp=1))
         assert_type(await publisher.flush(), bool)
-        await publisher.flush("1")  # type: ignore[arg-type] # seconds
+        await publisher.flush("1")  # type: ignore[arg-type] # not a number of seconds
         vehicles = await bus.vehicles(timeout=1.0)
         assert_type(vehicles["7"], list[nedbus.Address])
         assert_type(vehicles.complete, bool)
@@ -119,7 +119,7 @@ async def read_and_publish() -> None:
 
 
 def read() -> None:
-    """Files are read as arrays, or as data frames of the requested library."""
+    """Files are read as arrays, or as data frames of the given library."""
     assert_type(nedbus.read("flight.ulg", vehicle=7), nedbus.MessageArray)
     assert_type(nedbus.read("flight.ulg", dataframe="pandas"), pd.DataFrame)
     assert_type(nedbus.read("flight.ulg", ["home_position"]), dict[str, nedbus.MessageArray])
@@ -129,6 +129,6 @@ def read() -> None:
     assert_type(nedbus.align("flight.ulg", on=50.0, method="linear"), nedbus.MessageArray)
     assert_type(nedbus.align({}, on=[1, 2], utc=True, dataframe="pandas"), pd.DataFrame)
     assert_type(nedbus.utc_of("flight.ulg"), nedbus.UtcOffset | None)
-    nedbus.read("flight.ulg", dataframe="arrow")  # type: ignore[call-overload] # pandas or polars
-    nedbus.connect(tls_ca="ca.crt")  # type: ignore[call-arg] # tls=Tls(...)
+    nedbus.read("flight.ulg", dataframe="arrow")  # type: ignore[call-overload] # neither pandas nor polars
+    nedbus.connect(tls_ca="ca.crt")  # type: ignore[call-arg] # use tls=Tls(...)
     nedbus.raed  # type: ignore[attr-defined] # no such name

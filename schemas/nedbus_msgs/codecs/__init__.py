@@ -1,1 +1,1 @@
-"""Codecs of messages: msgpack on the wire, and CDR as in ROS 2 and PX4."""
+"""Message codecs: msgpack on the wire, and CDR as in ROS 2 and PX4."""

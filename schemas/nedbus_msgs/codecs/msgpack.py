@@ -13,23 +13,23 @@ import msgpack
 from pydantic import ValidationError
 
 from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
-from nedbus_msgs.model.declaration import kept
+from nedbus_msgs.model.declaration import cached_on_owner
 from nedbus_msgs.model.definition import Definition, M, upgrade_with
 from nedbus_msgs.model.message import fill
 from nedbus_msgs.model.px4_types import BASES, FieldType
 from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
-"""Bytes of the largest payload and the largest message that can be carried."""
+"""Maximum size of a payload, and so of a message [bytes]."""
 
-Newer = Mapping[int, Sequence[str]]
-"""Field names of layouts unknown to this version, by number on the wire."""
+NewerLayouts = Mapping[int, Sequence[str]]
+"""Field names of layouts unknown to this version, by layout number."""
 
 
 def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
-    """Return the tags of a type with zeros for values, the struct format of both, and the bit mask of the values.
+    """Return the msgpack bytes of a type with zeros for values, their struct format, and the bit mask of the values.
 
-    A bool is only a tag, 0xc2 or 0xc3, whose last bit is the value; a text is a str 16, filled up with NUL.
+    A bool is a tag alone, 0xc2 or 0xc3: its last bit is the value. Text is a str 16, padded with NUL.
     """
     base = BASES[kind.base]
     tag = bytes([base.tag]) + (kind.size.to_bytes(2, "big") if kind.is_text else b"")
@@ -48,19 +48,19 @@ def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
 class Codec(Generic[M]):
     """The codec of one message.
 
-    `size`: bytes of an encoded payload.
-    `tags`: a payload with zeros for values, as an integer; `tag_mask`: its bits that are not values.
-    `offsets`: name, element and offset of every value in a payload.
+    `size`: payload size [bytes].
+    `tags`: the payload with zeros for values, as an integer; `tag_mask`: its bits that are not values.
+    `offsets`: field, array index and payload offset of every value.
 
     `encode(message)`: return the payload of a message; float32 fields are rounded.
-    Raises EncodeError if values do not fit their fields, in a message whose validation was bypassed.
-    `encode_fields(fields)`: return the payload of these fields, validated without building a model.
+    Raises EncodeError for a value that does not fit its field, in a message whose validation was bypassed.
+    `encode_fields(fields)`: validate fields and return their payload, without building a model.
     Raises InvalidMessageError for an invalid message.
     `encode_row(values)`: the same for the values of all fields in order.
     Also raises EncodeError for a wrong number of values.
     `decode(payload, newer=...)`: return the validated message of a payload.
-    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
-    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
+    Raises UnknownLayoutError for a layout number that is neither known nor in `newer`, DecodeError for any other
+    invalid payload: wrong types or lengths, missing or trailing bytes, values that the model rejects.
     `decode_row(payload, newer=...)`: the same, as a Row.
     """
 
@@ -76,15 +76,15 @@ class Codec(Generic[M]):
     decode_row: Callable[..., M]
 
 
-@kept
+@cached_on_owner
 def codec_of(definition: Definition[M]) -> Codec[M]:
-    """Return the codec of a message; its functions are closures, as attribute access costs time on the hot path."""
+    """Return the codec of a message; its functions are closures, to avoid attribute access on the hot path."""
     name, types, model = definition.name, definition.types, definition.model
     validation, make_row = definition.validation, definition.row
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
     name_values, template, flatten = validation.name, validation.template, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
-    tags, tag_mask, packed, offsets = _forms(types, head)
+    tags, tag_mask, packed, offsets = _payload_parts(types, head)
     size, pack_flat, unpack_flat = packed.size, packed.pack, packed.unpack
     unflatten, has_text = validation.unflatten, any(kind.is_text for kind in types.values())
     new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
@@ -107,7 +107,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     def encode_row(values: Sequence[object]) -> bytes:
         values = tuple(values)
         if len(values) != count:
-            raise EncodeError(f"{len(values)} values, where a row has {count}", name)
+            raise EncodeError(f"{len(values)} values, expected {count}", name)
         row = check_row(values)
         return encode(to_model(name_values(values))) if row is None else encode_valid(row)
 
@@ -125,7 +125,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
             raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
 
     def decode_full_width(payload: bytes) -> Values | None:
-        """Decode a payload in the form that `encode` writes; None if `decode_any` has to decide."""
+        """Decode a payload as `encode` writes it; return None for any other, which `decode_any` handles."""
         if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
             return None
         # The tags prove type and range of every value; only the rules are left to check.
@@ -133,17 +133,17 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         return row if passes_rules(row) else None
 
     def decode_values(payload: bytes) -> Values:
-        """Decode a payload with texts, which end at a NUL, and may have bytes that are not UTF-8."""
+        """Decode a payload with text, which ends at the first NUL and may contain invalid UTF-8."""
         return unflatten(unpack_flat((from_bytes(payload, "big") ^ tags).to_bytes(size, "big")))
 
-    def decode_any(payload: bytes, newer: Newer | None) -> M:
+    def decode_any(payload: bytes, newer: NewerLayouts | None) -> M:
         """Decode any msgpack encoding of any known layout."""
         try:
             return upgrade_with(definition, _unpack_fields(definition, payload, newer or {}))
         except ValidationError as exc:
             raise DecodeError(describe(exc, definition), name) from exc
 
-    def decode(payload: bytes, *, newer: Newer | None = None) -> M:
+    def decode(payload: bytes, *, newer: NewerLayouts | None = None) -> M:
         row = decode_full_width(payload)
         if row is None:
             return decode_any(payload, newer)
@@ -151,7 +151,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         values.update(zip(template, row, strict=True))
         return fill(model.__new__(model), values, all_fields)
 
-    def decode_row(payload: bytes, *, newer: Newer | None = None) -> M:  # for type checkers
+    def decode_row(payload: bytes, *, newer: NewerLayouts | None = None) -> M:  # a Row at run time
         row = decode_full_width(payload)
         values = tuple(decode_any(payload, newer).__dict__.values()) if row is None else row
         return cast("M", new_row(make_row, values))
@@ -162,15 +162,15 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     )  # fmt: skip
 
 
-def _forms(
+def _payload_parts(
     types: Mapping[str, FieldType], head: bytes
 ) -> tuple[int, int, struct.Struct, tuple[tuple[str, int, int], ...]]:
-    """Return the tags, the mask of bits that are not values, the struct of values, and the offset of each value."""
+    """Return the tags, the mask of bits that are not values, the struct of the values, and the offset of each."""
     tags, values, code = head, bytes(len(head)), f">{len(head)}x"
     offsets: list[tuple[str, int, int]] = []
     for name, kind in types.items():
-        own_tags, own_code, own_values = full_width(kind)
-        tags, values, code = tags + own_tags, values + own_values, code + own_code
+        field_tags, field_code, field_bits = full_width(kind)
+        tags, values, code = tags + field_tags, values + field_bits, code + field_code
         tag = 3 * kind.is_text or int(kind.base != "bool")  # bytes of the tag besides the value
         step = tag + kind.size
         offsets += [(name, part, len(tags) - (kind.values - part) * step + tag) for part in range(kind.values)]
@@ -189,32 +189,32 @@ def describe(error: ValidationError, definition: Definition[Any]) -> str:
     return "; ".join(reasons)
 
 
-def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) -> dict[str, object]:
+def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayouts) -> dict[str, object]:
     def reject(reason: str) -> DecodeError:
         return DecodeError(reason, definition.name)
 
     if len(payload) > PAYLOAD_LIMIT:
-        raise reject(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
+        raise reject(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
     try:
         array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="replace")
     except (ValueError, msgpack.UnpackException) as exc:
-        raise reject(f"{len(payload)} bytes that are not one msgpack value ({exc or type(exc).__name__})") from exc
+        raise reject(f"{len(payload)} bytes are not a single msgpack value ({exc or type(exc).__name__})") from exc
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
-        raise reject("not an array that starts with the number of its layout")
+        raise reject("not an array that starts with a layout number")
     layout, *values = array
     known = {each.wire: each.fields for each in definition.layouts.values() if each.wire is not None}
     names = {**newer, **known}.get(layout)
     if names is None:
         raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
     if len(values) != len(names):
-        raise reject(f"{len(values)} fields where layout {layout} has {len(names)}")
+        raise reject(f"{len(values)} fields, expected {len(names)} for layout {layout}")
     for name, value in zip(names, values, strict=True):
-        # No field is nested deeper, and formatting a deeply nested value would exhaust the stack.
+        # No field has nested arrays, and formatting a deeply nested value would overflow the stack.
         parts = value if isinstance(value, tuple) else (value,)
         if any(isinstance(part, tuple) for part in parts):
-            raise reject(f"{name}: an array within an array")
+            raise reject(f"{name}: nested array")
         is_text = name in definition.types and definition.types[name].is_text
         # The model accepts "NaN" and the like, from JSON.
         if not is_text and any(isinstance(part, str) for part in parts):
-            raise reject(f"{name}: text, where msgpack has numbers and bools")
+            raise reject(f"{name}: text, expected numbers or bools")
     return dict(zip(names, values, strict=True))

@@ -1,4 +1,4 @@
-"""The messages that nedbus has a definition of, one file each."""
+"""The built-in messages, one file each."""
 
 from importlib import import_module
 from pkgutil import iter_modules
@@ -10,7 +10,7 @@ from nedbus_msgs.model.definition import MESSAGES
 for _name in sorted((module.name for module in iter_modules(__path__)), key=lambda name: (name != DEFAULT_TOPIC, name)):
     import_module(f"{__name__}.{_name}")
 
-if TYPE_CHECKING:  # for type checkers, a line for each file
+if TYPE_CHECKING:  # one line per file, for type checkers
     from .battery_status import BatteryStatus as BatteryStatus
     from .estimator_status_flags import EstimatorStatusFlags as EstimatorStatusFlags
     from .failsafe_flags import FailsafeFlags as FailsafeFlags

@@ -9,13 +9,13 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float32x14, Uint8, Uint16
 class BatteryStatus(Message):
     """State of one battery: voltage, current and charge; smart batteries provide more fields than power modules.
 
-    One uORB instance per battery; id, from 1, identifies the battery on its vehicle.
-    Unknown values: -1 in current_a, current_average_a, discharged_mah, remaining and scale, NaN in time_remaining_s and
-    temperature, 0 in the others. Simulators always have current -1 and no cell voltages.
-    faults has bit n (1 << n) for number n of FAULT_; numbers 6 and 7 of warning are STATE_UNHEALTHY and STATE_CHARGING.
+    One uORB instance per battery; id (from 1) identifies the battery on its vehicle.
+    Unknown values are -1 in current_a, current_average_a, discharged_mah, remaining and scale, NaN in time_remaining_s
+    and temperature, and 0 in the others. Simulators always report a current of -1 and no cell voltages.
+    Bit n (1 << n) of faults is number n of FAULT_; values 6 and 7 of warning are STATE_UNHEALTHY and STATE_CHARGING.
     """
 
-    TOPICS = (Topic("battery_status", 1.0, "each battery's driver, or its estimate", instances=True, plain_first=True),)
+    TOPICS = (Topic("battery_status", 1.0, "each battery's driver or estimator", instances=True, plain_first=True),)
     LAYOUTS = (
         Layout("1.13", """
             1.16, without internal_resistance_estimate ocv_estimate ocv_estimate_filtered volt_based_soc_estimate
@@ -39,61 +39,61 @@ class BatteryStatus(Message):
         FAULT_HARDWARE_FAILURE, FAULT_FAILED_TO_ARM, FAULT_COUNT,
     ) = range(12)  # fmt: skip
 
-    connected: Bool = field("The battery is connected, by its voltage")
-    voltage_v: Float32 = field("Voltage [V], 0 if not known")
-    current_a: Float32 = field("Current out of the battery [A], -1 if not known")
-    current_average_a: Float32 = field("Average current in level flight [A], -1 if not known")
-    discharged_mah: Float32 = field("Charge taken [mAh], -1 if not known")
+    connected: Bool = field("Battery is connected, based on its voltage")
+    voltage_v: Float32 = field("Battery voltage [V], 0 if unknown")
+    current_a: Float32 = field("Battery current [A], positive when discharging, -1 if unknown")
+    current_average_a: Float32 = field("Average current in level flight [A], -1 if unknown")
+    discharged_mah: Float32 = field("Discharged capacity [mAh], -1 if unknown")
 
-    remaining: Float32 = field("Charge left, 0 empty to 1 full, -1 if not known")
-    scale: Float32 = field("Factor of thrust against low voltage, 1 or more, -1 if not known")
-    time_remaining_s: Float32 = field("Time until empty at the recent load [s], NaN if not known")
-    temperature: Float32 = field("Temperature [deg C], NaN if not known")
+    remaining: Float32 = field("Remaining charge, 0 (empty) to 1 (full), -1 if unknown")
+    scale: Float32 = field("Thrust compensation for battery sag, at least 1, -1 if unknown")
+    time_remaining_s: Float32 = field("Predicted time until empty at the recent load [s], NaN if unknown")
+    temperature: Float32 = field("Temperature [deg C], NaN if unknown")
 
-    cell_count: Uint8 = field("Count of cells in series, 0 if not known")
+    cell_count: Uint8 = field("Number of cells in series, 0 if unknown")
     source: Uint8 = field("Source: 0 power module, 1 external, 2 ESCs")
-    priority: Uint8 = field("Number of the power input on the board, from 0")
+    priority: Uint8 = field("Index of the power input on the board, from 0")
 
     capacity: Uint16 = field("Actual capacity [mAh]")
-    cycle_count: Uint16 = field("Count of discharge cycles")
-    average_time_to_empty: Uint16 = field("Time until empty, averaged [min]")
-    manufacture_date: Uint16 = field("Day of manufacture: day + 32 * month + 512 * (year - 1980)")
-    state_of_health: Uint16 = field("Full charge in proportion to that of a new battery [%], 0 to 100")
-    max_error: Uint16 = field("Greatest error of the charge [%], 1 to 100")
+    cycle_count: Uint16 = field("Number of discharge cycles")
+    average_time_to_empty: Uint16 = field("Average time to empty [min]")
+    manufacture_date: Uint16 = field("Date of manufacture: day + 32 * month + 512 * (year - 1980)")
+    state_of_health: Uint16 = field("State of health: full charge relative to that of a new battery [%], 0 to 100")
+    max_error: Uint16 = field("Expected error of the state of charge [%], 1 to 100")
 
-    id: Uint8 = field("Number of the battery on this vehicle, from 1")
-    interface_error: Uint16 = field("Count of errors of the interface to the battery")
+    id: Uint8 = field("Battery ID on this vehicle, from 1")
+    interface_error: Uint16 = field("Number of interface errors")
 
-    voltage_cell_v: Float32x14 = field("Voltage of each cell [V], 0 if not known")
-    max_cell_voltage_delta: Float32 = field("Greatest difference between cell voltages [V]")
+    voltage_cell_v: Float32x14 = field("Cell voltages [V], 0 if unknown")
+    max_cell_voltage_delta: Float32 = field("Maximum difference between cell voltages [V]")
 
-    is_powering_off: Bool = field("The battery is about to switch off")
-    is_required: Bool = field("The battery is needed before arming")
-    warning: Uint8 = field("Warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed, 6 unhealthy, 7 charges")
-    faults: Uint16 = field("Faults as bits, 1 << number of FAULT_; 0 none")
+    is_powering_off: Bool = field("Battery is about to power off")
+    is_required: Bool = field("Battery is required for arming")
+    warning: Uint8 = field("Warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed, 6 unhealthy, 7 charging")
+    faults: Uint16 = field("Fault bitmask, see FAULT_; 0 if none")
 
-    full_charge_capacity_wh: Float32 = field("Energy when full [Wh]")
-    remaining_capacity_wh: Float32 = field("Energy left [Wh]")
-    over_discharge_count: Uint16 = field("Count of discharges below the limit")
+    full_charge_capacity_wh: Float32 = field("Energy when fully charged [Wh]")
+    remaining_capacity_wh: Float32 = field("Remaining energy [Wh]")
+    over_discharge_count: Uint16 = field("Number of over-discharges")
     nominal_voltage: Float32 = field("Nominal voltage [V]")
 
-    internal_resistance_estimate: Float32 = field("Internal resistance of a cell, estimated [Ohm]")
-    ocv_estimate: Float32 = field("Open circuit voltage, estimated [V]")
-    ocv_estimate_filtered: Float32 = field("Open circuit voltage, estimated and filtered [V]")
-    volt_based_soc_estimate: Float32 = field("Charge left by voltage alone, 0 to 1")
-    voltage_prediction: Float32 = field("Voltage predicted by the estimator [V]")
+    internal_resistance_estimate: Float32 = field("Estimated internal resistance per cell [Ohm]")
+    ocv_estimate: Float32 = field("Estimated open circuit voltage [V]")
+    ocv_estimate_filtered: Float32 = field("Estimated open circuit voltage, filtered [V]")
+    volt_based_soc_estimate: Float32 = field("State of charge estimated from voltage alone, 0 to 1")
+    voltage_prediction: Float32 = field("Predicted voltage [V]")
     prediction_error: Float32 = field("Error of voltage_prediction [V]")
-    estimation_covariance_norm: Float32 = field("Norm of the estimator's covariance")
+    estimation_covariance_norm: Float32 = field("Norm of the estimation covariance")
 
     # Up to 1.16:
     serial_number: Uint16 = field("Serial number")
 
     # Up to 1.15:
-    voltage_filtered_v: Float32 = field("Voltage, filtered [V], 0 if not known")
-    current_filtered_a: Float32 = field("Current, filtered [A], 0 or -1 if not known")
-    custom_faults: Uint32 = field("The maker's own faults as bits")
-    mode: Uint8 = field("Mode: 0 normal or not known, 1 discharges itself, 2 hot swap")
-    average_power: Float32 = field("Average power of this discharge, in the battery's own unit")
-    available_energy: Float32 = field("Charge or energy left, in the battery's own unit")
-    design_capacity: Float32 = field("Capacity by design, in the battery's own unit")
-    average_time_to_full: Uint16 = field("Time until full, averaged [min]")
+    voltage_filtered_v: Float32 = field("Filtered voltage [V], 0 if unknown")
+    current_filtered_a: Float32 = field("Filtered current [A], 0 or -1 if unknown")
+    custom_faults: Uint32 = field("Manufacturer-specific fault bitmask")
+    mode: Uint8 = field("Mode: 0 normal or unknown, 1 auto-discharging, 2 hot swap")
+    average_power: Float32 = field("Average power of this discharge, in battery-specific units")
+    available_energy: Float32 = field("Remaining charge or energy, in battery-specific units")
+    design_capacity: Float32 = field("Design capacity, in battery-specific units")
+    average_time_to_full: Uint16 = field("Average time to full [min]")

@@ -1,4 +1,4 @@
-"""HomePosition: the place to which the vehicle returns."""
+"""HomePosition: the point to which the vehicle returns."""
 
 from typing import ClassVar
 
@@ -8,15 +8,15 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field, w
 
 
 class HomePosition(Message):
-    """Home of a vehicle, the place to which it returns, in global coordinates and in local NED.
+    """Home position of a vehicle, the point to which it returns, in global coordinates and in local NED.
 
-    Latitude and longitude, altitude, and local position each have a flag; invalid values are mostly 0, not NaN.
-    PX4 publishes it when home is set or moves, and then perhaps not for minutes: keep the last one.
-    valid_attitude exists in main; up to 1.18 the validity of roll, pitch and yaw is unknown.
-    x, y and z apply until the estimator moves the origin of local NED.
+    Latitude and longitude, altitude, and local position have a validity flag; invalid values are mostly 0, not NaN.
+    PX4 publishes it when home is set or moved, which may be minutes apart: keep the last one.
+    valid_attitude exists in main only; up to 1.18 the validity of roll, pitch and yaw is unknown.
+    x, y and z become outdated when the estimator moves the origin of local NED.
     """
 
-    TOPICS = (Topic("home_position", 0.0, "the commander, when home is set or moves", on_change=True),)
+    TOPICS = (Topic("home_position", 0.0, "the commander, when home is set or moved", on_change=True),)
     LAYOUTS = (
         Layout("1.13", "timestamp lat lon alt x y z yaw valid_alt valid_hpos valid_lpos manual_home"),
         Layout("1.15", "1.13, manual_home: update_count"),
@@ -46,8 +46,8 @@ class HomePosition(Message):
     valid_lpos: Bool = field("x, y and z are valid")
     valid_attitude: Bool = field("roll, pitch and yaw are valid")
 
-    manual_home: Bool = field("Home was set by the user, not by the vehicle")
-    update_count: Uint32 = field("Count of changes of home since boot")
+    manual_home: Bool = field("Home position was set manually")
+    update_count: Uint32 = field("Number of home position updates since boot")
 
     position: ClassVar = while_valid(Ned, "x, y and z [m] [local NED]", "valid_lpos")
     global_position: ClassVar = while_valid(GlobalPosition, "lat, lon [deg], alt [m]", "valid_hpos", "valid_alt")

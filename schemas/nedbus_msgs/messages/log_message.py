@@ -1,18 +1,18 @@
-"""LogMessage: a text of PX4."""
+"""LogMessage: a text message from PX4."""
 
 from nedbus_msgs.model import InRange, Layout, Message, Topic
 from nedbus_msgs.model.px4_types import Char127, Uint8, field
 
 
 class LogMessage(Message):
-    """A statement of the vehicle in its own words, such as "Failsafe activated"; any characters may occur in it.
+    """A text message from the vehicle, such as "Failsafe activated"; it may contain any characters.
 
-    From a log it is what PX4 printed, and what it sent as an event, in the words of the log's own metadata; over
-    MAVLink, a STATUSTEXT. A statement that PX4 makes in several forms is published once.
-    Text is cut after 127 bytes of UTF-8. Statements come in bursts: subscribe in mode "every" to get each of them.
+    From a log: logged messages, and events formatted with the log's own metadata; over MAVLink: STATUSTEXT.
+    A message that PX4 sends in several forms is published once.
+    Text is truncated to 127 bytes of UTF-8. Messages come in bursts: subscribe in mode "every" to receive all of them.
     """
 
-    TOPICS = (Topic("log_message", 0.0, "the vehicle, when it has something to say", on_change=True),)
+    TOPICS = (Topic("log_message", 0.0, "the vehicle, on events", on_change=True),)
     LAYOUTS = (Layout("1.13", "*"),)
     RULES = (InRange("severity", 0, 7),)
 

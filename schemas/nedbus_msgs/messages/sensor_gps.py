@@ -3,21 +3,21 @@
 import math
 
 from nedbus_msgs.frames import GlobalPosition, Ned
-from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
+from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, RenamedField, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64, field
 
 
 def _integer(value: float, scale: float) -> int:
-    """Convert a value to an integer in units of 1/scale; 0 for NaN and infinity, which integers lack."""
+    """Convert a value to an integer in units of 1/scale; NaN and infinity become 0."""
     return round(value * scale) if math.isfinite(value * scale) else 0
 
 
 class SensorGps(Message):
     """Output of a GNSS receiver (sensor_gps), or the selected or blended output that EKF2 uses (vehicle_gps_position).
 
-    Without a fix (fix_type 0 or 1), fields may look good, also vel_ned_valid; global_position and velocity are None.
-    Without a fix, some receivers report eph and epv of thousands of kilometres; many leave timestamp_sample at 0.
-    cog_rad is within [-pi, pi] or [0, 2 pi], as the receiver has it; time_utc_usec is 0 until the receiver knows UTC.
+    Without a fix (fix_type 0 or 1), fields may look plausible and vel_ned_valid may be set, but global_position and
+    velocity are None. Some receivers then report eph and epv of thousands of kilometres; many leave timestamp_sample 0.
+    cog_rad is within [-pi, pi] or [0, 2 pi], depending on the receiver; time_utc_usec is 0 until UTC is available.
 
     Layouts 1.13 and 1.14 have integers for latitude and longitude (1e-7 deg) and altitudes (mm), converted both ways.
     Since 1.17 jamming_state and spoofing_state 2 and 3 mean "mitigated" and "detected";
@@ -25,8 +25,8 @@ class SensorGps(Message):
     """
 
     TOPICS = (
-        Topic("sensor_gps", 8.0, "each GNSS receiver's driver", instances=True, plain_first=True),
-        Topic("vehicle_gps_position", 50.0, "the blend or choice of all receivers"),
+        Topic("sensor_gps", 8.0, "the driver of each GNSS receiver", instances=True, plain_first=True),
+        Topic("vehicle_gps_position", 50.0, "the GNSS selector or blending"),
     )
     LAYOUTS = (
         Layout("1.13", """
@@ -40,10 +40,10 @@ class SensorGps(Message):
         Layout("1.18", "*"),
     )  # fmt: skip
     OLDER = (
-        Older("lat", "latitude_deg", lambda lat: lat / 1e7, lambda degrees: _integer(degrees, 1e7), "int32"),
-        Older("lon", "longitude_deg", lambda lon: lon / 1e7, lambda degrees: _integer(degrees, 1e7), "int32"),
-        Older("alt", "altitude_msl_m", lambda alt: alt / 1e3, lambda m: _integer(m, 1e3), "int32"),
-        Older("alt_ellipsoid", "altitude_ellipsoid_m", lambda alt: alt / 1e3, lambda m: _integer(m, 1e3), "int32"),
+        RenamedField("lat", "latitude_deg", lambda lat: lat / 1e7, lambda deg: _integer(deg, 1e7), "int32"),
+        RenamedField("lon", "longitude_deg", lambda lon: lon / 1e7, lambda deg: _integer(deg, 1e7), "int32"),
+        RenamedField("alt", "altitude_msl_m", lambda mm: mm / 1e3, lambda m: _integer(m, 1e3), "int32"),
+        RenamedField("alt_ellipsoid", "altitude_ellipsoid_m", lambda mm: mm / 1e3, lambda m: _integer(m, 1e3), "int32"),
     )
     RULES = (
         NotLater("timestamp_sample", "timestamp"),
@@ -69,30 +69,30 @@ class SensorGps(Message):
     ) = 0, 1, 2, 4, 8, 16, 32, 64  # fmt: skip
     RTCM_MSG_USED_UNKNOWN, RTCM_MSG_USED_NOT_USED, RTCM_MSG_USED_USED = range(3)
 
-    timestamp_sample: Uint64 = field("Time of the sensor data behind this [us], <= timestamp")
+    timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
 
-    device_id: Uint32 = field("ID of the sensor, kept over restarts")
+    device_id: Uint32 = field("Device ID, unchanged by restarts")
 
     latitude_deg: Float64 = field("Latitude [deg] [WGS84]")
     longitude_deg: Float64 = field("Longitude [deg] [WGS84]")
     altitude_msl_m: Float64 = field("Altitude above mean sea level [m]")
     altitude_ellipsoid_m: Float64 = field("Altitude above the ellipsoid [m] [WGS84]")
 
-    s_variance_m_s: Float32 = field("Accuracy of speed, no variance [m/s]")
-    c_variance_rad: Float32 = field("Accuracy of course, no variance [rad]")
-    fix_type: Uint8 = field("Fix: 0, 1 none, 2 2D, 3 3D, 4 differential, 5 RTK float, 6 RTK, 8 extrapolated")
+    s_variance_m_s: Float32 = field("Speed accuracy [m/s], not a variance")
+    c_variance_rad: Float32 = field("Course accuracy [rad], not a variance")
+    fix_type: Uint8 = field("Fix: 0, 1 none, 2 2D, 3 3D, 4 RTCM differential, 5 RTK float, 6 RTK fixed, 8 extrapolated")
 
-    eph: Float32 = field("Accuracy of horizontal position [m]")
-    epv: Float32 = field("Accuracy of altitude [m]")
+    eph: Float32 = field("Horizontal position accuracy [m]")
+    epv: Float32 = field("Vertical position accuracy [m]")
     hdop: Float32 = field("Horizontal dilution of precision")
     vdop: Float32 = field("Vertical dilution of precision")
 
-    noise_per_ms: Int32 = field("Noise per millisecond, in the receiver's own counts")
-    automatic_gain_control: Uint16 = field("Gain of the receiver's input, in its own counts")
-    jamming_state: Uint8 = field("Jamming: 0 unknown, 1 none, 2 mitigated, 3 detected")
-    jamming_indicator: Int32 = field("Strength of jamming, in the receiver's own counts")
-    spoofing_state: Uint8 = field("Spoofing: 0 unknown, 1 none, 2 mitigated, 3 detected")
-    authentication_state: Uint8 = field("Signals: 0 unknown, 1 starting, 2 error, 3 authentic, 4 not checked")
+    noise_per_ms: Int32 = field("Noise per millisecond, in receiver-specific units")
+    automatic_gain_control: Uint16 = field("Automatic gain control, in receiver-specific units")
+    jamming_state: Uint8 = field("Jamming: 0 unknown, 1 OK, 2 mitigated, 3 detected")
+    jamming_indicator: Int32 = field("Jamming level, in receiver-specific units")
+    spoofing_state: Uint8 = field("Spoofing: 0 unknown, 1 OK, 2 mitigated, 3 detected")
+    authentication_state: Uint8 = field("Signal authentication: 0 unknown, 1 initializing, 2 error, 3 OK, 4 disabled")
 
     vel_m_s: Float32 = field("Ground speed [m/s]")
     vel_n_m_s: Float32 = field("North velocity [m/s] [NED]")
@@ -101,24 +101,24 @@ class SensorGps(Message):
     cog_rad: Float32 = field("Course over ground, not heading [rad]")
     vel_ned_valid: Bool = field("vel_n_m_s, vel_e_m_s and vel_d_m_s are valid")
 
-    timestamp_time_relative: Int32 = field("Time of time_utc_usec, after timestamp [us]")
-    time_utc_usec: Uint64 = field("Unix time of the fix [us], 0 if not known")
+    timestamp_time_relative: Int32 = field("Time of time_utc_usec relative to timestamp [us]")
+    time_utc_usec: Uint64 = field("Unix time of the fix [us], 0 if unknown")
 
-    satellites_used: Uint8 = field("Count of satellites used")
-    system_error: Uint32 = field("Faults of the receiver as bits, see SYSTEM_ERROR_; 0 none")
+    satellites_used: Uint8 = field("Number of satellites used")
+    system_error: Uint32 = field("Receiver error bitmask, see SYSTEM_ERROR_; 0 if none")
 
-    heading: Float32 = field("Heading by two antennas, body frame to NED [rad], NaN if not known")
-    heading_offset: Float32 = field("Angle of the two antennas in the body frame [rad], NaN without")
-    heading_accuracy: Float32 = field("Accuracy of heading [rad]")
+    heading: Float32 = field("Dual-antenna heading, body frame to NED [rad], NaN if unknown")
+    heading_offset: Float32 = field("Dual-antenna angle in the body frame [rad], NaN if not used")
+    heading_accuracy: Float32 = field("Heading accuracy [rad]")
 
-    rtcm_injection_rate: Float32 = field("Rate of RTCM corrections given to the receiver [Hz]")
-    selected_rtcm_instance: Uint8 = field("uORB instance of the corrections in use")
-    rtcm_crc_failed: Bool = field("The latest correction arrived damaged")
-    rtcm_msg_used: Uint8 = field("The receiver used the latest correction: 0 unknown, 1 no, 2 yes")
+    rtcm_injection_rate: Float32 = field("RTCM injection rate [Hz]")
+    selected_rtcm_instance: Uint8 = field("uORB instance of the RTCM corrections in use")
+    rtcm_crc_failed: Bool = field("CRC of the last RTCM message failed")
+    rtcm_msg_used: Uint8 = field("Receiver used the last RTCM message: 0 unknown, 1 no, 2 yes")
 
-    antenna_offset_x: Float32 = field("Antenna's position, forward [m] [body FRD]")
-    antenna_offset_y: Float32 = field("Antenna's position, right [m] [body FRD]")
-    antenna_offset_z: Float32 = field("Antenna's position, down [m] [body FRD]")
+    antenna_offset_x: Float32 = field("Antenna position, forward [m] [body FRD]")
+    antenna_offset_y: Float32 = field("Antenna position, right [m] [body FRD]")
+    antenna_offset_z: Float32 = field("Antenna position, down [m] [body FRD]")
 
     @property
     def global_position(self) -> GlobalPosition | None:

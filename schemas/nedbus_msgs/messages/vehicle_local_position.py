@@ -7,8 +7,9 @@ from collections.abc import Collection, Mapping
 from typing import ClassVar, Final
 
 from nedbus_msgs.frames import GlobalPosition, Ned, to_global
-from nedbus_msgs.model import FLOAT32_PI, FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
+from nedbus_msgs.model import Layout, Message, RenamedField, Topic
 from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Uint8, Uint64, field, while_valid
+from nedbus_msgs.model.rules import FLOAT32_PI, FiniteWhile, NotLater, NotNegative, Within
 
 _VALID: Final = {"xy_valid": "xy", "z_valid": "z", "v_xy_valid": "vxy", "v_z_valid": "vz"}
 _WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # bad if set
@@ -23,18 +24,18 @@ class VehicleLocalPosition(Message):
     The origin is where EKF2 started, or the global origin once that is set.
     x, y, z, vx, vy and vz hold numbers even while they are invalid: check the flags.
 
-    A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
-    bit for bit as it was made; a number beyond float32 (1e39) is rejected.
-    A field that is not given is "not provided": NaN, false or 0, and absent from `model_fields_set`.
+    Numbers in float32 fields are rounded to the nearest float32, like a C float, so a message is received bit for bit
+    as it was created; numbers beyond the range of float32 (1e39) are rejected.
+    An omitted field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
-    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
+    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a broken rule.
     """
 
     TOPICS = (
-        Topic("vehicle_local_position", 100.0, "EKF2, or the EKF2 selector of several", priority="data_high"),
+        Topic("vehicle_local_position", 100.0, "EKF2, or the EKF2 selector in multi-EKF mode", priority="data_high"),
         Topic("vehicle_local_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
         Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)"),
-        Topic("estimator_local_position", 2.0, "each EKF instance, when several run", instances=True),
+        Topic("estimator_local_position", 2.0, "each EKF2 instance in multi-EKF mode", instances=True),
     )
     LAYOUTS = (
         Layout("1.13", "1.14, without dead_reckoning"),
@@ -51,11 +52,11 @@ class VehicleLocalPosition(Message):
     ALWAYS = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"
     OLDER = (
         # As in PX4's own translation:
-        Older("hagl_max", "hagl_max_z hagl_max_xy", doc="Greatest height above ground [m]"),
+        RenamedField("hagl_max", "hagl_max_z hagl_max_xy", doc="Maximum height above ground [m]"),
         # Up to 1.11:
-        Older("yaw", "heading"),
-        Older("delta_yaw", "delta_heading"),
-        Older("yaw_reset_counter", "heading_reset_counter"),
+        RenamedField("yaw", "heading"),
+        RenamedField("delta_yaw", "delta_heading"),
+        RenamedField("yaw_reset_counter", "heading_reset_counter"),
     )
     RULES = (
         FiniteWhile({
@@ -78,7 +79,7 @@ class VehicleLocalPosition(Message):
     MESSAGE_VERSION: ClassVar = 1
     DIST_BOTTOM_SENSOR_NONE, DIST_BOTTOM_SENSOR_RANGE, DIST_BOTTOM_SENSOR_FLOW = range(3)
 
-    timestamp_sample: Uint64 = field("Time of the sensor data behind this estimate [us], <= timestamp")
+    timestamp_sample: Uint64 = field("Time of the underlying sensor data [us], <= timestamp")
 
     xy_valid: Bool = field("x and y are valid")
     z_valid: Bool = field("z is valid")
@@ -108,25 +109,25 @@ class VehicleLocalPosition(Message):
 
     heading: Float32 = field("Euler yaw, body frame to local NED [rad], within [-pi, pi]")
     heading_var: Float32 = field("Variance of heading [rad^2]")
-    unaided_heading: Float32 = field("Heading from gyros alone [rad]: only differences mean anything")
+    unaided_heading: Float32 = field("Heading from gyros alone [rad]; only differences are meaningful")
     delta_heading: Float32 = field("Jump of heading at its latest reset [rad]")
     heading_reset_counter: Uint8 = field("Count of heading resets, wraps at 255")
-    heading_good_for_control: Bool = field("heading is good enough to control the vehicle with")
+    heading_good_for_control: Bool = field("heading is good enough for control")
     tilt_var: Float32 = field("Variance of tilt [rad^2]")
 
     xy_global: Bool = field("x and y have a global origin (ref_lat, ref_lon)")
     z_global: Bool = field("z has a global origin (ref_alt)")
     ref_timestamp: Uint64 = field("Time when the origin was set, since boot [us]")
-    ref_lat: Float64 = field("Latitude of the origin [deg] [WGS84], NaN while there is none")
-    ref_lon: Float64 = field("Longitude of the origin [deg] [WGS84], NaN while there is none")
-    ref_alt: Float32 = field("Altitude of the origin above mean sea level [m], NaN while there is none")
+    ref_lat: Float64 = field("Latitude of the origin [deg] [WGS84], NaN if none")
+    ref_lon: Float64 = field("Longitude of the origin [deg] [WGS84], NaN if none")
+    ref_alt: Float32 = field("Altitude of the origin above mean sea level [m], NaN if none")
 
     dist_bottom_valid: Bool = field("dist_bottom is valid")
-    dist_bottom: Float32 = field("Distance down to the ground [m], written even when not valid")
+    dist_bottom: Float32 = field("Distance to the ground [m], written even while invalid")
     dist_bottom_var: Float32 = field("Variance of the terrain estimate [m^2]")
     delta_dist_bottom: Float32 = field("Jump of dist_bottom at its latest reset [m]")
     dist_bottom_reset_counter: Uint8 = field("Count of dist_bottom resets, wraps at 255")
-    dist_bottom_sensor_bitfield: Uint8 = field("Sensors behind dist_bottom: 0 none, 1 range, 2 flow")
+    dist_bottom_sensor_bitfield: Uint8 = field("Sensors used for dist_bottom: 0 none, 1 range, 2 flow")
 
     eph: Float32 = field("Standard deviation of north and east position combined [m]")
     epv: Float32 = field("Standard deviation of down position [m]")
@@ -135,11 +136,11 @@ class VehicleLocalPosition(Message):
 
     dead_reckoning: Bool = field("The position is estimated by dead reckoning")
 
-    vxy_max: Float32 = field("Limit of horizontal speed [m/s]; none: infinity (0 in ground truth)")
-    vz_max: Float32 = field("Limit of vertical speed [m/s]; none: infinity (0 in ground truth)")
-    hagl_min: Float32 = field("Least height above ground [m]; none: infinity (0 in ground truth)")
-    hagl_max_z: Float32 = field("Greatest height above ground for z control [m]; none: infinity")
-    hagl_max_xy: Float32 = field("Greatest height above ground for xy control [m]; none: infinity")
+    vxy_max: Float32 = field("Maximum horizontal speed [m/s]; infinity if unlimited (0 in ground truth)")
+    vz_max: Float32 = field("Maximum vertical speed [m/s]; infinity if unlimited (0 in ground truth)")
+    hagl_min: Float32 = field("Minimum height above ground [m]; infinity if unlimited (0 in ground truth)")
+    hagl_max_z: Float32 = field("Maximum height above ground for z control [m]; infinity if unlimited")
+    hagl_max_xy: Float32 = field("Maximum height above ground for xy control [m]; infinity if unlimited")
 
     position: ClassVar = while_valid(Ned, "x, y and z [m] [local NED]", "xy_valid", "z_valid")
     velocity: ClassVar = while_valid(Ned, "vx, vy and vz [m/s] [local NED]", "v_xy_valid", "v_z_valid")

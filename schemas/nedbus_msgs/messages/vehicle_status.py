@@ -1,6 +1,6 @@
 """VehicleStatus: arming, mode and failsafe."""
 
-from nedbus_msgs.model import Layout, Message, Older, Topic
+from nedbus_msgs.model import Layout, Message, RenamedField, Topic
 from nedbus_msgs.model.px4_types import Bool, Uint8, Uint16, Uint32, Uint64, field
 
 
@@ -8,12 +8,12 @@ class VehicleStatus(Message):
     """State of a vehicle from PX4's commander: arming, mode, failsafe, links.
 
     nav_state is the active mode; nav_state_user_intention is the user's choice, which a failsafe does not change.
-    Masks have bit n (1 << n) for mode n of NAVIGATION_STATE_; modes 23 to 30 are a companion's.
+    Bit n (1 << n) of a mask is mode n of NAVIGATION_STATE_; modes 23 to 30 are external modes of a companion.
 
-    The constants are those of main; numbers unused in older releases have names now. Numbers with another meaning:
-    mode 8 landed after an engine failure in 1.13; ARM_DISARM_REASON_ from 6 on: up to 1.17 6 was the safety button,
-    7 landed, 8 no take-off, 9 the kill switch, 10 lockdown, 11 the failure detector, 12 shutdown, 13 a test.
-    data_link_lost and data_link_lost_counter of layout 1.13 are gcs_connection_lost and its counter here.
+    The constants are those of main; some numbers had another meaning in older releases. Mode 8 was landing after an
+    engine failure in 1.13. Up to 1.17, ARM_DISARM_REASON_ 6 was the safety button, 7 landing, 8 no take-off, 9 the
+    kill switch, 10 lockdown, 11 the failure detector, 12 shutdown, 13 a unit test.
+    data_link_lost and data_link_lost_counter of layout 1.13 are now gcs_connection_lost and its counter.
     """
 
     TOPICS = (Topic("vehicle_status", 2.0, "the commander", on_change=True),)
@@ -37,8 +37,8 @@ class VehicleStatus(Message):
             onboard_control_sensors_present onboard_control_sensors_enabled onboard_control_sensors_health"""),
     )  # fmt: skip
     OLDER = (
-        Older("data_link_lost", "gcs_connection_lost"),
-        Older("data_link_lost_counter", "gcs_connection_lost_counter"),
+        RenamedField("data_link_lost", "gcs_connection_lost"),
+        RenamedField("data_link_lost_counter", "gcs_connection_lost_counter"),
     )
 
     ARMING_STATE_DISARMED, ARMING_STATE_ARMED = range(1, 3)
@@ -65,74 +65,74 @@ class VehicleStatus(Message):
     FAILSAFE_DEFER_STATE_DISABLED, FAILSAFE_DEFER_STATE_ENABLED, FAILSAFE_DEFER_STATE_WOULD_FAILSAFE = range(3)
 
     armed_time: Uint64 = field("Time of arming, since boot [us], 0 if not armed")
-    takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if there was none")
+    takeoff_time: Uint64 = field("Time of take-off, since boot [us], 0 if none")
 
-    arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 start, 3 error, 4 shutdown, 5 restored in air")
-    latest_arming_reason: Uint8 = field("Why armed: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
-    latest_disarming_reason: Uint8 = field("Why disarmed, as latest_arming_reason: 6 landed (up to 1.17: 7) ...")
+    arming_state: Uint8 = field("1 disarmed, 2 armed; up to 1.14 also 0 init, 3 error, 4 shutdown, 5 in-air restore")
+    latest_arming_reason: Uint8 = field("Arming reason: 1 stick, 2 switch, 3, 4 command, 5 mission: ARM_DISARM_REASON_")
+    latest_disarming_reason: Uint8 = field("Disarming reason, as latest_arming_reason: 6 landing (up to 1.17: 7) ...")
 
     nav_state_timestamp: Uint64 = field("Time of the latest change of nav_state, since boot [us]")
-    nav_state_user_intention: Uint8 = field("Mode that the user chose, as nav_state")
+    nav_state_user_intention: Uint8 = field("Mode selected by the user, as nav_state")
     nav_state: Uint8 = field("Mode: 0 manual, 1 altitude, 2 position, 3 mission, 4 hold, 5 return, 14 offboard ...")
 
-    executor_in_charge: Uint8 = field("Executor of modes in charge: 0 the autopilot")
-    nav_state_display: Uint8 = field("Mode to show to the user, as nav_state")
-    accepts_offboard_setpoints: Bool = field("The mode in force takes setpoints from a companion")
+    executor_in_charge: Uint8 = field("Mode executor in charge: 0 autopilot")
+    nav_state_display: Uint8 = field("Mode to display to the user, as nav_state")
+    accepts_offboard_setpoints: Bool = field("Active mode accepts offboard setpoints")
 
-    valid_nav_states_mask: Uint32 = field("Modes that exist, as bits of nav_state")
-    can_set_nav_states_mask: Uint32 = field("Modes that a user can choose, as bits of nav_state")
+    valid_nav_states_mask: Uint32 = field("Available modes, as a bitmask of nav_state")
+    can_set_nav_states_mask: Uint32 = field("Modes that the user can select, as a bitmask of nav_state")
 
     hil_state: Uint8 = field("Hardware in the loop: 0 off, 1 on")
-    vehicle_type: Uint8 = field("Kind now: 0 unspecified, 1 rotary wing, 2 fixed wing, 3 rover; a VTOL's changes")
+    vehicle_type: Uint8 = field("Current type: 0 unspecified, 1 rotary wing, 2 fixed wing, 3 rover; a VTOL changes it")
 
-    failsafe: Bool = field("A failsafe is in force")
-    failsafe_and_user_took_over: Bool = field("The user took over from a failsafe")
-    failsafe_defer_state: Uint8 = field("Failsafes put off: 0 no, 1 yes, 2 yes, and one is due")
+    failsafe: Bool = field("Failsafe is active")
+    failsafe_and_user_took_over: Bool = field("User took over from a failsafe")
+    failsafe_defer_state: Uint8 = field("Failsafe deferral: 0 disabled, 1 enabled, 2 enabled with a failsafe pending")
 
-    gcs_connection_lost: Bool = field("The link to the ground station is lost")
-    gcs_connection_lost_counter: Uint8 = field("Count of losses of the link to the ground station")
-    high_latency_data_link_lost: Bool = field("The satellite (high latency) link is lost")
+    gcs_connection_lost: Bool = field("Ground control station connection lost")
+    gcs_connection_lost_counter: Uint8 = field("Number of ground control station connection losses")
+    high_latency_data_link_lost: Bool = field("High-latency (satellite) link lost")
 
-    is_vtol: Bool = field("The vehicle is a VTOL")
-    is_vtol_tailsitter: Bool = field("The vehicle is a tailsitter")
-    in_transition_mode: Bool = field("A VTOL is in transition")
-    in_transition_to_fw: Bool = field("A VTOL is in transition to fixed wing")
+    is_vtol: Bool = field("Vehicle is a VTOL")
+    is_vtol_tailsitter: Bool = field("Vehicle is a tailsitter")
+    in_transition_mode: Bool = field("VTOL is in transition")
+    in_transition_to_fw: Bool = field("VTOL is in transition to fixed wing")
 
-    system_type: Uint8 = field("Kind of vehicle, MAVLink's MAV_TYPE")
+    system_type: Uint8 = field("Vehicle type, MAVLink's MAV_TYPE")
     system_id: Uint8 = field("MAVLink system ID")
     component_id: Uint8 = field("MAVLink component ID")
 
-    safety_button_available: Bool = field("There is a safety button")
-    safety_off: Bool = field("Safety is off: the vehicle may be armed")
-    power_input_valid: Bool = field("The supply of power is good")
-    usb_connected: Bool = field("USB is, or was, connected")
+    safety_button_available: Bool = field("Safety button available")
+    safety_off: Bool = field("Safety is off: arming is allowed")
+    power_input_valid: Bool = field("Power input is valid")
+    usb_connected: Bool = field("USB is connected, or was since boot")
 
-    open_drone_id_system_present: Bool = field("There is a remote ID transmitter")
-    open_drone_id_system_healthy: Bool = field("The remote ID transmitter works")
-    parachute_system_present: Bool = field("There is a parachute")
-    parachute_system_healthy: Bool = field("The parachute works")
-    traffic_avoidance_system_present: Bool = field("There is a traffic avoidance system")
+    open_drone_id_system_present: Bool = field("Remote ID system present")
+    open_drone_id_system_healthy: Bool = field("Remote ID system healthy")
+    parachute_system_present: Bool = field("Parachute system present")
+    parachute_system_healthy: Bool = field("Parachute system healthy")
+    traffic_avoidance_system_present: Bool = field("Traffic avoidance system present")
 
-    rc_calibration_in_progress: Bool = field("The remote control is being calibrated")
-    calibration_enabled: Bool = field("A sensor is being calibrated")
-    pre_flight_checks_pass: Bool = field("The checks before arming pass")
+    rc_calibration_in_progress: Bool = field("RC calibration in progress")
+    calibration_enabled: Bool = field("Sensor calibration in progress")
+    pre_flight_checks_pass: Bool = field("Preflight checks pass")
 
     # Up to 1.17:
     failure_detector_status: Uint16 = field(
-        "Failures as bits: 1 roll, 2 pitch, 4 altitude, 8 external, 16 ESC, 32 ... by release"
+        "Failure detector bitmask: 1 roll, 2 pitch, 4 altitude, 8 external, 16 ESC, 32 ... by release"
     )
 
     # Up to 1.15:
-    avoidance_system_required: Bool = field("Collision avoidance by a companion is required")
-    avoidance_system_valid: Bool = field("Collision avoidance by a companion works")
+    avoidance_system_required: Bool = field("Companion's collision avoidance system is required")
+    avoidance_system_valid: Bool = field("Companion's collision avoidance system is working")
 
     # Up to 1.13:
-    failsafe_timestamp: Uint64 = field("Time when the failsafe began, since boot [us]")
-    vtol_fw_permanent_stab: Bool = field("A VTOL is stabilised in fixed wing flight too")
-    rc_signal_lost: Bool = field("The remote control is lost")
-    engine_failure: Bool = field("An engine failed")
-    mission_failure: Bool = field("The mission failed")
-    geofence_violated: Bool = field("The vehicle is outside its geofence")
-    onboard_control_sensors_present: Uint64 = field("Sensors present, MAVLink's bits of SYS_STATUS")
-    onboard_control_sensors_enabled: Uint64 = field("Sensors enabled, MAVLink's bits of SYS_STATUS")
-    onboard_control_sensors_health: Uint64 = field("Sensors healthy, MAVLink's bits of SYS_STATUS")
+    failsafe_timestamp: Uint64 = field("Time when the failsafe started, since boot [us]")
+    vtol_fw_permanent_stab: Bool = field("VTOL is stabilised in fixed-wing flight too")
+    rc_signal_lost: Bool = field("RC signal lost")
+    engine_failure: Bool = field("Engine failure")
+    mission_failure: Bool = field("Mission failure")
+    geofence_violated: Bool = field("Geofence violated")
+    onboard_control_sensors_present: Uint64 = field("Sensors present, as a bitmask of MAVLink's SYS_STATUS")
+    onboard_control_sensors_enabled: Uint64 = field("Sensors enabled, as a bitmask of MAVLink's SYS_STATUS")
+    onboard_control_sensors_health: Uint64 = field("Sensors healthy, as a bitmask of MAVLink's SYS_STATUS")

@@ -1,5 +1,5 @@
-"""The definition of a message, built from its file in `messages/`: fields, types, layouts, rules and validation."""
+"""Message definitions: fields, types, layouts, rules and validation, built from the classes in `messages/`."""
 
-from .declaration import Layout, Older, Topic
+from .declaration import Layout, RenamedField, Topic
 from .message import Message
 from .rules import FLOAT32_PI, FiniteWhile, InRange, NotLater, NotNegative, UnitQuaternion, Within

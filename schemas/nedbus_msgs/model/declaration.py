@@ -1,4 +1,4 @@
-"""Declarations in a message's file besides its fields: topics, layouts, and fields of older layouts."""
+"""What a message class declares besides its fields: topics, layouts and renamed fields."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -14,8 +14,8 @@ RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 ALL: Final = "all"
 """Name of the layout with every field of the model, if no release of PX4 has them all."""
 
-_CACHE_SECONDS: Final = 20.0  # s of messages in a publisher's cache, at the nominal rate
-_MIN_CACHE: Final = 400  # messages in a publisher's cache
+_CACHE_SECONDS: Final = 20.0  # capacity of a publisher's cache at the nominal rate
+_MIN_CACHE: Final = 400  # messages
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -25,10 +25,10 @@ class Topic:
 
     `rate`: nominal rate at which PX4 publishes or logs it [Hz]; 0 if there is none.
     `doc`: its publisher.
-    `on_change`: PX4 sends it on change, and at `rate` otherwise, so bursts and pauses are not faults.
+    `on_change`: PX4 publishes it on change, otherwise at `rate`; bursts and pauses are not faults.
     `instances`: True if it has uORB instances, one per EKF or sensor; None if unknown.
-    `plain_first`: the ROS 2 topic of instance 0 has no number, as in PX4's defaults.
-    `priority`: messages of higher priority go first on a congested link.
+    `plain_first`: the ROS 2 topic of instance 0 has no suffix, as in PX4's defaults.
+    `priority`: Zenoh priority; higher ones are sent first on a congested link.
     """
 
     name: str
@@ -50,12 +50,12 @@ class Layout:
     """One layout of a message.
 
     `name`: the first PX4 release with it.
-    `text`: the names of its fields, `*` for those of the model, or the difference from another layout:
+    `text`: its field names, `*` for those of the model, or the difference from another layout:
     `1.13, without a b, c: d e` lacks a and b, and has d and e after c; `d:uint8` overrides the type in the model.
-    `wire`: its number in payloads, if it has one.
-    `aliases`: further ROS 2 types with this layout, besides that of the message.
-    `types`: its fields and their types in order, which the definition of the message parses from `text`.
-    `caches`: see `kept`.
+    `wire`: its number in payloads, or None.
+    `aliases`: other ROS 2 types with this layout.
+    `types`: its fields and their types in order, parsed from `text` by the definition.
+    `caches`: see `cached_on_owner`.
     """
 
     name: str
@@ -71,16 +71,16 @@ class Layout:
         return tuple(self.types)
 
 
-def kept(make: _F) -> _F:
-    """Cache the last 1,024 results of a function in its first argument, a Definition or Layout, to be freed with it.
+def cached_on_owner(make: _F) -> _F:
+    """Cache up to 1,024 results of a function in its first argument, a Definition or Layout, and free them with it.
 
-    A cache of the function would keep the definitions that any peer may send.
+    A global cache would keep every definition that a peer sends.
     """
 
     @wraps(make)
     def find(owner: Any, *arguments: object) -> Any:
         cached = owner.caches.get(make)
-        if cached is None:  # another thread may set it meanwhile
+        if cached is None:  # setdefault: another thread may have set it
             cached = owner.caches.setdefault(make, lru_cache(1024)(partial(make, owner)))
         return cached(*arguments)
 
@@ -88,11 +88,11 @@ def kept(make: _F) -> _F:
 
 
 @dataclass(frozen=True, slots=True)
-class Older:
-    """A field of older layouts, and its place in the model.
+class RenamedField:
+    """A field of older layouts that the model has under another name or in another unit.
 
-    `new`: the fields of the model with its value, or elements such as `position[0]`.
-    `up`, `down`: functions that convert its value to the model and back; without them, it is only renamed.
+    `new`: the model's fields with its value, or an element such as `position[0]`.
+    `up`, `down`: conversions of its value to the model and back; None if only the name changed.
     `type`: its PX4 type, if different; `doc`: its unit and meaning.
     """
 
@@ -104,7 +104,7 @@ class Older:
     doc: str = ""
 
     @property
-    def places(self) -> list[tuple[str, int | None]]:
-        """The fields of the model with its value, each with the index of an element or None."""
+    def targets(self) -> list[tuple[str, int | None]]:
+        """The model's fields with its value, each with an element index or None."""
         parts = [place.rstrip("]").partition("[") for place in self.new.split()]
         return [(field, int(index) if index else None) for field, _, index in parts]

@@ -1,4 +1,4 @@
-"""Definitions of messages, their registry, and the conversion of PX4's layouts to the model.
+"""Message definitions, their registry, and conversion between PX4's layouts and the model.
 
 A layout is identified by its field names or its name, never by MESSAGE_VERSION, which two layouts may share.
 """
@@ -12,7 +12,7 @@ from functools import cached_property
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
-from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, kept
+from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, cached_on_owner
 from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values
 
@@ -24,7 +24,7 @@ M_co = TypeVar("M_co", bound="Message", covariant=True)
 
 
 class Row(tuple[Any, ...]):
-    """A message as a named tuple: the fields of the model in the same order, in a fraction of the time.
+    """A message as a named tuple, which is much faster than a model: the same fields in the same order.
 
     Validated when decoded or encoded, not when created.
     Type checkers see the message class; `_fields` and `_asdict()` are those of any named tuple.
@@ -45,11 +45,12 @@ class Row(tuple[Any, ...]):
         return _row, (self.DEFINITION, tuple(self))
 
 
-class Plan(NamedTuple):
-    """Mapping from the fields of a layout to those of the model.
+class UpgradePlan(NamedTuple):
+    """How the fields of a layout fill those of the model.
 
-    All keys are fields of the model, those of `provided`. `names`: the field with the same value.
-    `converted`: the fields, None for an element of an array without one, and a function of their values.
+    `provided`: the filled fields of the model, which are also the keys of `names` and `converted`.
+    `names`: the source field with the same value.
+    `converted`: the source fields (None for a missing array element) and the function that converts their values.
     """
 
     provided: frozenset[str]
@@ -58,13 +59,13 @@ class Plan(NamedTuple):
 
 
 class Definition(Generic[M_co]):
-    """Metadata of one message, from the class in its file.
+    """Metadata of one message, derived from its class.
 
     `name`: its name in PX4, such as VehicleAttitude. `model`: its Pydantic model.
     `types`: the PX4 type of every field of the model, in order.
     `topics`, `older`: topics and older fields by name. `rules`: the rules for its fields.
     `flags`: the fields that are valid while a flag is true.
-    `always`: the fields that every log has, even the oldest. `caches`: see `kept`.
+    `always`: the fields present in every log, even the oldest. `caches`: see `cached_on_owner`.
     """
 
     def __init__(self, model: type[M_co]) -> None:
@@ -85,7 +86,7 @@ class Definition(Generic[M_co]):
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
-        """PX4's layouts by name, oldest first; the last one is that of the model."""
+        """PX4's layouts by name, oldest first; the last one is the model's."""
         found = {layout.name: replace(layout, types=self._types_of(layout.text)) for layout in self.model.LAYOUTS}
         if all(layout.wire is None for layout in found.values()):
             fields = list(self.types.items())
@@ -101,18 +102,18 @@ class Definition(Generic[M_co]):
 
     @cached_property
     def validation(self) -> Validation:
-        """Validation of fields, and of rows."""
+        """Validation of fields and rows."""
         return Validation(self.types, self.rules)
 
     @cached_property
     def row(self) -> type[Row]:
-        """The named tuple of this message."""
-        places: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
-        places |= {name: each for name, each in vars(self.model).items() if isinstance(each, property)}
-        return type(f"{self.name}Row", (Row,), {**places, "__slots__": (), "_fields": self.names, "DEFINITION": self})
+        """The named tuple class of this message."""
+        members: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
+        members |= {name: each for name, each in vars(self.model).items() if isinstance(each, property)}
+        return type(f"{self.name}Row", (Row,), {**members, "__slots__": (), "_fields": self.names, "DEFINITION": self})
 
     def layout_of_release(self, release: str) -> Layout | None:
-        """Return the layout of a PX4 release, or of this name; None if the release lacks the message."""
+        """Return the layout with this name or of this PX4 release; None if the release lacks the message."""
         if release in self.layouts or release not in RELEASES:
             return self.layouts.get(release)
         until = RELEASES[: RELEASES.index(release) + 1]
@@ -139,13 +140,13 @@ class Definition(Generic[M_co]):
         """
         return self.current if self.current.name != ALL else self.find_layout(provided) or self.current
 
-    @kept  # all messages of a stream have the same names
-    def plan(self, names: tuple[str, ...]) -> Plan:
+    @cached_on_owner  # all messages of a stream have the same field names
+    def plan(self, names: tuple[str, ...]) -> UpgradePlan:
         """Return the mapping from these fields, of any PX4 release, to the model; unknown names are ignored."""
         direct: dict[str, str] = {name: name for name in names if name in self.types}
         converted: dict[str, tuple[list[str | None], Callable[..., Any]]] = {}
         for old in (self.older[name] for name in names if name in self.older):
-            for base, index in old.places:
+            for base, index in old.targets:
                 if index is not None and base not in direct:
                     converted.setdefault(base, ([None] * self.types[base].values, _elements))[0][index] = old.name
                 elif old.up and base not in direct:
@@ -153,15 +154,15 @@ class Definition(Generic[M_co]):
                 elif base not in converted:
                     direct.setdefault(base, old.name)
         in_order = {name: direct[name] for name in self.types if name in direct}
-        return Plan(frozenset({*direct, *converted}), in_order, converted)
+        return UpgradePlan(frozenset({*direct, *converted}), in_order, converted)
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
-        """Convert to an older layout, in its field order; fields that the model lacks are "not provided"."""
+        """Convert to an older layout, in its field order; fields that the model lacks become "not provided"."""
         found: dict[str, object] = {}
         for name, kind in layout.types.items():
             value, old = values.get(name, kind.absent), self.older.get(name)
             if old:
-                base, index = old.places[0]
+                base, index = old.targets[0]
                 value = values[base] if index is None else values[base][index]
                 value = old.down(value) if old.down else value
             if self.types.get(name) != kind and not (kind.length or kind.is_float):
@@ -176,7 +177,7 @@ class Definition(Generic[M_co]):
         return (field.description if field else self.older[name].doc if name in self.older else "") or ""
 
     def schema(self) -> dict[str, Any]:
-        """Return the JSON Schema (2020-12), in which NaN and infinities are strings of those names, and the layouts.
+        """Return the JSON Schema (2020-12), where NaN and infinities are strings, and the layouts.
 
         Each layout has its name, its number on the wire (or None), and its fields in order, with name and type.
         """
@@ -198,8 +199,8 @@ class Definition(Generic[M_co]):
         base, bracket, _ = name.partition("[")
         near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
         schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
-        hint = f"did you mean {' or '.join(near)}?" if near else f"'{schema}' lists them"
-        return f"there is no field {name!r}: {hint}"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"'{schema}' lists the fields"
+        return f"unknown field {name!r}: {hint}"
 
     def __repr__(self) -> str:
         return f"<Definition of {self.name}>"
@@ -208,7 +209,6 @@ class Definition(Generic[M_co]):
         return attrgetter("DEFINITION"), (self.model,)
 
     def _types_of(self, text: str) -> Mapping[str, FieldType]:
-        """Parse the text of a layout to its fields."""
         base, *changes = (part.strip() for part in text.split(","))
         same = next((layout for layout in self.model.LAYOUTS if layout.name == base), None)
         if same or base == "*":
@@ -226,19 +226,19 @@ class Definition(Generic[M_co]):
         return dict(fields)
 
     def _field(self, text: str) -> tuple[str, FieldType]:
-        """Parse `name`, or `name:type` with a type that overrides the model's, to name and type."""
+        """Parse `name`, or `name:type` where the type overrides the model's."""
         name, _, kind = text.partition(":")
         if kind or name in self.types:
             return name, field_type(kind) if kind else self.types[name]
         old = self.older[name]
-        base, index = old.places[0]
+        base, index = old.targets[0]
         return name, field_type(old.type or (str(self.types[base]) if index is None else self.types[base].base))
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
     """Build a message from the fields of any PX4 release; arrays are tuples.
 
-    Older names are mapped to current ones, and unknown names are ignored.
+    RenamedField names are mapped to current ones, and unknown names are ignored.
     A missing field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
     Raises pydantic.ValidationError for an invalid message.
@@ -268,17 +268,17 @@ def _row(definition: Definition[Any], values: Values) -> Row:
 
 
 MESSAGES: Final[dict[str, Definition[Any]]] = {}
-"""Definitions by message name, of the messages with a file in `nedbus_msgs.messages`."""
+"""Definitions of all registered messages by name: the built-in ones, and those of imported classes."""
 TOPICS: Final[dict[str, Topic]] = {}
-"""The topics of these messages by name."""
+"""Topics of these messages by name."""
 BY_TOPIC: Final[dict[str, Definition[Any]]] = {}
-"""The definition of the messages on each topic."""
+"""Definitions of these messages by topic."""
 
 
 def register(definition: Definition[Any]) -> None:
-    """Register a message; raise ValueError if its name or one of its topics is taken."""
+    """Register a message; raise ValueError if its name or one of its topics is already registered."""
     if taken := [name for name in (definition.name, *definition.topics) if name in MESSAGES or name in TOPICS]:
-        raise ValueError(f"{definition.name}: there is a message with {', '.join(taken)} already")
+        raise ValueError(f"cannot register {definition.name}: {', '.join(taken)} already registered")
     MESSAGES[definition.name] = definition
     for topic in definition.topics.values():
         TOPICS[topic.name], BY_TOPIC[topic.name] = topic, definition

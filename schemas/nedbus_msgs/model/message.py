@@ -1,4 +1,4 @@
-"""The base of all messages: a validated, immutable Pydantic model with PX4's fields."""
+"""Base class of all messages: a validated, immutable Pydantic model with PX4's fields."""
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar, cast
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from .declaration import Layout, Older, Topic
+from .declaration import Layout, RenamedField, Topic
 from .definition import Definition, register
 from .px4_types import FieldType, Timestamp, decode_text, field_type
 from .rules import Rule, violations
@@ -17,7 +17,7 @@ _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
 class Message(BaseModel):
-    """One message of one vehicle; a subclass in a file of `nedbus_msgs.messages` declares its fields.
+    """One message of one vehicle; each subclass declares the fields of one PX4 message.
 
     Numbers in float32 fields are rounded to the nearest float32, like a C float, so a message is received bit for bit
     as it was created; numbers beyond the range of float32 (1e39) are rejected.
@@ -32,7 +32,7 @@ class Message(BaseModel):
     )  # fmt: skip
     TOPICS: ClassVar[Sequence[Topic]] = ()
     LAYOUTS: ClassVar[Sequence[Layout]] = ()
-    OLDER: ClassVar[Sequence[Older]] = ()
+    OLDER: ClassVar[Sequence[RenamedField]] = ()
     RULES: ClassVar[Sequence[Rule]] = ()
     ALWAYS: ClassVar[str] = "timestamp"
     DEFINITION: ClassVar[Definition[Any]]
@@ -57,7 +57,7 @@ class Message(BaseModel):
             else:
                 fill(self, values, definition.all_fields if len(fields) == len(values) else frozenset(fields))
 
-        # The mark of Pydantic's own constructor: validation of dicts and JSON then skips this one.
+        # Pydantic's mark for its own constructor: validation of dicts and JSON bypasses it.
         __init__.__pydantic_base_init__ = True
 
     @classmethod
@@ -134,9 +134,9 @@ def _is_same(one: object, other: object) -> bool:
 
 
 def _to_python(value: Any, kind: FieldType | None) -> object:
-    """Convert a NumPy scalar or array, a list, or JSON's name of a float to Python's own value.
+    """Convert a NumPy scalar or array, a list, or a float name in JSON to a Python value.
 
-    Anything else is left for the model to reject.
+    Anything else is returned unchanged, for the model to reject.
     """
     if type(value).__module__ == "numpy":
         value = value.tolist()

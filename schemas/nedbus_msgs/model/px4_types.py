@@ -1,4 +1,4 @@
-"""PX4's field types: a table of base types, and declarations of fields and of properties with flags."""
+"""PX4's field types, and declarations of fields and of properties guarded by validity flags."""
 
 import math
 import re
@@ -13,9 +13,9 @@ from pydantic_core import CoreSchema, core_schema
 _T = TypeVar("_T")
 
 NAN: Final = math.nan
-YEAR_2000: Final = 946_684_800_000_000  # us; an earlier time is since boot
+YEAR_2000: Final = 946_684_800_000_000  # us since 1970; earlier timestamps are time since boot
 _YEAR_2100: Final = 4_102_444_800_000_000
-_LONGEST_ARRAY: Final = 1024  # elements; PX4's longest has 512
+_MAX_ARRAY: Final = 1024  # elements; PX4's longest array has 512
 
 
 class Base(NamedTuple):
@@ -39,18 +39,18 @@ BASES: Final[Mapping[str, Base]] = {
     "uint64": Base("Q", 0xCF, 9, 0),
     "float32": Base("f", 0xCA, 10, NAN),
     "float64": Base("d", 0xCB, 11, NAN),
-    "char": Base("s", 0xDA, 3, ""),  # only as an array, which is a text; ROS 2 has a uint8 in its place
+    "char": Base("s", 0xDA, 3, ""),  # only as an array, which is text; ROS 2 uses uint8
 }
 ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
-"""The types of single values with another name in PX4."""
+"""Other names that PX4 uses for types of single values."""
 
 
 class FieldType(str):
-    """The name of a PX4 field type, such as `float32[4]`, and what follows from it; `field_type` returns them.
+    """A PX4 field type by its name, such as `float32[4]`, with derived properties; `field_type` creates it.
 
     `base`: the type of one value; `length`: the elements of an array, None for a single value.
-    `is_text`: True for an array of characters. `char[127]` is a single value, a text (`str`) of at most 127 bytes of
-    UTF-8. It ends at the first NUL, and bytes that are not UTF-8 become "?".
+    `is_text`: True for a char array. `char[127]` is a single value, a `str` of at most 127 bytes of UTF-8, which ends
+    at the first NUL; bytes that are not UTF-8 become "?".
     `is_array`: True for a type whose value is a tuple. `values`: number of values.
     `form`: the struct format of all values. `size`: size of one value in bytes.
     `is_float`: True for float types, whose values may be NaN. `limits`: minimum and maximum of an integer type.
@@ -71,9 +71,9 @@ class FieldType(str):
         self.limits = (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
     def fit(self, value: Any) -> Any:
-        """Convert a number of another type, or a tuple of at most this length; return None unless it keeps its value.
+        """Convert a number, or a tuple of at most this length, to this type; return None if a value would change.
 
-        A shorter array is filled up with "not provided".
+        A shorter array is padded with "not provided".
         """
         base = BASES[self.base]
         if self.is_text:
@@ -94,7 +94,7 @@ class FieldType(str):
     def annotation(self) -> Any:
         """The type annotation of a model's field."""
         value = str if self.is_text else bool if self.base == "bool" else float if self.is_float else int
-        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one for each
+        python = tuple[(value,) * self.values] if self.is_array else value  # type: ignore[misc] # one per value
         return Annotated[python, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:
@@ -120,7 +120,7 @@ class FieldType(str):
 
     def _check_text(self, text: str) -> str:
         if len(encode_text(text)) > self.size:
-            raise ValueError(f"it has more than {self.size} bytes in UTF-8")
+            raise ValueError(f"text exceeds {self.size} bytes of UTF-8")
         return text
 
     def __get_pydantic_core_schema__(self, source: object, handler: object) -> CoreSchema:
@@ -128,20 +128,20 @@ class FieldType(str):
 
 
 def encode_text(text: str) -> bytes:
-    """Return the UTF-8 of a text up to its first NUL; raise TypeError for another type."""
+    """Encode text as UTF-8 up to its first NUL; raise TypeError for any other type."""
     return str.encode(text, "utf-8", "replace").partition(b"\0")[0]
 
 
 def decode_text(data: bytes) -> str:
-    """Return the text of an array of characters; with "?", it has no more bytes than that."""
+    """Decode a char array up to its first NUL; "?" replaces invalid UTF-8, and never makes the text longer."""
     return data.partition(b"\0")[0].decode(errors="replace").replace("\ufffd", "?")
 
 
 @cache
 def field_type(text: str) -> FieldType:
-    """Parse PX4's name of a type.
+    """Parse the name of a PX4 type.
 
-    Raises ValueError for an unknown base type, and for an array with no or too many elements.
+    Raises ValueError for an unknown base type, or an array with no or too many elements.
     """
     found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
     if found is None:
@@ -151,13 +151,13 @@ def field_type(text: str) -> FieldType:
         base = ALIASES.get(base, base)
     if base not in BASES:
         raise ValueError(f"{base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
-    if length and not 0 < int(length) <= _LONGEST_ARRAY:
-        raise ValueError(f"an array of {int(length)}: expected 1 to {_LONGEST_ARRAY} elements")
+    if length and not 0 < int(length) <= _MAX_ARRAY:
+        raise ValueError(f"array of {int(length)} elements: expected 1 to {_MAX_ARRAY}")
     return FieldType(f"{base}[{int(length)}]" if length else base)
 
 
 def is_unix_time(timestamp_us: Any) -> Any:
-    """Return whether a time [us], or each of an array, is Unix time, a date from 2000 to 2100, not since boot."""
+    """Return whether a timestamp [us], or each in an array, is Unix time (2000 to 2100), not time since boot."""
     return (timestamp_us >= YEAR_2000) & (timestamp_us < _YEAR_2100)
 
 
@@ -169,7 +169,7 @@ def field(meaning: str) -> Any:
 def while_valid(make: Callable[..., _T], meaning: str, *flags: str) -> _T | None:
     """Declare a property of models and rows: None while one of its flags is false or not provided.
 
-    `make`: a function from the fields of these flags, by the message's rule FiniteWhile, to the value.
+    `make`: builds the value from the fields that these flags guard, as declared by FiniteWhile.
     """
 
     def value(message: Any) -> _T | None:
@@ -181,7 +181,7 @@ def while_valid(make: Callable[..., _T], meaning: str, *flags: str) -> _T | None
 
 
 Timestamp = Annotated[int, field_type("uint64")]
-"""The time of a message, its only required field."""
+"""Type of `timestamp`, the only required field."""
 Bool = Annotated[bool, field_type("bool"), Field(default=False)]
 Int8 = Annotated[int, field_type("int8"), Field(default=0)]
 Int32 = Annotated[int, field_type("int32"), Field(default=0)]

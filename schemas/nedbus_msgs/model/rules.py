@@ -1,4 +1,4 @@
-"""Rules for the fields of a message, as Python expressions on values and on NumPy columns.
+"""Validation rules between fields, as Python expressions on values and on NumPy columns.
 
 Every rule holds on all real flights examined; docs/messages.md has the counts.
 """
@@ -20,8 +20,8 @@ _QUATERNION: Final = struct.Struct("<4f")
 class Check(NamedTuple):
     """The check of one field.
 
-    `reason`: the error text; `wrong`: an expression that is true if the field breaks the rule, with parentheses around
-    each comparison and no `if`, to be convertible to an expression on columns. Both have fields in braces.
+    `reason`: the error text. `wrong`: an expression that is true if the field breaks the rule; it has parentheses
+    around each comparison and no `if`, so it converts to an expression on columns. Both have field names in braces.
     """
 
     field: str
@@ -30,7 +30,7 @@ class Check(NamedTuple):
 
 
 class Rule:
-    """A rule for fields, whose values already have the right types; NaN never breaks the rule of a single field.
+    """Base class of rules; values already have the right types, and NaN never breaks a rule on a single field.
 
     `flags`: the fields that are finite while a flag is set, by flag.
     """
@@ -79,10 +79,8 @@ class InRange(Rule):
     def __init__(
         self, field: str, least: float, greatest: float, *, or_: float | None = None, is_array: bool = False
     ) -> None:
-        reason = f"must be {least:.9g} to {greatest:.9g}" + (
-            "" if or_ is None else f", or {or_:g} while it is not known"
-        )
-        # A valid value must remain valid when it is rounded to float32; the bounds may be infinite.
+        reason = f"must be {least:.9g} to {greatest:.9g}" + ("" if or_ is None else f", or {or_:g} if unknown")
+        # A valid value must stay valid when rounded to float32; the bounds may be infinite.
         least, greatest = min(least, float32(least)), max(greatest, float32(greatest))
         each = "each" if is_array else f"{{{field}}}"
         known = [] if or_ is None else [f"({each} != {value!r})" for value in dict.fromkeys((or_, float32(or_)))]
@@ -102,50 +100,50 @@ class UnitQuaternion(Rule):
     """A quaternion (w, x, y, z) has norm 1, within 0.001, or is not provided (w is NaN)."""
 
     def __init__(self, field: str) -> None:
-        reason = "must have norm 1, or NaN as its first element while it is not known"
+        reason = "must have norm 1, or NaN as first element if unknown"
         middle, tolerance = (0.999**2 + 1.001**2) / 2, (1.001**2 - 0.999**2) / 2
         value = f"{{{field}}}"
         bad = f"not (abs(squared_norm({value}) - {middle!r}) <= {tolerance!r})"
         super().__init__([Check(field, reason, f"(({value}[0] == {value}[0]) and {bad})")])
 
 
-def passes_all(rules: Sequence[Rule], places: Mapping[str, str]) -> Callable[[Any], bool]:
-    """Return a function that checks whether `values` pass all rules; `places`: the expression of each field in it.
+def compile_rules(rules: Sequence[Rule], accessors: Mapping[str, str]) -> Callable[[Any], bool]:
+    """Compile all rules to one predicate on `values`; `accessors`: the expression for each field.
 
-    It is compiled from a single expression, so it costs no more than its comparisons.
+    A single expression costs no more than its comparisons.
     """
     passed = []
     for rule in rules:
         right = f"not ({' or '.join(check.wrong for check in rule.checks)})"
-        # All fields with flags at once first, as they are almost always finite.
+        # Fast path: the sum of all guarded fields is almost always finite.
         finite = " + ".join(f"{{{name}}}" for fields in rule.flags.values() for name in fields)
         passed.append(f"(isfinite({finite}) or {right})" if finite else right)
-    return evaluated(f"lambda values: {' and '.join(passed) or True}".format_map(places))
+    return compile_lambda(f"lambda values: {' and '.join(passed) or True}".format_map(accessors))
 
 
 def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the name and the reason for each field that breaks a rule, given the values of all fields."""
-    places = {name: f"values[{name!r}]" for name in values}
+    accessors = {name: f"values[{name!r}]" for name in values}
     for check in chain.from_iterable(rule.checks for rule in rules):
-        if evaluated(f"lambda values: {check.wrong}".format_map(places))(values):
+        if compile_lambda(f"lambda values: {check.wrong}".format_map(accessors))(values):
             yield check.field, check.reason.format_map(values)
 
 
-def wrong_columns(rules: Sequence[Rule], **functions: Callable[..., Any]) -> list[Callable[[Any], Any]]:
-    """Return one function per check, from a structured array to a mask of the messages that break the rule.
+def column_checks(rules: Sequence[Rule], **functions: Callable[..., Any]) -> list[Callable[[Any], Any]]:
+    """Return one function per check that maps a structured array to a mask of the messages that break it.
 
-    `functions`: the functions that checks call, for columns; columns of arrays are transposed.
+    `functions`: column versions of the functions that checks call; array columns are transposed.
     """
-    places = {name: f"values[{name!r}].T" for rule in rules for name in rule.fields}
-    texts = [check.wrong.format_map(places) for rule in rules for check in rule.checks]
+    accessors = {name: f"values[{name!r}].T" for rule in rules for name in rule.fields}
+    texts = [check.wrong.format_map(accessors) for rule in rules for check in rule.checks]
     for word, operator in {" or ": " | ", " and ": " & ", "not ": "~"}.items():
         texts = [text.replace(word, operator) for text in texts]
-    return [evaluated(f"lambda values: {text}", **functions) for text in texts]
+    return [compile_lambda(f"lambda values: {text}", **functions) for text in texts]
 
 
 @lru_cache(1024)
-def evaluated(expression: str, **functions: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Compile a lambda that was generated from numbers and field positions, never from a peer's data."""
+def compile_lambda(expression: str, **functions: Callable[..., Any]) -> Callable[[Any], Any]:
+    """Compile a lambda generated from numbers and field positions, never from data of a peer."""
     names = {"isfinite": math.isfinite, "squared_norm": _squared_norm, "inf": math.inf, **functions}
     code = compile(expression, "<rules>", "eval")  # eval() of a str makes CPython lose a pending Ctrl-C
     return cast("Callable[[Any], Any]", eval(code, names))  # noqa: S307 - see above

@@ -1,7 +1,7 @@
 """Fast path of validation: all fields of a message as one tuple, in a fifth of the model's time.
 
-It has the types and rules of the model, and accepts nothing that the model rejects.
-Whatever it does not accept goes to the model, which decides and gives the reasons.
+It checks the model's types and rules, and accepts nothing that the model rejects.
+Anything it does not accept is passed to the model, which decides and reports the reasons.
 """
 
 import math
@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
 from .px4_types import FieldType, decode_text, encode_text
-from .rules import Rule, evaluated, passes_all
+from .rules import Rule, compile_lambda, compile_rules
 
 _FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
@@ -25,30 +25,30 @@ Values = tuple[object, ...]
 class Validation:
     """Validation of the fields of one message, and their rounding to float32.
 
-    `passes_rules`: return whether the values of all fields, which have the right types, pass the rules.
-    `template`: a dict with all field names, to copy and fill, which is faster than a growing dict.
+    `passes_rules`: return whether the values of all fields, already of the right types, pass the rules.
+    `template`: a dict with all field names; copying and filling it is faster than growing a dict.
     `values_of`: return the values of all fields in order from a mapping.
     `validate`: return the values of all fields; raise pydantic.ValidationError for a wrong type.
-    `flatten`: expand the arrays of a row in place and encode its texts, as struct packs them; `unflatten`: the reverse.
+    `flatten`: expand arrays of a row in place and encode text, for struct to pack; `unflatten`: the reverse.
     """
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
         names, kinds = tuple(types), types.values()
-        self.passes_rules = passes_all(rules, {name: f"values[{index}]" for index, name in enumerate(names)})
+        self.passes_rules = compile_rules(rules, {name: f"values[{index}]" for index, name in enumerate(names)})
         self.values_of: Callable[[Any], Values] = (
             itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         )
         self.template: dict[str, object] = dict.fromkeys(names)
         self._types = types
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
-        # Not the model's schema: building it for all messages takes Pydantic 20 ms, in which it swallows a Ctrl-C.
+        # Not the model's schema: Pydantic needs 20 ms to build it for all messages, and swallows Ctrl-C meanwhile.
         tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
         self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
         self._struct = struct.Struct("=" + "".join(kind.form for kind in kinds))
-        self.flatten, self.unflatten = _flat_forms(list(kinds))
+        self.flatten, self.unflatten = _flatten_functions(list(kinds))
 
     def check_row(self, values: Values) -> Values | None:
-        """Validate the values of all fields without rounding them; return None if the model has to decide."""
+        """Validate the values of all fields without rounding; return None to let the model decide."""
         try:
             row: Values = self.validate(values)
         except ValidationError:
@@ -81,7 +81,7 @@ class Validation:
         return self.name(self.unflatten(self._struct.unpack(packed)))
 
     def unpack(self, packed: bytes) -> Values:
-        """Return the values of all fields from their native forms, one behind the other."""
+        """Unpack the values of all fields from consecutive native values."""
         return self.unflatten(self._struct.unpack(packed))
 
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -92,8 +92,8 @@ class Validation:
                     yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
 
 
-def _flat_forms(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:
-    """Return functions that flatten a row and restore it, given the types of its fields."""
+def _flatten_functions(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:
+    """Return functions that flatten and restore rows with fields of these types."""
     flat, nested, index, place = [], [], 0, 0  # first value after the last array: in the row, and in the flat tuple
     for position, kind in enumerate(kinds):
         if kind.length is not None:
@@ -107,5 +107,5 @@ def _flat_forms(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values],
     if not flat:
         return tuple, tuple
     functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ((flat, index), (nested, place))]
-    flatten, unflatten = (evaluated(each, encode_text=encode_text, decode_text=decode_text) for each in functions)
+    flatten, unflatten = (compile_lambda(each, encode_text=encode_text, decode_text=decode_text) for each in functions)
     return flatten, unflatten

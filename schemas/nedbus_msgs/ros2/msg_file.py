@@ -12,23 +12,23 @@ from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
 from nedbus_msgs.model.rules import InRange
 
-from .types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
+from .types import ARRAY, NESTED, PACKAGE, FieldDescription, describe_field, type_hash
 
 _FIELD = re.compile(
     r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})\s*"
     r"(?:=\s*(?P<value>[^#]*)|(?:[-+.\d\[\"']|true\b|True\b|false\b|False\b)[^#]*)?(?P<comment>#.*)?"
 )
 """A field, with a default value or not, or a constant."""
-_LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or a form feed, which a comment may have
-_STRINGS: Final = ("string", "wstring")  # of constants
-# Possessive: a comment may have 200,000 spaces or digits.
+_LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or form feed, which may occur in a comment
+_STRINGS: Final = ("string", "wstring")  # types of constants only
+# Possessive quantifiers: a comment may have 200,000 spaces or digits.
 _NUMBER: Final = r"[-+]?(?:\d++\.?\d*+(?:[eE][-+]?\d++)?|inf)"
 _RANGE = re.compile(rf"@range\s++({_NUMBER})?\s*+,\s*+({_NUMBER})?")
 _INVALID = re.compile(rf"@invalid\s++({_NUMBER})")
-_MOST: Final = 1000  # fields of a file, nested ones included; a message has fewer
-_NESTED: Final = 3  # levels of nested messages; PX4 has one
-_LONGEST: Final = 2**18  # characters per file; PX4's longest has 20,000
-_COMMENT: Final = 2000  # characters of a comment that are kept
+_MAX_FIELDS: Final = 1000  # including nested ones; the limit of a message is lower
+_MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
+_MAX_LENGTH: Final = 2**18  # characters per file; PX4's longest has 20,000
+_MAX_COMMENT: Final = 2000  # characters; the rest is cut off
 
 
 class MsgError(ValueError):
@@ -51,18 +51,18 @@ class MsgField(NamedTuple):
 def read_msg(text: str) -> list[MsgField]:
     """Return the fields of a .msg file in order, without constants; raise MsgError if it is malformed.
 
-    Nested messages follow it as in ROS 2 and MCAP, each after a line of = and a line `MSG: package/Name`. Their fields
-    are flattened into the message: `current_lat`, `esc_0_esc_rpm`.
+    Nested messages follow as in ROS 2 and MCAP, each after a line of = and a line `MSG: package/Name`. Their fields are
+    flattened into the message: `current_lat`, `esc_0_esc_rpm`.
     """
-    fields = list(islice(_flatten(_parts(text), "", "", 0), _MOST + 1))
-    if len(fields) > _MOST:
-        raise MsgError(1, 1, f"more than {_MOST} fields, including those of nested messages")
+    fields = list(islice(_flatten(_parts(text), "", "", 0), _MAX_FIELDS + 1))
+    if len(fields) > _MAX_FIELDS:
+        raise MsgError(1, 1, f"more than {_MAX_FIELDS} fields, including those of nested messages")
     return fields
 
 
-@lru_cache(256)  # its codecs are kept with it
+@lru_cache(256)  # a cached definition keeps its codecs
 def define_msg(name: str, text: str) -> Definition[Message]:
-    """Define the message of a .msg file, range-checked by its annotations; raise MsgError if it cannot be carried."""
+    """Define a message from a .msg file, with its `@range` annotations as rules; raise MsgError if it is invalid."""
     fields = read_msg(text)
     try:
         return define(
@@ -78,9 +78,9 @@ def define_msg(name: str, text: str) -> Definition[Message]:
 def hash_of_msg(name: str, text: str) -> str:
     """Return the RIHS01 hash of the px4_msgs type in a .msg file, including nested messages."""
     parts = _parts(text)
-    described = {part: [_describe(line, parts) for line in lines.values()] for part, lines in parts.items()}
+    types = {part: [_describe(line, parts) for line in lines.values()] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
-    return type_hash(*((f"{PACKAGE}/{each or name}", described[each]) for each in ["", *used]))
+    return type_hash(*((f"{PACKAGE}/{each or name}", types[each]) for each in ["", *used]))
 
 
 def bases_of_msg(text: str) -> set[str]:
@@ -104,8 +104,8 @@ _Parts = Mapping[str, Mapping[str, _Line]]
 
 def _parts(text: str) -> _Parts:
     """Return the fields of the message by name under "", and those of nested messages under their names."""
-    if len(text) > _LONGEST:
-        raise MsgError(1, 1, f"{len(text)} characters, more than the limit of {_LONGEST}")
+    if len(text) > _MAX_LENGTH:
+        raise MsgError(1, 1, f"{len(text)} characters, more than the limit of {_MAX_LENGTH}")
     current: dict[str, _Line] = {}
     parts = {"": current}
     for number, line in enumerate(_LINE_END.split(text.removeprefix("\ufeff")), 1):
@@ -117,20 +117,20 @@ def _parts(text: str) -> _Parts:
             if found is None:
                 raise MsgError(number, start + 1, "expected a field, such as 'float32[4] q', or a constant")
             base, bracket, length = found["type"].rpartition("/")[2].partition("[")
-            name, comment = found["name"], (found["comment"] or "").lstrip("# ")[:_COMMENT].strip()
+            name, comment = found["name"], (found["comment"] or "").lstrip("# ")[:_MAX_COMMENT].strip()
             if name in current:
-                raise MsgError(number, start + 1 + found.start("name"), f"a second field {name!r}")
+                raise MsgError(number, start + 1 + found.start("name"), f"duplicate field {name!r}")
             if found["value"] is None:
                 current[name] = _Line(number, start + 1, base, bracket + length, name, comment)
             elif base not in BASES and base not in ALIASES and base not in _STRINGS:
-                raise MsgError(number, start + 1, f"a constant of type {base!r}")
+                raise MsgError(number, start + 1, f"unsupported constant type {base!r}")
     return parts
 
 
 def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[MsgField]:
     for line in parts[message].values():
         count = re.fullmatch(r"\[([1-9]\d{0,2})\]", line.length)
-        if parts.get(line.base) and level < _NESTED and (count or not line.length):
+        if parts.get(line.base) and level < _MAX_NESTING and (count or not line.length):
             for index in range(int(count[1])) if count else [None]:
                 yield from _flatten(
                     parts, line.base, f"{prefix}{line.name}_" + f"{index}_" * (index is not None), level + 1
@@ -139,11 +139,11 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
         yield MsgField(prefix + line.name, _type_of(line), line.comment)
 
 
-def _describe(line: _Line, parts: Mapping[str, object]) -> Described:
+def _describe(line: _Line, parts: Mapping[str, object]) -> FieldDescription:
     if line.base in parts:
         length = int(line.length.strip("[]") or 0)
         return line.name, NESTED + (ARRAY if length else 0), length, f"{PACKAGE}/{line.base}"
-    return described(line.name, _type_of(line))
+    return describe_field(line.name, _type_of(line))
 
 
 def _type_of(line: _Line) -> FieldType:

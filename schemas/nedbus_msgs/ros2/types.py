@@ -1,4 +1,4 @@
-"""ROS 2 types of messages: names, definitions and RIHS01 hashes, computed from layouts."""
+"""ROS 2 types of messages: names, .msg definitions and RIHS01 hashes, computed from layouts."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -11,9 +11,9 @@ from nedbus_msgs.model.definition import MESSAGES, Definition
 from nedbus_msgs.model.px4_types import BASES, FieldType
 
 PACKAGE: Final = "px4_msgs/msg"
-ARRAY: Final = 48  # offset in type_description_interfaces/msg/FieldType, for an array of fixed size
-NESTED: Final = 1  # in the same, for a nested message
-Described = tuple[str, int, int, str]
+ARRAY: Final = 48  # offset of fixed-size arrays in type_description_interfaces/msg/FieldType
+NESTED: Final = 1  # type id of a nested message
+FieldDescription = tuple[str, int, int, str]
 """A field in a type description: name, type id, array length, and name of the nested type."""
 
 _RIHS01: Final = "RIHS01_"
@@ -43,12 +43,12 @@ def ros2_types() -> Mapping[str, Definition[Any]]:
 
 def hash_of(layout: Layout, ros2_type: str) -> str:
     """Return the RIHS01 hash (REP 2016) of a ROS 2 type with the fields of a layout: `RIHS01_` and 64 hex digits."""
-    return type_hash((ros2_type, [described(name, kind) for name, kind in layout.types.items()]))
+    return type_hash((ros2_type, [describe_field(name, kind) for name, kind in layout.types.items()]))
 
 
-def type_hash(*types: tuple[str, Sequence[Described]]) -> str:
+def type_hash(*types: tuple[str, Sequence[FieldDescription]]) -> str:
     """Return the RIHS01 hash of a type, given by name and fields, followed by its nested types sorted by name."""
-    whole, *within = [
+    root, *referenced = [
         {
             "type_name": type_name,
             "fields": [
@@ -61,11 +61,11 @@ def type_hash(*types: tuple[str, Sequence[Described]]) -> str:
         }
         for type_name, fields in types
     ]
-    content = {"type_description": whole, "referenced_type_descriptions": within}
+    content = {"type_description": root, "referenced_type_descriptions": referenced}
     return _RIHS01 + sha256(json.dumps(content).encode()).hexdigest()
 
 
-def described(name: str, kind: FieldType) -> Described:
+def describe_field(name: str, kind: FieldType) -> FieldDescription:
     """Return a field as part of a type description."""
     capacity = kind.length or 0
     return name, BASES[kind.base].ros2 + (ARRAY if capacity else 0), capacity, ""
@@ -78,7 +78,7 @@ def definition_text(definition: Definition[Any], layout: Layout) -> str:
 
 
 def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
-    """Return message and layout for a type hash, with or without `RIHS01_`; None if it is unknown."""
+    """Return the message and layout with a type hash, given with or without `RIHS01_`; None if unknown."""
     return _by_hash().get(text.removeprefix(_RIHS01).lower())
 
 

@@ -103,7 +103,7 @@ class Ros2Bridge:
         bridge from the observer.
         """
         key = transport.node_token(self._domain, self._zid, self._node)
-        with transport.while_open():
+        with transport.translate_zenoh_errors():
             token = self._session.liveliness().declare_token(key)
         try:
             if self._observer is not None:
@@ -150,7 +150,7 @@ class Ros2Bridge:
     def _poll(self) -> None:
         """Report late samples, query the addresses of the bus and the nodes of ROS 2, and apply the decisions."""
         if held_back := self._late_filter.report():
-            _log.warning("%s: ROS 2 would take them for the current estimate", held_back, extra=about("held-back"))
+            _log.warning("%s: ROS 2 would take them for the current estimate", held_back, extra=about("bridge_late"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
             self._held.pop(address, None)
@@ -194,7 +194,7 @@ class Ros2Bridge:
         self._entities += 1
         token, drop = key.token("MP", self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
         encoding = transport.BRIDGED_ENCODING
-        with transport.while_open():
+        with transport.translate_zenoh_errors():
             publisher = self._session.declare_publisher(str(key), encoding=encoding, congestion_control=drop)
             declared = self._session.liveliness().declare_token(token)
         self._publishers[address] = _Ros2Publisher(transport.gid_of_token(token), publisher, declared)
@@ -210,7 +210,7 @@ class Ros2Bridge:
         payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
         publisher.sequence += 1
         attachment = bytes(transport.Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
-        with transport.while_open():
+        with transport.translate_zenoh_errors():
             publisher.publisher.put(payload, attachment=attachment)
 
     def _key(self, address: Address) -> transport.TopicKey:

@@ -39,7 +39,7 @@ def follow(
             if connected != bus.connected:
                 connected = not connected
                 text = "the link to %s is up again" if connected else "the link to %s is lost: still trying"
-                event = "link-back" if connected else "link-broken"
+                event = "link_up" if connected else "link_lost"
                 _log.warning(text, " or ".join(bus.routers), extra=about(event))
             each_second()
         if not seen and not noticed and now > start + TIMINGS.first_sample:

@@ -86,7 +86,7 @@ def run_until_stopped(
         with suppress(queue.Empty):
             changed.get(timeout=_TICK)
     if signals:
-        _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("ending"))
+        _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("shutdown"))
     _await_end(thread, closing, signals)
     failed, interrupted = outcome.result() is False, signals[:1] == [signal.SIGINT]
     if failed or interrupted:
@@ -102,7 +102,7 @@ def _await_end(thread: threading.Thread, closing: threading.Event, signals: list
         reason = f"links not closed within {_CLOSE_TIMEOUT:g} s: messages not yet sent on them are lost"
     else:
         reason = f"still running {_END_TIMEOUT:g} s after the signal: unfinished work is lost"
-    _log.error(reason, extra=about("ending"))
+    _log.error(reason, extra=about("shutdown"))
     sys.stderr.flush()
     os._exit(130 if signals[0] == signal.SIGINT else 1)
 

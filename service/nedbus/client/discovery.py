@@ -22,7 +22,7 @@ from nedbus.client.health import Health
 from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
-from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, while_open
+from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, translate_zenoh_errors
 from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
 
 _log = logging.getLogger(__name__)
@@ -285,7 +285,7 @@ class Rejections:
     def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
         self._prefix = prefix
         self._owner = owner  # keeps the bus open
-        with while_open():
+        with translate_zenoh_errors():
             reports = f"{prefix}{REJECTED}/**"
             subscriber = session.declare_subscriber(reports, zenoh.handlers.RingChannel(_MAX_REPORTS))
         self._handler = subscriber.handler
@@ -293,7 +293,7 @@ class Rejections:
 
     def take(self) -> list[RejectionReport]:
         """Return the reports received since the last call, at most 1000, without waiting."""
-        with while_open():
+        with translate_zenoh_errors():
             samples = list(iter(self._handler.try_recv, None))
         reports: list[RejectionReport] = []
         for sample in samples:

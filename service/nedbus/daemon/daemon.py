@@ -1,4 +1,4 @@
-"""The service: publishes validated messages from sources, answers status queries, reloads and shuts down."""
+"""The service: publishes validated messages of its sources, replies to status queries, reloads and shuts down."""
 
 import logging
 import os
@@ -19,21 +19,21 @@ from nedbus.sources import ReplaySource, Source, parse_source
 from nedbus.transport import Session, Uplinks, dial_endpoint, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
-from .worker import Planned, SourceMeasures, Worker, stop_workers
+from .worker import PlannedSource, SourceMeasures, Worker, stop_workers
 from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s for sources to stop at shutdown
 _RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
-_POLL: Final = 1.0  # s between two polls of silent streams and of the link
-_RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
+_POLL: Final = 1.0  # s between polls for silent streams and for the link
+_RELOADABLE: Final = frozenset({"source", "vehicle"})  # settings that a reload can change
 _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 
-def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:
-    """Open the sources for a service with these endpoints; also return the mistakes, at most one per source."""
-    plan: list[Planned] = []
+def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[PlannedSource], list[ConfigError]]:
+    """Return the sources of a service with these endpoints, and the configuration errors, at most one per source."""
+    plan: list[PlannedSource] = []
     mistakes: list[ConfigError] = []
     if not settings.source and "source" not in settings.left_out:
         reason = "no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"
@@ -54,22 +54,22 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
         except ConfigError as exc:
             mistakes.append(locate_source(settings, index, exc))
         else:
-            plan.append(Planned(index, spec.text, settings.vehicle, source))
+            plan.append(PlannedSource(index, spec.text, settings.vehicle, source))
     if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
-        reason = "no source ever ends: give sim: a duration, or remove loop=1 from ulog:"
+        reason = "no source ever ends: set duration= for sim:, or remove loop=1 from ulog:"
         mistakes.append(ConfigError("until_done", reason))
     return plan, mistakes
 
 
 def is_finite(source: Source) -> bool:
-    """Return True if a source ends by itself."""
+    """Return True if a source ends without being stopped."""
     return isinstance(source, ReplaySource) and source.finite
 
 
 class Daemon:
     """Publish the configured sources until they have ended or `stop` is called.
 
-    `run` blocks; call it in a separate thread, to keep the main thread free for signals.
+    `run` blocks; call it in a separate thread to keep the main thread free for signals.
 
     The constructor raises ConfigError for an invalid source.
     """
@@ -86,10 +86,10 @@ class Daemon:
         self._session: Session | None = None
         self._permission: WritePermission | None = None
         self.account = Account()
-        # Random, because services in containers may all be PID 1 on hosts of the same name.
+        # Random, as services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.max_sessions: int | None = None  # of the embedded router, once it is open
-        self.ready, self.closing = threading.Event(), threading.Event()  # closing: only the session is left
+        self.ready, self.closing = threading.Event(), threading.Event()  # closing: only the session is still open
         self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
         self._plan = self._make_plan(settings)
@@ -121,7 +121,7 @@ class Daemon:
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """Known verdicts of the router by published vehicle: True if access rules refuse it."""
+        """Known write permission at the router by published vehicle: True if access rules deny it."""
         return {} if self._permission is None else self._permission.refused
 
     @property
@@ -131,16 +131,16 @@ class Daemon:
 
     @property
     def busy(self) -> float:
-        """Longest time that a source has spent on its current turn [s], for watchdogs."""
+        """Longest time that a source has spent on its current message [s], for watchdogs."""
         return max((worker.busy for worker in self._workers), default=0.0)
 
     @property
     def sessions(self) -> int:
-        """Number of sessions connected to the embedded router, or of links of this client to its router."""
+        """Number of sessions connected to the embedded router, or of links of a client to its router."""
         return 0 if self._session is None else len(self._session.info.transports())
 
-    def look(self, measures: Sequence[SourceMeasures] | None = None) -> Account:
-        """Update and return the account of events; `measures`: current measurements, if the caller has them."""
+    def update_events(self, measures: Sequence[SourceMeasures] | None = None) -> Account:
+        """Update and return the event log; `measures`: current measurements, if already available."""
         measured: dict[str, str] = {}
         for source in self.measures if measures is None else measures:
             measured |= source.states
@@ -149,15 +149,15 @@ class Daemon:
         present = set() if self._registry is None else {each.vehicle for each in tuple(self._registry.publishers)}
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         states |= {main: "duplicate" for main in states if main.vehicle in shared}
-        is_cut = self.role == "client" and self._session is not None and not self.sessions
-        link = f"no link to {' or '.join(self.endpoints)}" if is_cut else ""
+        is_link_lost = self.role == "client" and self._session is not None and not self.sessions
+        link = f"no link to {' or '.join(self.endpoints)}" if is_link_lost else ""
         self.account.update(clock.steady(), states, link=link, present=present)
         return self.account
 
     def report(self, *, within: float = 0.0) -> AccountReport:
         """Return the events of the last `within` seconds and the current state of each vehicle."""
         return report_of(
-            self.look(), self.id, socket.gethostname(), clock.steady(), within=within, to_utc=clock.to_utc()
+            self.update_events(), self.id, socket.gethostname(), clock.steady(), within=within, to_utc=clock.to_utc()
         )
 
     def _answer(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
@@ -167,18 +167,18 @@ class Daemon:
         return reply_parts(self.status if within is None else self.report(within=seconds))
 
     def stop(self) -> None:
-        """Stop `run`; safe in any thread and in signal handlers."""
+        """Stop `run`; safe to call from any thread and from signal handlers."""
         self._stop.set()
         self._changed.set()
 
     def reload(self, settings: Settings) -> str:
         """Start new sources, stop removed ones and leave all others running; return a summary for the log.
 
-        Raises ConfigError without any change if a source is invalid, or if settings other than source and vehicle
-        differ.
+        Raises ConfigError, and changes nothing, if a source is invalid or any setting other than source and vehicle
+        differs.
         """
         for name in type(settings).model_fields:
-            if name not in _RELOADED and getattr(settings, name) != getattr(self._settings, name):
+            if name not in _RELOADABLE and getattr(settings, name) != getattr(self._settings, name):
                 raise locate_setting(settings, name, f"{name} cannot be changed by a reload: restart the service")
         plan = self._make_plan(settings)
         with self._planning:
@@ -190,7 +190,7 @@ class Daemon:
         return f"{len(plan) - kept} started, {before - kept} stopped, {kept} unchanged"
 
     def run(self) -> bool:
-        """Publish until done or stopped; return False if a source has failed; raise ListenError or ConfigError."""
+        """Publish until done or stopped; return False if a source failed; raise ListenError or ConfigError."""
         session = self._session = self._open()
         if session is None:
             return True
@@ -216,37 +216,36 @@ class Daemon:
         return not any(source.state == "failed" for source in self.sources)
 
     def _apply_plan(self, registry: PublisherRegistry) -> int:
-        """Start new sources and stop removed ones, in the order of the plan; return the number of unchanged ones."""
-        left, ordered, new = list(self._workers), list[Worker](), list[Worker]()
+        """Stop removed sources and start new ones, in the order of the plan; return the number of unchanged sources."""
+        removed, ordered, new = list(self._workers), list[Worker](), list[Worker]()
         router = self._session if self.role == "router" else None
         for planned in self._plan:
-            worker = next((each for each in left if each.planned == planned), None)
+            worker = next((each for each in removed if each.planned == planned), None)
             if worker is not None:
-                left.remove(worker)
+                removed.remove(worker)
             else:
                 retry, on_end = not self.until_done, self._changed.set
                 worker = Worker(planned, registry, router=router, account=self.account, retry=retry, on_end=on_end)
                 new.append(worker)
             ordered.append(worker)
-        stop_workers(left, _RETIRE_TIMEOUT, release=True)
-        for worker in left:
+        stop_workers(removed, _RETIRE_TIMEOUT, release=True)
+        for worker in removed:
             if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
-                text = "%s: still stopping after %.0f s, maybe because of a slow reader"
+                text = "%s: still stopping after %.0f s, possibly because of a slow reader"
                 _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
-        for worker in new:  # after the others have stopped: they may use the same addresses
+        for worker in new:  # after the removed ones have stopped, as they may use the same addresses
             worker.thread.start()
         self._workers = ordered
         return len(ordered) - len(new)
 
-    def _make_plan(self, settings: Settings) -> list[Planned]:
-        """Open the sources of these settings; raise ConfigError for the first mistake, with its location."""
+    def _make_plan(self, settings: Settings) -> list[PlannedSource]:
         plan, mistakes = plan_sources(settings, self.endpoints)
         if mistakes:
             raise mistakes[0]
         return plan
 
     def _open(self) -> Session | None:
-        """Open the session; a client waits for its router. Return None if stopped before it answers."""
+        """Open the session; a client waits for its router. Return None if stopped during the wait."""
         settings, endpoints = self._settings, ", ".join(self.endpoints)
         if self.role == "router":
             session = open_router(
@@ -259,7 +258,7 @@ class Daemon:
             joining = f", joining {', '.join(settings.connect)}" if settings.connect else ""
             _log.info("router on %s%s", endpoints, joining, extra=about("router"))
             return session
-        setter = settings.set_by("connect")  # NEDBUS_CONNECT may be set for scripts
+        setter = settings.set_by("connect")  # NEDBUS_CONNECT may have been set for scripts
         hint = "" if setter == "connect" else f", set by {setter}; use --listen to run a router instead"
         _log.info("client of %s%s", endpoints, hint, extra=about("client"))
         logged = False
@@ -268,7 +267,7 @@ class Daemon:
                 return open_client(self.endpoints, timeout=1.0, tls=settings.tls, stop=self._stop)
             except ConnectError as exc:
                 if not logged:
-                    _log.warning("%s; still trying", exc, extra=about("link-broken"))
+                    _log.warning("%s; still trying", exc, extra=about("link_lost"))
                 logged = True
         return None
 
@@ -278,12 +277,12 @@ class Daemon:
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status().ended for worker in finite):
-                    # Heartbeats tell readers of the last message, in case they missed it.
+                    # Heartbeats let readers detect the loss of the last message.
                     speeds = [each.source.options.speed for each in finite if isinstance(each.source, ReplaySource)]
                     self._stop.wait(2 * HEARTBEAT if any(speeds) else 0.0)
                     registry.flush(tuple(registry.publishers.values()), stop=self._stop)
                     return
             self._changed.wait(_POLL)
             self._changed.clear()
-            self.look()
+            self.update_events()
             uplinks.check()

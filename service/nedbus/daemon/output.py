@@ -1,4 +1,4 @@
-"""Output of a source: validates, publishes or rejects its messages, and tracks the health of each stream."""
+"""Output of a source: validate, publish or reject its messages, and track the health of each stream."""
 
 import logging
 import time
@@ -20,37 +20,37 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 _log = logging.getLogger(__name__)
 
 _MAX_ADDRESSES: Final = 1000  # of one live source
-_MAX_WARNINGS: Final = 50  # rejections kept and logged, one for each `where`
-_MAX_TEXT: Final = 300  # logged characters of a rejection, which any peer may have sent
+_MAX_WARNINGS: Final = 50  # rejections kept and logged, one per `where`
+_MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # logged invalid messages of a source
-_MAX_RULES: Final = 50  # with a counter of their own
+_MAX_RULES: Final = 50  # rules with a separate counter
 _NO_MESSAGE: Final = "input that is no message"
 TOO_MANY: Final = "too many addresses"
-"""Rule of messages that are rejected as their source has too many addresses."""
+"""Rule of messages rejected because their source has too many addresses."""
 
 _DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 1e-1, 1.0)  # s
 
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """State of one address: health, publisher while published, and last message of a live source."""
+    """State of one address: health, publisher while published, and the last message of a live source."""
 
     health: StreamHealth
     publisher: Publisher | None = None
-    heard: float | None = None
+    last_received: float | None = None
     last: SourceMessage | None = None
 
 
 class SourceOutput:
-    """Publish the messages of a source with this name in the log and configured text; `now`: monotonic clock [s]."""
+    """Publish the messages of a source, called `name` in the log and configured as `text`; `now`: monotonic [s]."""
 
     def __init__(
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
-        self.absence = Absence()  # topics that vehicles publish and a live source does not deliver now
-        self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
+        self.absence = Absence()  # topics that vehicles advertise but a live source does not deliver
+        self.log_streams: dict[str, LogStreamStatus] = {}  # of a live source, by vehicle
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
         self._text = text
@@ -62,7 +62,7 @@ class SourceOutput:
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # addresses logged as silent
         self._invalid = 0
-        self._is_full = False  # of addresses that are published
+        self._is_full = False  # all addresses are published, none is stale
 
     @property
     def addresses(self) -> list[Address]:
@@ -71,22 +71,22 @@ class SourceOutput:
 
     @property
     def stale(self) -> list[Address]:
-        """Addresses of a live source that fell silent."""
+        """Addresses of a live source that are no longer published."""
         streams = list(self._streams.items())
-        return [address for address, stream in streams if stream.publisher is None and stream.heard is not None]
+        return [address for address, stream in streams if stream.publisher is None and stream.last_received is not None]
 
     def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
-        """Return the health of all streams, or of `limit` of them."""
+        """Return the health of all streams, or of the first `limit`."""
         streams, now = list(self._streams.items())[:limit], self._now_ns()
         return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The first rejection of each origin."""
+        """First rejection of each origin."""
         return tuple(self._warnings.values())
 
     def claim_all(self, run: ReplayRun, *, lossless: bool) -> None:
-        """Claim all addresses known at the start of a run or none: otherwise two sources could block each other.
+        """Claim all addresses known at the start of a run, or none, so two sources cannot block each other.
 
         Raises AddressInUseError if another source of this service publishes one of them.
         """
@@ -97,14 +97,14 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher for an address without one of this definition; raise AddressInUseError if another has it."""
+        """Open a publisher with this definition, unless open; raise AddressInUseError if another source has it."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
             if not _differs(definition, stream.publisher.definition):
                 return
-            stream.publisher.close()  # another firmware, after a reboot
+            stream.publisher.close()  # different firmware after a reboot
             stream.publisher = None
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
@@ -127,7 +127,7 @@ class SourceOutput:
         start = time.perf_counter()
         try:
             fields = upgrade_fields(stream.publisher.definition, message.fields)
-            fields.setdefault("timestamp", None)  # else invalid: it is never this host's
+            fields.setdefault("timestamp", None)  # invalid if missing: the time of this host is never used
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
             field, violation = exc.violations[0]
@@ -157,8 +157,8 @@ class SourceOutput:
         stream = self._streams.get(address)
         publisher = stream.publisher if stream is not None else None
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
-            back = stream is not None and stream.heard is not None
-            if not back and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
+            resumed = stream is not None and stream.last_received is not None
+            if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
                 reason = f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"
                 self.reject(Rejection("vehicles", reason), rule=TOO_MANY)
                 return
@@ -167,17 +167,18 @@ class SourceOutput:
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
-            event = "back" if back else "published"
-            _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
-            self._bring_back(message)
+            text = f"{address} is published{' again' if resumed else ''}"
+            event = "stream_resumed" if resumed else "published"
+            _log.info("%s: %s", self._name, text, extra=about(event, address, source=self._name))
+            self._republish_retained(message)
             stream = self._streams[address]
-        stream.heard, stream.last = self._now(), message
+        stream.last_received, stream.last = self._now(), message
         if stream.publisher is not None:
             stream.publisher.relabel(message.source or self._kind)
         self.publish(message)
 
     def expire_stale(self) -> bool:
-        """Stop publishing live addresses that have been silent for 3 s; return True if any is left.
+        """Stop publishing live addresses without a message for 3 s; return True if any address is still published.
 
         Topics without a rate stay published while other messages of their vehicle arrive.
         """
@@ -185,32 +186,32 @@ class SourceOutput:
         fresh = {
             address
             for address, stream in self._streams.items()
-            if stream.heard is not None and now - stream.heard < TIMINGS.stale
+            if stream.last_received is not None and now - stream.last_received < TIMINGS.stale
         }
-        heard = {address.vehicle for address in fresh}
-        fresh |= {each for each in self._streams if each.vehicle in heard and not get_topic(each.topic).rate}
+        vehicles = {address.vehicle for address in fresh}
+        fresh |= {each for each in self._streams if each.vehicle in vehicles and not get_topic(each.topic).rate}
         for address in self.addresses:
             if address not in fresh:
                 text = f"{address} is stale: no message for {TIMINGS.stale:.0f} s"
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
-            is_known = address.vehicle in self._account.vehicles and stream.heard is not None
-            if stream.publisher is None and not (is_known and now - (stream.heard or 0.0) < TIMINGS.forgotten):
+            is_known = address.vehicle in self._account.vehicles and stream.last_received is not None
+            if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]
         self._is_full = False
         return bool(fresh)
 
     def _make_room(self) -> bool:
-        """Forget the address that has been stale longest; return False if all are published."""
+        """Delete the address that has been stale longest; return False if all are published."""
         stale = () if self._is_full else {*self._streams}.difference(self.addresses)
         if stale:
-            del self._streams[min(stale, key=lambda each: self._streams[each].heard or 0.0)]
+            del self._streams[min(stale, key=lambda each: self._streams[each].last_received or 0.0)]
         self._is_full = not stale
         return not self._is_full
 
     def reject(self, rejection: Rejection, rule: str = _NO_MESSAGE) -> None:
-        """Count invalid input, log it once per origin, and publish a report if it has an address."""
+        """Count invalid input, log it once per origin, and publish a rejection report if it has an address."""
         self._count_rejected(rule, rejection.count)
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
@@ -223,15 +224,15 @@ class SourceOutput:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, absence: Absence) -> None:
-        """Store the absent topics of a live source; log each silent address once."""
+        """Store the absent topics of a live source, and log each silent address once."""
         self.absence = absence
         if new := [address for address in absence.silent if address not in self._silent]:
             self._silent.update(new)
-            text = f"announced, but no message arrives: {', '.join(new)}; see 'nedbus doctor'"
-            _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
+            text = f"advertised, but no message arrives: {', '.join(new)}; run 'nedbus doctor'"
+            _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
 
-    def _bring_back(self, message: SourceMessage) -> None:
-        """Republish the topics without a rate of a vehicle that is back, as it will not, unless it rebooted since."""
+    def _republish_retained(self, message: SourceMessage) -> None:
+        """After an outage, republish the last messages of topics without a rate, unless the vehicle has rebooted."""
         vehicle = message.address.vehicle
         known = [
             (address, stream, stream.last)
@@ -247,7 +248,8 @@ class SourceOutput:
                 continue
             with suppress(AddressInUseError):
                 self.claim(address, last.definition)
-                _log.info("%s: %s is back", self._name, address, extra=about("back", address, source=self._name))
+                extra = about("stream_resumed", address, source=self._name)
+                _log.info("%s: %s is published again", self._name, address, extra=extra)
                 self.publish(replace(last, lost=0))
 
     def _now_ns(self) -> int:
@@ -261,7 +263,7 @@ class SourceOutput:
         self._count_rejected(rule)
         self._invalid += 1
         if self._invalid <= _MAX_LOGGED:
-            last = "; further ones are counted, not logged" if self._invalid == _MAX_LOGGED else ""
+            last = "; further rejections are counted but not logged" if self._invalid == _MAX_LOGGED else ""
             text = f"{message.address} rejected: {reason}{last}"
             extra = about("rejected", message.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
@@ -271,7 +273,7 @@ class SourceOutput:
 
 
 def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
-    """Return True if a definition has other fields, or the same in another order."""
+    """Return True if a definition has different fields, or the same fields in another order."""
     return new is not None and new is not known and [*new.types.items()] != [*known.types.items()]
 
 

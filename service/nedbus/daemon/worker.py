@@ -1,4 +1,4 @@
-"""Worker threads of a service: each runs one source, a replay or a live source."""
+"""Worker threads of a service; each runs one source, a replay or a live source."""
 
 import logging
 import threading
@@ -20,11 +20,11 @@ from .output import SourceOutput
 
 _log = logging.getLogger(__name__)
 
-_MIN_RUN: Final = 0.1  # s, minimum of a looped run: a log of one message must not be read thousands of times a second
-_MAX_DELAY: Final = 1.0  # s: a replay that is later than this shifts its schedule instead of catching up
-_STALE_POLL: Final = 0.5  # s between two checks for stale streams
-_READER_POLL: Final = 0.05  # s between two checks for a reader
-_MAX_STREAMS: Final = 100  # in a status, which must fit into one message
+_MIN_RUN: Final = 0.1  # s per run of a loop: a log of one message must not be read thousands of times a second
+_MAX_DELAY: Final = 1.0  # s; a replay that is later shifts its schedule instead of catching up
+_STALE_POLL: Final = 0.5  # s between checks for stale streams
+_READER_POLL: Final = 0.05  # s between checks for a subscriber
+_MAX_STREAMS: Final = 100  # in a status, which must fit into one reply
 
 _Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
@@ -32,8 +32,8 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
-    """A configured source, number `index` in the settings; a reload leaves it running if text and vehicle are equal."""
+class PlannedSource:
+    """A configured source, number `index` in the settings; a reload keeps it running if text and vehicle are equal."""
 
     index: int = field(compare=False)
     text: str
@@ -43,14 +43,14 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class SourceMeasures:
-    """Measurements of one source for metrics: status, with all streams, and times to publish a message [s]."""
+    """Measurements of one source for metrics: status with all streams, and publish durations [s]."""
 
     status: SourceStatus
     durations: Histogram
 
     @property
     def states(self) -> dict[str, str]:
-        """State of each stream by address; silence after the end of the source is ok."""
+        """State of each stream by address; all are ok after the end of the source."""
         if self.status.ended:
             return {stream.address: "ok" for stream in self.status.streams}
         alive, streams = frozenset(self.status.addresses), self.status.streams
@@ -58,21 +58,21 @@ class SourceMeasures:
 
 
 class Clock(threading.Event):
-    """Monotonic time, and waits that end early when the worker is stopped, as this is set; replaced in tests."""
+    """Monotonic clock and stop flag: `wait` returns early once `set` is called; replaced by a fake clock in tests."""
 
     now = staticmethod(time.monotonic)
 
 
 class Worker:
-    """Run one source in its own thread until the worker is stopped; publishers stay open after the source has ended.
+    """Run one source in a thread until the worker is stopped; publishers stay open after the source has ended.
 
-    With `retry`, a failed replay is restarted with exponential backoff; a live source always is.
+    `retry`: restart a failed replay with exponential backoff, as is always done with a live source.
     `router`: the embedded router, for live sources; `on_end`: called when the source has ended.
     """
 
     def __init__(
         self,
-        planned: Planned,
+        planned: PlannedSource,
         registry: PublisherRegistry,
         *,
         router: Session | None = None,
@@ -82,7 +82,7 @@ class Worker:
         on_end: Callable[[], object],
     ) -> None:
         self.planned, self.source = planned, planned.source
-        self.text = planned.text.encode(errors="backslashreplace").decode()  # a file name may not be valid UTF-8
+        self.text = planned.text.encode(errors="backslashreplace").decode()  # file names may be invalid UTF-8
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
         self._name = self.text.rstrip(":")  # in the log
         self._registry = registry
@@ -95,14 +95,14 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._turn: float | None = None  # start of the current turn; None while it may take any time
+        self._message_start: float | None = None  # of publishing the current one; None while waiting
         self._release = False
         self._warned: set[str] = set()
 
     @property
     def busy(self) -> float:
-        """Age of the current turn of its loop [s]; 0 while it opens a source or waits for the next message."""
-        since = self._turn
+        """Time spent on the current message [s]; 0 while opening a source or waiting for the next message."""
+        since = self._message_start
         return 0.0 if since is None else self._clock.now() - since
 
     @property
@@ -111,7 +111,7 @@ class Worker:
         return SourceMeasures(self.status(None), self._output.durations)
 
     def status(self, max_streams: int | None = _MAX_STREAMS) -> SourceStatus:
-        """Return the status of the source; `max_streams`: limit of its streams, None for all."""
+        """Return the status of the source with at most `max_streams` streams, None for all."""
         run, output = self._run, self._output
         return SourceStatus(
             source=self.text,
@@ -136,7 +136,7 @@ class Worker:
         )
 
     def run(self) -> None:
-        """Run the source until it is done or stopped; repeat it if it loops, restart it if it fails; never raise."""
+        """Run the source until done or stopped, repeat it if it loops, restart it after failures; never raise."""
         try:
             self._run_until_done()
         except BaseException as exc:  # noqa: BLE001 - the state must not stay "running" when the thread ends
@@ -155,7 +155,7 @@ class Worker:
         self._clock.wait(None)
         if self._release:
             self._output.release()
-            _log.info("%s: stopped, no longer configured", self.text, extra=about("reload"))
+            _log.info("%s: stopped, as it is no longer configured", self.text, extra=about("reload"))
 
     def _run_until_done(self) -> None:
         failures = 0
@@ -171,7 +171,7 @@ class Worker:
                 return
             except NedbusError as exc:
                 self._fail(str(exc))
-            except BaseException as exc:  # noqa: BLE001 - only this source fails, not the service; a panic in Rust is not an Exception
+            except BaseException as exc:  # noqa: BLE001 - fails only this source; a Rust panic is not an Exception
                 _log.exception("%s: unexpected error", self._name, extra=about("retrying", source=self._name))
                 self._fail(_describe(exc))
             else:
@@ -182,27 +182,27 @@ class Worker:
                 self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
                 continue
             finally:
-                self._turn = None
+                self._message_start = None
             if not self._retry:
                 self._end("failed", self._error)
                 return
             if self._clock.now() - start > TIMINGS.backoff[-1]:
-                failures = 0  # it ran well before this failure
+                failures = 0  # it ran without errors before this failure
             self._clock.wait(TIMINGS.backoff[min(failures, len(TIMINGS.backoff) - 1)])
             failures += 1
 
     def _run_replay(self, source: ReplaySource) -> None:
         run, last, speed = source.open(), self._run, source.options.speed
         if last is None or last.summary != run.summary:
-            _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
+            _log.info("%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name))
             self._warned.clear()
         else:
-            run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that come later
+            run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that start later
         self._warn(run)
         self._run, self._done = run, 0
         if source.options.wait and last is None:
             self._state = "waiting"
-            _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
+            _log.info("%s: waiting for a subscriber", self._name, extra=about("replay_waiting", source=self._name))
             while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
                 pass
         self._output.release(keep=run.addresses)
@@ -213,7 +213,7 @@ class Worker:
             if speed is not None:
                 early = start + message.due / speed - self._clock.now()
                 if early < -_MAX_DELAY:
-                    extra = about("late", source=self._name)
+                    extra = about("replay_late", source=self._name)
                     _log.warning("%s: %.1f s late, shifting the schedule", self._name, -early, extra=extra)
                     start -= early
                 elif early > 0:
@@ -221,9 +221,9 @@ class Worker:
             if self._clock.is_set():
                 return
             # A lossless publisher may wait for its readers.
-            self._turn = None if speed is None else self._clock.now()
+            self._message_start = None if speed is None else self._clock.now()
             self._output.publish_replay(message, lossless=speed is None)
-            self._turn = None
+            self._message_start = None
             self._done += 1
         self._warn(run)
         self._error = run.damage
@@ -235,11 +235,11 @@ class Worker:
                 _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
 
     def _listen(self, source: LiveSource) -> None:
-        """Publish the messages of a live source; it yields None several times a second while no message arrives."""
+        """Publish the messages of a live source, which yields None several times a second while no message arrives."""
         with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # live sources are generators
             next_poll = 0.0
             for item in items:
-                now = self._turn = self._clock.now()
+                now = self._message_start = self._clock.now()
                 if self._clock.is_set():
                     return
                 if isinstance(item, Rejection):
@@ -269,7 +269,7 @@ class Worker:
             _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
     def _fail(self, reason: str) -> None:
-        """Store the reason and release all addresses: another source may need them meanwhile."""
+        """Store the reason and release all addresses, as another source may use them during the backoff."""
         self._state, self._error = "retrying", reason
         self._retries += 1
         event = "retrying" if self._retry else "failed"
@@ -282,7 +282,7 @@ def _describe(error: BaseException) -> str:
 
 
 def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:
-    """Stop these workers and wait up to `grace` seconds; `release` as in `Worker.stop`."""
+    """Stop workers and wait up to `grace` seconds; `release` as in `Worker.stop`."""
     for worker in workers:
         worker.stop(release=release)
     deadline = time.monotonic() + grace

@@ -1,7 +1,7 @@
 """Write permission at the router, whose access rules drop messages without an error at the sender.
 
-Only services with a certificate are checked, because access rules refer to it. A check opens a second session for a
-moment: soon after a link is up or a new vehicle appears, then rarely. Rules change only when a router restarts.
+Only services with a certificate are checked, because access rules refer to certificates. Each check briefly opens a
+second session: soon after the link is up or a vehicle appears, then rarely, as rules change only at a router restart.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from nedbus.errors import ConnectError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, while_open
+from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-_BELIEVED: Final = 3  # consecutive denials that count as a refusal: a slow or restarting router causes fewer
-_GRACE: Final = 5.0  # s to end
+_CONFIRMED: Final = 3  # consecutive denials that count as a refusal; a slow or restarting router causes fewer
+_GRACE: Final = 5.0  # s for the thread to end
 _MAX_NAMED: Final = 20  # vehicles named in a log line
 
 
 def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
-    """Start the checks if the service has a certificate; else return None."""
+    """Start the checks if the service uses a client certificate, else return None."""
     endpoints = [endpoint for endpoint in settings.connect if endpoint.startswith(("tls/", "quic/"))]
     if settings.tls is None or settings.tls.certificate is None or not endpoints:
         return None
@@ -42,9 +42,9 @@ def watch_permission(session: Session, settings: Settings, registry: PublisherRe
 
 
 class WritePermission:
-    """Check repeatedly, in a separate thread, that the router accepts all vehicles returned by `vehicles`.
+    """Check repeatedly, in a separate thread, whether the router accepts all vehicles returned by `vehicles`.
 
-    `session` publishes them, as a client of one of the endpoints or as a router that joins them.
+    `session`: publishes the vehicles, as a client of one of the endpoints or as a router connected to them.
     """
 
     def __init__(
@@ -56,15 +56,15 @@ class WritePermission:
         self._prefix = prefix
         self._vehicles = vehicles
         self._stop = threading.Event()
-        self._denials: dict[str, int] = {}  # consecutive ones by vehicle; 0 if allowed, no entry if unknown
+        self._denials: dict[str, int] = {}  # consecutive denials by vehicle; 0 if allowed, no entry if unknown
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
-        self.start = self._thread.start  # checks after changes of the link, for new vehicles, and rarely in between
+        self.start = self._thread.start
 
     @property
     def refused(self) -> dict[str, bool]:
-        """Known verdicts of the router by vehicle: True if access rules refuse it."""
+        """Known write permission at the router by vehicle: True if access rules deny it."""
         known = self._denials.copy().items()
-        return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _BELIEVED}
+        return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _CONFIRMED}
 
     def close(self) -> None:
         """Stop the thread; close the session first to abort a running check."""
@@ -77,8 +77,8 @@ class WritePermission:
             now = time.monotonic()
             routers, vehicles = _routers_of(self._session), self._vehicles()
             if routers != known[0]:
-                self._denials = {vehicle: _BELIEVED * refused for vehicle, refused in self.refused.items()}
-                due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads load, no secret
+                self._denials = {vehicle: _CONFIRMED * refused for vehicle, refused in self.refused.items()}
+                due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
             elif vehicles - known[1]:
                 due = min(due, now + TIMINGS.probe_first[0])
             known = routers, vehicles
@@ -86,11 +86,11 @@ class WritePermission:
                 due = now + self.check()
 
     def check(self) -> float:
-        """Check once; return the time until the next check [s]."""
+        """Check once, and return the time until the next check [s]."""
         vehicles = self._vehicles()
         try:
             verdicts = self._probe(vehicles)
-        except NedbusError as exc:  # link or session closed, or a file being replaced
+        except NedbusError as exc:  # link or session closed, or a TLS file being replaced
             _log.debug("write permission unknown: %s", exc)
             verdicts = {}
         before = self.refused
@@ -101,26 +101,26 @@ class WritePermission:
                 self._denials[vehicle] = 0
             elif verdict == "denied":
                 self._denials[vehicle] = number + 1
-            elif not number:  # else the router was slow: rules do not change while a link is up
+            elif not number:  # else the router was slow, as rules do not change while a link is up
                 self._denials.pop(vehicle, None)
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
-                "the router refuses %s: its messages reach no reader; check that its access rules name it, and that"
-                " %s is its certificate ('nedbus pki rules', docs/security.md); checking again",
+                "the router refuses %s: its messages reach no reader; check that the access rules name it, and that"
+                " %s is its certificate ('nedbus pki rules', docs/security.md); still checking",
                 _name(new),
                 self._tls.certificate,
-                extra=about("refused"),
+                extra=about("access_denied"),
             )
-        if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router accepts %s now", _name(mended), extra=about("accepted"))
-        if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
+        if accepted := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
+            _log.info("the router accepts %s now", _name(accepted), extra=about("access_granted"))
+        if any(verdict == "denied" and self._denials[vehicle] < _CONFIRMED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
         return TIMINGS.probe_pause if is_well else TIMINGS.probe_unsure
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
-        """Return the verdict on each vehicle; empty if the two sessions share no router."""
+        """Return the verdict for each vehicle; empty if the two sessions share no router."""
         routers = _routers_of(self._session)
         for endpoint in self._endpoints if vehicles else ():
             try:
@@ -131,14 +131,14 @@ class WritePermission:
                 if not (there := _routers_of(reader)) or not there <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
-                # A missing probe counts only if no link was lost meanwhile.
+                # A missing probe only counts if no link was lost during the check.
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}
 
 
 def _routers_of(session: Session) -> set[str]:
     try:
-        with while_open():
+        with translate_zenoh_errors():
             return {str(zid) for zid in session.info.routers_zid()}
     except NedbusError:
         return set()

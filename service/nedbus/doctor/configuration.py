@@ -6,10 +6,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 
-from nedbus.daemon import Planned, plan_sources
+from nedbus.daemon import PlannedSource, plan_sources
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, place_at
+from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, position_at
 from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
 from nedbus.transport import check_endpoints, read_router_config, router_endpoints, split_endpoint
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -74,7 +74,7 @@ def check_router_file(
         reason = _reason(check_pem_file(name, file, "it is"))
         found.append((str(file), reason and f"{name}: {reason}"))
     text = path.read_text(errors="replace")
-    located = ((reason, place_at(text, text.find(value))) for value, reason in found if reason)
+    located = ((reason, position_at(text, text.find(value))) for value, reason in found if reason)
     return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
 
 
@@ -82,7 +82,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
     """Yield a mistake for each source that cannot be opened, or publishes an address of another source."""
     plan, mistakes = plan_sources(settings, tuple(endpoints))
     yield from mistakes
-    publishers: dict[Address, Planned] = {}
+    publishers: dict[Address, PlannedSource] = {}
     for planned in plan:
         try:
             addresses, reason = _addresses(planned, offline=offline), ""
@@ -98,7 +98,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
             publishers.setdefault(address, planned)
 
 
-def _addresses(planned: Planned, *, offline: bool) -> Collection[Address]:
+def _addresses(planned: PlannedSource, *, offline: bool) -> Collection[Address]:
     """Return the addresses of a replay, or the positions of vehicles named by a live source."""
     spec = parse_source(planned.text)
     if isinstance(planned.source, LiveSource):

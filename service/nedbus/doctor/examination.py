@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final
 
 from nedbus.errors import NedbusError
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 from nedbus.log_event import about
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
@@ -45,7 +45,7 @@ def examine(
     checks: dict[tuple[str, str], Check] = {("settings", ""): partial(_check_sources, settings)}
     if mavlink is not None:
         parse_link(mavlink)
-        checks["mavlink", mavlink] = lambda: needs("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink)
+        checks["mavlink", mavlink] = lambda: import_optional("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink)
     for endpoint in settings.routers[:_MAX_ROUTERS]:
         checks["endpoint", endpoint] = partial(check_endpoint, endpoint, tls)
     findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
@@ -102,7 +102,7 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         except (NedbusError, OSError) as exc:
             found[name] = [Finding(*name, "wrong", f"check failed: {exc}")]
         except BaseException as exc:  # noqa: BLE001 - includes Zenoh's panics
-            _log.exception("unexpected error in a check", extra=about("bug"))
+            _log.exception("unexpected error in a check", extra=about("internal_error"))
             seen = f"check failed: unexpected {type(exc).__name__}: {exc}"
             found[name] = [Finding(*name, "unknown", seen, "a bug in nedbus: report it with the traceback above")]
 

@@ -22,10 +22,10 @@ from nedbus.transport import (
     Session,
     Verdict,
     alive_keys,
-    ask_routers,
     px4_publishers_key_expr,
     query,
-    while_open,
+    query_routers,
+    translate_zenoh_errors,
 )
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
 
@@ -80,7 +80,7 @@ class Observation:
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-        self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
+        self.routers = query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
         self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
@@ -130,7 +130,7 @@ class Observation:
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
     """Return a function that drains received samples, at most one full ring; deleting it ends the subscription."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
-    with while_open():
+    with translate_zenoh_errors():
         subscriber = session.declare_subscriber(key_expr, channel)
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 

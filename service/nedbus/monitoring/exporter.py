@@ -19,7 +19,7 @@ from nedbus.client import Bus, LogStreamStatus, Sample, find_services
 from nedbus.errors import NedbusError
 from nedbus.events import report_of
 from nedbus.timings import TIMINGS
-from nedbus.transport import RouterState, Session, ask_routers
+from nedbus.transport import RouterState, Session, query_routers
 from nedbus_msgs import Address, Selection
 
 from .http_server import Page
@@ -124,7 +124,7 @@ class Exporter(Observer):
                 with suppress(NedbusError):  # the router is full or the link is down: export no counts
                     self._session = self._session or self._bus.open_session(timeout=TIMINGS.routers_session)
                     if not stop.is_set():
-                        states = ask_routers(self._session, timeout=TIMINGS.routers_timeout)
+                        states = query_routers(self._session, timeout=TIMINGS.routers_timeout)
                 self._routers = states[:_MAX_ROUTERS]
                 due = time.monotonic() + TIMINGS.routers_interval
             elif self._session is not None and any(each.startswith("mavlink") for each in [*self._sources.values()]):

@@ -153,7 +153,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             return pages[path]()
         except Exception:  # noqa: BLE001 - one page must not break the server
-            _log.exception("%s failed", path, extra=about("bug"))
+            _log.exception("%s failed", path, extra=about("internal_error"))
             return Page.text("unexpected error, see the log", status=500)
 
     def _stop_receiving(self) -> None:

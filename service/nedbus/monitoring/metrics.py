@@ -226,7 +226,7 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
         for each in measures.status.streams
     ]
     yield from stream_metrics(streams, messages="nedbus_messages_published")
-    account = daemon.look(list(sources.values()))
+    account = daemon.update_events(list(sources.values()))
     yield from vehicle_metrics(account, streams)
     of = {label: measures.status for label, measures in sources.items()}
     addresses = sum(each.status.rejections.get(TOO_MANY, 0) for each in sources.values())

@@ -7,7 +7,7 @@ from typing import Final
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.events import AccountReport, Expectation, by_vehicle, faults_of, since_text
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 
 from .http_server import Page
 
@@ -68,7 +68,7 @@ def _refusals(daemon: Daemon) -> list[str]:
 
 def _metrics(daemon: Daemon) -> Page:
     try:
-        metrics = needs("metrics", "nedbus.monitoring.metrics")
+        metrics = import_optional("metrics", "nedbus.monitoring.metrics")
     except ConfigError as exc:
         return Page.text(str(exc), status=501)
     page: Page = metrics.metrics_page(metrics.service_metrics(daemon))

@@ -1,4 +1,4 @@
-"""Certificates of a fleet: create, list and renew them, bundle them for vehicles, and write a router's access rules."""
+"""Certificates of a fleet: create, list, renew and bundle them, and write a router's access rules."""
 
 from typing import TYPE_CHECKING
 

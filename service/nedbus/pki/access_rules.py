@@ -1,7 +1,7 @@
-"""Access rules of a fleet: generate the part of a router's configuration file that names the vehicles.
+"""Access rules of a fleet: generate the vehicle entries of a router's configuration file.
 
-Zenoh's access control has no patterns for common names or for key expressions derived from them, so each vehicle needs
-its own rule, subject and policy. These go between marks in the file; the rest of the file is left as it is.
+Zenoh's access control supports neither wildcards in common names nor key expressions derived from them, so each vehicle
+requires its own rule, subject and policy. They are written between marker lines; the rest of the file is unchanged.
 """
 
 import json
@@ -24,8 +24,8 @@ _BLOCK: Final = re.compile(
 _SUBJECT: Final = re.compile(
     rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE
 )
-# A vehicle sends data, last values, retransmissions (@adv), downsampled copies (@rate), liveliness tokens, probes of
-# `nedbus doctor`, rejection reports and a status.
+# A vehicle sends data, last values, retransmissions (@adv), downsampled streams (@rate), liveliness tokens, probes of
+# `nedbus doctor`, rejection reports and the service status.
 _MESSAGES: Final = '["put", "delete", "reply", "declare_queryable", "liveliness_token"]'
 _KEYS: Final = (
     "{p}/{v}/**",
@@ -40,22 +40,22 @@ _KEYS: Final = (
 
 
 def read_access_rules(file: Path) -> list[str]:
-    """Return the vehicles between the marks of a router's file; raises ConfigError like `write_access_rules`."""
+    """Return the vehicles named in a router's file; raise ConfigError like `write_access_rules`."""
     return _SUBJECT.findall(_find_blocks(file)[1]["content"])
 
 
 def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX) -> None:
-    """Write rules for exactly these vehicles into a router's file, atomically; the rest of the file is left as it is.
+    """Atomically replace the vehicle entries of a router's file; the rest of the file is unchanged.
 
     Raises AddressError for an invalid vehicle; ConfigError without any vehicle, and for a file that cannot be read or
-    written, or lacks the marks of `config/router-secure.json5`.
+    written, or lacks the marker lines of `config/router-secure.json5`.
     """
     check_prefix(prefix)
     names = sorted(set(vehicles))
-    if not names:  # a router does not start with a subject without names
+    if not names:  # Zenoh rejects a subject without names
         raise ConfigError.in_file(file, "name at least one vehicle")
     text = _find_blocks(file)[0].string
-    # There is one subject for all vehicles, for their common permissions, and one for each; a certificate matches both.
+    # A certificate matches two subjects: "vehicles" for common permissions, and its own.
     subjects = [f'{{ id: "vehicles", cert_common_names: {json.dumps(list(map(certificate_name, names)))} }},']
     rules, policies = list[str](), list[str]()
     for vehicle, name in zip(names, map(certificate_name, names), strict=True):
@@ -89,8 +89,8 @@ def _find_blocks(file: Path) -> list[re.Match[str]]:
         raise ConfigError.in_file(file, "not UTF-8 text") from exc
     if len(blocks) != 3:
         reason = (
-            f"it has {len(blocks)} of 3 pairs of lines '{_BEGIN}' and '{_END}', in rules, subjects and policies of"
-            " access_control: start from config/router-secure.json5"
+            f"found {len(blocks)} of 3 pairs of marker lines '{_BEGIN}' and '{_END}', in rules, subjects and policies"
+            " of access_control: start from config/router-secure.json5"
         )
         raise ConfigError.in_file(file, reason)
     return blocks

@@ -1,6 +1,6 @@
 """The certificate authority (CA) of a fleet: create, sign, list and renew its keys and certificates.
 
-The access control in `config/router-secure.json5` matches the common names of certificates.
+The access rules in `config/router-secure.json5` match the common names of these certificates.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
 
     The key signs all other certificates; keep it off vehicles and routers.
 
-    Raises PkiError if there is a CA already, or the folder cannot be written.
+    Raises PkiError if the folder already has a CA, or cannot be written.
     """
     key = new_key()
     return _write_files(folder / "ca", _sign(_CA_NAME, key.public_key(), key, days), key)
@@ -50,12 +50,12 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
 def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
     """Create `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
 
-    `hosts`: names and addresses of a router, which clients check. A certificate without hosts is for clients only.
+    `hosts`: names and addresses of a router, verified by clients. A certificate without hosts is for clients only.
 
-    Raises PkiError if there is a key of that name already, no CA, or the folder cannot be written.
+    Raises PkiError if the folder already has a certificate of that name, has no CA, or cannot be written.
     """
     if not name or len(name) > MAX_NAME or "/" in name or name.startswith("."):
-        raise PkiError(f"{name!r} is not a name for a certificate: use 1 to {MAX_NAME} characters without /")
+        raise PkiError(f"{name!r} is not a valid name: use 1 to {MAX_NAME} characters, without / or a leading dot")
     authority = Authority.read(folder)
     key = new_key()
     return _write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
@@ -63,11 +63,11 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
 
 @dataclass(frozen=True, slots=True)
 class CertificateEntry:
-    """A certificate of a folder.
+    """A certificate in the folder of a CA.
 
-    `name`: its common name; for the CA, the name of its file.
+    `name`: common name; for the CA, the name of its file.
     `use`: "authority", "router" or "client".
-    `problem`: the reason that it is useless even before it expires; "" if there is none.
+    `problem`: why it cannot be used even before it expires; "" if valid.
     """
 
     path: Path
@@ -78,7 +78,7 @@ class CertificateEntry:
 
 
 def list_certificates(folder: Path) -> list[CertificateEntry]:
-    """Return the certificates in a CA's folder: the CA's own first, then the others by expiry.
+    """Return the certificates in the folder of a CA: the CA first, then the others by expiry.
 
     Raises PkiError if the folder has no CA, or a certificate cannot be read.
     """
@@ -86,7 +86,7 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
     found = []
     for path in folder.glob("*.crt"):
         loaded, certificate, problem = load_certificate(path), Certificate.read(path), ""
-        with suppress(OSError, ValueError, TypeError):  # the key is elsewhere, or this user may not read it
+        with suppress(OSError, ValueError, TypeError):  # the key is missing, or not readable by this user
             key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
             problem = "" if key.public_key() == loaded.public_key() else "does not match the key beside it"
         try:
@@ -101,10 +101,10 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
 
 
 def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None) -> list[Path]:
-    """Replace a certificate with one of the same name and hosts that expires later, and return the new files.
+    """Replace a certificate by one with the same name and hosts and a later expiry, and return the new files.
 
-    The old one remains valid until it expires, even with `replace_key`, together with its old key.
-    A CA keeps its key, as all certificates that it signed would be void otherwise.
+    The old certificate stays valid until it expires; with `replace_key`, together with its old key.
+    A CA keeps its key, which keeps all certificates valid that it signed.
 
     Raises PkiError for a certificate of another CA, and if a file cannot be read or written.
     """
@@ -115,7 +115,7 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
         return _write_files(folder / "ca", signed, replace=True)
     if entry.problem == _FOREIGN:
         raise PkiError(f"{entry.path} is {_FOREIGN}: renew it in the folder of that authority")
-    # The private key may be on its vehicle only; the public key is in the old certificate.
+    # The private key may exist only on the vehicle, but the old certificate has the public key.
     key = new_key() if replace_key else None
     public_key = key.public_key() if key else load_certificate(entry.path).public_key()
     signed = authority.sign(entry.name, public_key, hosts=entry.certificate.hosts, days=days)
@@ -123,7 +123,7 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
 
 
 class Authority(NamedTuple):
-    """The CA of a folder: its certificate and its private key."""
+    """A CA: its certificate and private key."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
@@ -137,23 +137,23 @@ class Authority(NamedTuple):
         except (ValueError, TypeError):
             key = None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise PkiError(f"{path} is not a key of 'nedbus pki ca': restore it, or make a new CA in another folder")
+            raise PkiError(f"{path} is not a key of 'nedbus pki ca': restore it, or create a new CA in another folder")
         return cls(certificate, key)
 
     def sign(
         self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
     ) -> x509.Certificate:
-        """Sign a key, for a router if hosts are given; the certificate never outlives the CA's."""
+        """Return a certificate for a key, for a router if hosts are given; it expires no later than the CA."""
         return _sign(name, key, self.key, days, issuer=self.certificate, hosts=hosts)
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
-    """Generate a key on the curve P-256."""
+    """Generate a private key on the curve P-256."""
     return ec.generate_private_key(ec.SECP256R1())
 
 
 def write_new(path: Path, item: x509.Certificate | ec.EllipticCurvePrivateKey) -> None:
-    """Write a certificate to a new file that all users can read, or a key to one that only its owner can read."""
+    """Write a certificate (mode 644) or a private key (mode 600) to a new file."""
     if isinstance(item, x509.Certificate):
         content, mode = item.public_bytes(serialization.Encoding.PEM), 0o644
     else:
@@ -168,13 +168,13 @@ def load_certificate(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(_read(path))
     except ValueError as exc:
-        raise PkiError(f"{path} is not a PEM certificate: move it away, or make a new one") from exc
+        raise PkiError(f"{path} is not a PEM certificate: move it away, or create a new one") from exc
 
 
 def _write_files(
     stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey | None = None, *, replace: bool = False
 ) -> list[Path]:
-    """Write `STEM.key`, if a key is given, and `STEM.crt`, both or neither, and return their paths."""
+    """Atomically write `STEM.key`, if a key is given, and `STEM.crt`, and return their paths."""
     items = {Path(f"{stem}.key"): key, Path(f"{stem}.crt"): certificate}
     written = {path: item for path, item in items.items() if item is not None}
     try:
@@ -184,8 +184,8 @@ def _write_files(
             for part, item in zip(parts, written.values(), strict=True):
                 write_new(part, item)
     except FileExistsError as exc:
-        reason = "it is not overwritten; move it away, or choose another folder or name"
-        raise PkiError(f"{exc.filename} exists: {reason}") from exc
+        reason = "move it away, or choose another folder or name"
+        raise PkiError(f"{exc.filename} exists and is not overwritten: {reason}") from exc
     except OSError as exc:
         raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
     return list(written)
@@ -203,7 +203,7 @@ def _sign(
     name: str, key: CertificatePublicKeyTypes, signer: ec.EllipticCurvePrivateKey, days: int | None, *,
     issuer: x509.Certificate | None = None, hosts: Sequence[str] = (),
 ) -> x509.Certificate:  # fmt: skip
-    """Return the certificate of a key; without an issuer, that of a CA, signed by itself."""
+    """Return a certificate for a key; without an issuer, a self-signed CA certificate."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now, is_authority = clock.now(), issuer is None
     if days is None:
@@ -216,10 +216,10 @@ def _sign(
         .issuer_name(subject if issuer is None else issuer.subject)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        # A vehicle's clock may be behind when it boots.
+        # The clock of a vehicle may be behind at boot.
         .not_valid_before(min(now, until) - dt.timedelta(days=1))
         .not_valid_after(until if issuer is None else min(until, issuer.not_valid_after_utc))
-        # Python 3.13 and later require both key identifiers, Zenoh does not.
+        # Required by Python 3.13 and later, though not by Zenoh.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)

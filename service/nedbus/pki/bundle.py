@@ -1,4 +1,4 @@
-"""Bundle for a vehicle: its certificate, its key, and the configuration that uses them, ready to copy to it."""
+"""Bundle of a vehicle: certificate, key and configuration in one folder, ready to copy to the vehicle."""
 
 import json
 import os
@@ -15,13 +15,13 @@ from nedbus.whole_file import whole_file
 from .authority import Authority, new_key, write_new
 from .certificate import certificate_name
 
-_TARGET: Final = Path("/etc/nedbus")  # where the systemd unit and the container image look for nedbus.toml
+_TARGET: Final = Path("/etc/nedbus")  # where the systemd unit and the image expect nedbus.toml
 _IN_WHEEL: Final = Path(__file__).with_name("fleet")
 _TEMPLATES: Final = _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[3] / "packaging" / "fleet"
 
 
 class _Template(string.Template):
-    delimiter = "@"  # $ is for the shell and for Docker
+    delimiter = "@"  # as $ is used by the shell and by Docker
 
 
 def make_bundle(
@@ -34,29 +34,29 @@ def make_bundle(
     target: Path | None = None,
     days: int | None = None,
 ) -> list[Path]:
-    """Create a folder with everything that a vehicle needs to join these routers, atomically, and return its files.
+    """Atomically create a folder with all files that a vehicle needs to join these routers, and return the files.
 
-    The CA's folder keeps the certificate, to list and renew it; the key is only in the bundle.
+    `folder`: the CA, which keeps a copy of the certificate to list and renew it; the key is only in the bundle.
     `target`: folder of the files on the vehicle, by default /etc/nedbus.
 
-    Raises PkiError if the output folder, or a key or certificate of this vehicle, exists already; ConfigError for an
-    endpoint that is not tls/, AddressError for an invalid vehicle.
+    Raises PkiError if the output folder, or a key or certificate of this vehicle, already exists; ConfigError for an
+    endpoint other than tls/; AddressError for an invalid vehicle.
     """
     name = certificate_name(vehicle)
     check_endpoints(routers, where="--router")
     for router in routers:
         if not router.startswith("tls/"):
-            raise ConfigError("--router", f"{router!r} does not use TLS: give a tls/ endpoint")
+            raise ConfigError("--router", f"{router!r} does not use TLS: use a tls/ endpoint")
     if not routers:
         raise ConfigError("--router", "give at least one router, such as tls/192.168.1.5:7447")
     authority = Authority.read(folder)
     for path in (output, folder / f"{name}.key", folder / f"{name}.crt"):
         if path.exists():
-            raise PkiError(f"{path} exists: it is not overwritten; move it away to enroll {name} again")
+            raise PkiError(f"{path} exists and is not overwritten: move it away to enroll {name} again")
     key = new_key()
     certificate = authority.sign(name, key.public_key(), days=days)
     target = target or _TARGET
-    strings = {  # written as JSON, which TOML and YAML read as well
+    strings = {  # written as JSON strings, which are valid in TOML and YAML
         "routers": list(routers),
         "ca": f"{target}/pki/ca.crt",
         "certificate": f"{target}/pki/{name}.crt",

@@ -1,4 +1,4 @@
-"""X.509 certificates as text: subject, issuer, hosts and validity; and the common names of vehicles."""
+"""Fields of X.509 certificates - subject, issuer, hosts, validity - and the common names of vehicles."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 from nedbus_msgs import AddressError, check_vehicle
 
-DAYS: Final = 825  # days of validity of a certificate
+DAYS: Final = 825  # default validity of a certificate [days]
 RENEW_WITHIN: Final = 30  # days before expiry from which a certificate is due for renewal
 CERTIFICATE_PREFIX: Final = "vehicle-"
-"""Prefix of the vehicle's id in the common name of its certificate, so no vehicle has the name of a reader."""
+"""Prefix of the vehicle id in common names, which prevents a vehicle named like a reader or router."""
 
-MAX_NAME: Final = 64  # characters of the longest common name that X.509 allows
+MAX_NAME: Final = 64  # limit of X.509 for a common name [characters]
 
 
 def certificate_name(vehicle: str) -> str:
-    """Return the common name of a vehicle's certificate; raise AddressError if the id is invalid or too long."""
+    """Return the common name of a vehicle's certificate; raise AddressError for an invalid or too long id."""
     check_vehicle(vehicle)
     longest = MAX_NAME - len(CERTIFICATE_PREFIX)
     if len(vehicle) > longest:
@@ -29,7 +29,7 @@ def certificate_name(vehicle: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """One certificate: common names of subject and issuer, hosts, and validity (UTC)."""
+    """A certificate: common names of subject and issuer, hosts, and validity (UTC)."""
 
     subject: str
     issuer: str
@@ -39,13 +39,13 @@ class Certificate:
 
     @classmethod
     def decode(cls, data: bytes, *, pem: bool = False) -> Certificate:
-        """Decode a DER certificate, or with `pem` the first one of a PEM text; it may come from any peer.
+        """Decode a certificate in DER, or with `pem` the first one of a PEM text, from an untrusted peer.
 
         Uses the optional package `cryptography`, as Python's `ssl` decodes only verified certificates.
 
-        Raises ValueError for anything else, ConfigError (also a ValueError) without the extra `pki`.
+        Raises ValueError for malformed data, ConfigError (also a ValueError) without the extra `pki`.
         """
-        x509 = needs("pki", "cryptography.x509")
+        x509 = import_optional("pki", "cryptography.x509")
         try:
             found = x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
             names = [each.value for each in found.extensions if each.oid == x509.OID_SUBJECT_ALTERNATIVE_NAME]
@@ -57,15 +57,15 @@ class Certificate:
 
     @classmethod
     def read(cls, path: str | Path) -> Certificate:
-        """Read the first certificate of a PEM file; raise OSError, and ValueError or ConfigError as `decode` does."""
+        """Read the first certificate in a PEM file; raise OSError, or the errors of `decode`."""
         return cls.decode(Path(path).read_bytes(), pem=True)
 
     def days_left(self, now: dt.datetime) -> float:
-        """Return the days until it expires, negative once it has."""
+        """Return the days until expiry, negative after it."""
         return (self.ends - now) / dt.timedelta(days=1)
 
     def is_due(self, now: dt.datetime, within: float = RENEW_WITHIN) -> bool:
-        """Return whether it is due for renewal: it expires within these days, or has expired."""
+        """Return whether renewal is due: it expires within `within` days, or has expired."""
         return self.days_left(now) <= within
 
     def __str__(self) -> str:

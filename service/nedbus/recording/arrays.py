@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from nedbus.errors import ArgumentError, DecodeError
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 from nedbus.ulog import LoggedStream
 from nedbus_msgs import TOPICS, Address, Definition, Message, decode_text, decode_with, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
@@ -72,11 +72,11 @@ class Flight(ExitStack):
         self._invalid: list[str] = []
         self.start = 0
         if (form := find_format(path)) == "mcap":
-            reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
+            reader = import_optional("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file = self.enter_context(reader)
             self.definitions = {stream.address: stream.definition for stream in reader.counts}
         elif form == "tlog":  # converted by the source, which is above this package
-            self._file = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
+            self._file = import_optional("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
             self.definitions = self._file.definitions
             for address, own in _by_address(self._file.messages()):
                 self._converted[address].append(_decode_fields(self.definitions[address], own))
@@ -230,7 +230,7 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
         return messages
     if library not in ("pandas", "polars"):
         raise ArgumentError("dataframe", library, "pandas or polars")
-    package = needs(library, library)
+    package = import_optional(library, library)
     columns: dict[str, Any] = {}
     for name in messages.dtype.names or ():
         values = messages[name]

@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl, unquote, urlencode
 from pydantic import ValidationError
 
 from nedbus.errors import AddressError, ConfigError
-from nedbus.extras import needs
+from nedbus.extras import import_optional
 from nedbus.recording import find_format, format_of
 from nedbus.transport import Tls
 
@@ -64,7 +64,7 @@ class SourceSpec:
         # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
             raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one first")
-        make = getattr(needs(kind.extra, kind.module), kind.name)
+        make = getattr(import_optional(kind.extra, kind.module), kind.name)
         if isinstance(self.options, RecordedOptions | SimulatorOptions):
             return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
         return cast("LiveSource", make(self.target, self.options, vehicle, routers, tls))

@@ -1,8 +1,8 @@
-"""The transport on Zenoh: sessions, routers, TLS, queries, and the keys of rmw_zenoh."""
+"""Zenoh transport: sessions, routers, TLS, queries, liveliness tokens, and the keys of rmw_zenoh."""
 
 from .alive_tokens import AliveTokens, alive_keys
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
-from .queries import MAX_ANSWERS, Answers, ask, query, wait_for_answers
+from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
@@ -15,7 +15,7 @@ from .rmw_zenoh import (
     node_token,
     px4_publishers_key_expr,
 )
-from .router import RouterState, ask_routers, open_router, read_router_config, router_endpoints
+from .router import RouterState, open_router, query_routers, read_router_config, router_endpoints
 from .router_log import Uplinks, log_refusals
 from .session import (
     MAX_REPLY_BYTES,
@@ -26,7 +26,7 @@ from .session import (
     open_client,
     require_unforked,
     translate_error,
-    while_open,
+    translate_zenoh_errors,
 )
 from .tls import UNKNOWN_AUTHORITY, Tls, check_pem
 from .write_probe import Verdict, probe_writes

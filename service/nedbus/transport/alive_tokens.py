@@ -1,4 +1,4 @@
-"""Liveliness tokens: the present ones, and changes as they appear and disappear."""
+"""Liveliness tokens: a snapshot by query, and a subscription to changes."""
 
 import logging
 import math
@@ -12,48 +12,48 @@ import zenoh
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 
-from .queries import MAX_ANSWER_BYTES, MAX_ANSWERS, Answers, wait_for_answers, zenoh_timeout
-from .session import Session, while_open
+from .queries import MAX_QUERY_BYTES, MAX_REPLIES, Replies, wait_for_replies, zenoh_timeout
+from .session import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-_MAX_WAITING: Final = 131_072  # answers; large, as Zenoh would hold its session lock while it waits for room
-_MAX_CHANGES: Final = 16_384  # waiting changes, more than the tokens that are kept
-_MAX_KEY_LENGTH: Final = MAX_ANSWER_BYTES // MAX_ANSWERS
-_PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before it is probed again
+_MAX_PENDING: Final = 131_072  # replies; large, as Zenoh holds its session lock while it waits for a free slot
+_MAX_CHANGES: Final = 16_384  # queued changes, more than the tokens that are kept
+_MAX_KEY_LENGTH: Final = MAX_QUERY_BYTES // MAX_REPLIES
+_PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
-    """Return the keys of matching liveliness tokens: unique, sorted, at most 10,000."""
-    replies = wait_for_answers([_ask(session, key_expr, timeout)])
-    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_ANSWERS]
+    """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
+    replies = wait_for_replies([_query_tokens(session, key_expr, timeout)])
+    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_REPLIES]
 
 
 class AliveTokens:
     """The liveliness tokens that match a key expression; used by one thread.
 
-    A router sends them to a new subscriber, then each change. It sends them all at once, and the time that it needs
-    grows with the square of their number: a second for 4,000. A query on a key without a token marks the end: its
-    answer follows them. After the queue of changes has overflowed, it subscribes anew. At most 10,000 tokens are kept;
-    more are logged.
+    A router sends a new subscriber all tokens at once, then each change. The time for the list grows with the square of
+    its length: a second for 4,000 tokens. A query on a key without a token (the probe) marks the end of the list, as
+    its reply follows the tokens. An overflow of the queue of changes causes a new subscription. At most 10,000 tokens
+    are kept; a warning is logged if there are more.
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
         self._session, self._key_expr = session, key_expr
         self._keys: set[str] = set()
-        self._unseen: set[str] = set()  # tokens of an earlier subscription that this one has not listed yet
+        self._unseen: set[str] = set()  # tokens of the previous subscription, not yet listed by this one
         self._retry = math.inf  # monotonic time from which tokens beyond the limit are listed [s]
-        self._probe: Answers | None = None
+        self._probe: Replies | None = None
         self._subscribe()
 
     @property
     def complete(self) -> bool:
-        """True if the last `take` had all tokens."""
+        """True if the last `take` completed the list of tokens."""
         return not self.is_listing and self._retry == math.inf
 
     @property
     def is_listing(self) -> bool:
-        """True until the router has listed all tokens; a later `take` receives them."""
+        """True until the router has listed all tokens."""
         return self._probe is not None
 
     def undeclare(self) -> None:
@@ -63,52 +63,52 @@ class AliveTokens:
     def take(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, in order: the key of a token, and True if it appeared."""
         is_listed = False
-        if self._probe is not None:  # before the changes, as all tokens precede its answer
+        if self._probe is not None:  # read before the changes, as its reply follows all tokens
             self._probe.take()
             is_listed = self._probe.ended and not self._probe.failed
             if self._probe.ended:
-                self._probe = self._ask_probe() if self._probe.failed else None
+                self._probe = self._send_probe() if self._probe.failed else None
         changes: list[tuple[str, bool]] = []
         with suppress(zenoh.ZError):  # the session is closed
             while len(changes) < _MAX_CHANGES and (sample := self._subscriber.handler.try_recv()) is not None:
                 changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-        has_room = len(self._keys) < MAX_ANSWERS and time.monotonic() >= self._retry
-        if len(changes) == _MAX_CHANGES or has_room:  # further changes were dropped
+        is_retry_due = len(self._keys) < MAX_REPLIES and time.monotonic() >= self._retry
+        if len(changes) == _MAX_CHANGES or is_retry_due:  # changes were dropped
             self.undeclare()
             self._subscribe()
             return []
         self._unseen.difference_update(key for key, _ in changes)
         if is_listed:
             changes += [(key, False) for key in self._unseen]
-        return [change for change in changes if self._note(*change)]
+        return [change for change in changes if self._apply(*change)]
 
     def _subscribe(self) -> None:
-        with while_open():
+        with translate_zenoh_errors():
             declare = self._session.liveliness().declare_subscriber
             self._subscriber = declare(self._key_expr, zenoh.handlers.RingChannel(_MAX_CHANGES), history=True)
-        self._probe, self._unseen, self._retry = self._ask_probe(), self._keys.copy(), math.inf
+        self._probe, self._unseen, self._retry = self._send_probe(), self._keys.copy(), math.inf
 
-    def _ask_probe(self) -> Answers:
-        key = re.sub(r"\*\*|\$?\*", "-", self._key_expr)  # allowed where the expression is
-        return _ask(self._session, key, _PROBE_TIMEOUT)
+    def _send_probe(self) -> Replies:
+        key = re.sub(r"\*\*|\$?\*", "-", self._key_expr)  # access rules that allow the expression allow this key
+        return _query_tokens(self._session, key, _PROBE_TIMEOUT)
 
-    def _note(self, key: str, alive: bool) -> bool:
-        """Apply a change; return whether it made a difference."""
+    def _apply(self, key: str, alive: bool) -> bool:
+        """Apply a change; return False if it has no effect."""
         if (key in self._keys) == alive or len(key) > _MAX_KEY_LENGTH:
             return False
-        if alive and len(self._keys) >= MAX_ANSWERS:
+        if alive and len(self._keys) >= MAX_REPLIES:
             if self._retry == math.inf:
                 text = "%s: more than %d liveliness tokens: some vehicles are missing"
-                _log.warning(text, self._key_expr, MAX_ANSWERS, extra=about("incomplete"))
+                _log.warning(text, self._key_expr, MAX_REPLIES, extra=about("incomplete"))
             self._retry = time.monotonic() + TIMINGS.tokens_retry
             return False
         (self._keys.add if alive else self._keys.remove)(key)
         return True
 
 
-def _ask(session: Session, key_expr: str, timeout: float) -> Answers:
-    """Query matching tokens and return at once; each answer without an error holds one token."""
+def _query_tokens(session: Session, key_expr: str, timeout: float) -> Replies:
+    """Query matching tokens without waiting; each successful reply is one token."""
     timeout = zenoh_timeout(timeout)
-    with while_open():
-        answers = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_WAITING), timeout=timeout)
-    return Answers(answers, timeout=timeout)
+    with translate_zenoh_errors():
+        replies = session.liveliness().get(key_expr, zenoh.handlers.FifoChannel(_MAX_PENDING), timeout=timeout)
+    return Replies(replies, timeout=timeout)

@@ -1,4 +1,4 @@
-"""Zenoh endpoints: the default, their syntax, and the address to dial for a listening endpoint."""
+"""Zenoh endpoints: default, syntax, name resolution, and the address to dial for a listening endpoint."""
 
 import re
 import socket
@@ -15,7 +15,7 @@ _ENDPOINT: Final = re.compile(
 
 
 def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
-    """Raise ConfigError unless these are all Zenoh endpoints; `where` is the name of the setting."""
+    """Raise ConfigError unless all are valid Zenoh endpoints; `where` is the name of the setting."""
     for endpoint in endpoints:
         found = _ENDPOINT.fullmatch(endpoint)
         if found is None:
@@ -34,7 +34,7 @@ def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
 
 
 def explain_endpoints(endpoints: Sequence[str]) -> str | None:
-    """Return the error text if name resolution fails for all endpoints, else None."""
+    """Return an error text if name resolution fails for all endpoints, else None."""
     hosts = []
     for parts in map(split_endpoint, endpoints):
         if parts is None:
@@ -48,5 +48,5 @@ def explain_endpoints(endpoints: Sequence[str]) -> str | None:
 
 
 def dial_endpoint(endpoint: str) -> str:
-    """Return the endpoint to dial from this host for one that a router listens on, which may be a wildcard address."""
+    """Return the endpoint to dial for a local router, with loopback in place of a wildcard address."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")

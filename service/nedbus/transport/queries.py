@@ -1,8 +1,8 @@
-"""Zenoh queries and their answers.
+"""Zenoh queries and their replies.
 
-Answers wait in channels in Rust until a thread of nedbus polls them. A Python callback, or its drop, would wait for the
-GIL on a thread of Zenoh's, which for a liveliness query holds the session lock meanwhile: a deadlock as soon as another
-thread needs that lock.
+Replies are queued in Rust channels until a thread of nedbus polls them. A Python callback, or its destructor, would
+wait for the GIL on a Zenoh thread. During a liveliness query that thread holds the session lock: a deadlock as soon as
+another thread waits for the lock with the GIL held.
 """
 
 import logging
@@ -14,35 +14,34 @@ import zenoh
 
 from nedbus.log_event import about
 
-from .session import RawSample, Session, while_open
+from .session import RawSample, Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-MAX_ANSWERS: Final = 10_000
-"""Answers accepted per query; honest peers send fewer."""
+MAX_REPLIES: Final = 10_000
+"""Replies accepted per query; well-behaved peers send fewer."""
 
-MAX_ANSWER_BYTES: Final = 2**26
-"""Bytes of payloads and keys accepted per query."""
+MAX_QUERY_BYTES: Final = 2**26
+"""Payload and key bytes accepted per query."""
 
-_MAX_WAITING: Final = 1024  # answers in the channel
 _GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
-_PAUSES: Final = (0.0005, 0.01)  # s between polls for answers: the first pause, and the longest
+_PAUSES: Final = (0.0005, 0.01)  # s between polls for replies: first and longest pause
 
 
-class Answers:
-    """The answers to one query, polled by the thread that sent it."""
+class Replies:
+    """The replies to one query, polled by the thread that sent it."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
-        self.ended = False  # the last answer was taken: every queryable has answered, or the timeout has passed
-        self.failed = False  # an answer was an error, such as a timeout
+        self.ended = False  # every reply was taken: all queryables have replied, or the timeout has passed
+        self.failed = False  # at least one reply was an error, such as a timeout
         self._handler = handler
         self._end = time.monotonic() + timeout + _GRACE
 
     def take(self) -> list[zenoh.Reply]:
-        """Return the answers received since the last call."""
+        """Return the replies received since the last call."""
         taken: list[zenoh.Reply] = []
         try:
-            while len(taken) < MAX_ANSWERS and (reply := self._handler.try_recv()) is not None:
+            while len(taken) < MAX_REPLIES and (reply := self._handler.try_recv()) is not None:
                 taken.append(reply)
                 self.failed |= reply.ok is None
             if time.monotonic() > self._end:
@@ -52,42 +51,43 @@ class Answers:
         return taken
 
 
-def ask(session: Session, selector: str, *, timeout: float, room: int = _MAX_WAITING, **options: Any) -> Answers:
-    """Query all matching queryables and return at once; the session blocks while `room` answers wait.
+def send_query(session: Session, selector: str, *, timeout: float, capacity: int = 1024, **options: Any) -> Replies:
+    """Query all matching queryables without waiting; the session blocks while `capacity` replies are pending.
 
     `options`: further arguments of `zenoh.Session.get`, such as `priority`.
     """
     timeout = zenoh_timeout(timeout)
     options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
-    with while_open():
-        answers = session.get(selector, zenoh.handlers.FifoChannel(room), timeout=timeout, **options)
-    return Answers(answers, timeout=timeout)
+    with translate_zenoh_errors():
+        replies = session.get(selector, zenoh.handlers.FifoChannel(capacity), timeout=timeout, **options)
+    return Replies(replies, timeout=timeout)
 
 
 def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]:
-    """Return the answers within `timeout` seconds, perhaps several for a key.
+    """Return the replies received within `timeout` seconds, possibly several per key.
 
-    At most 10,000 answers and 64 MB in total are accepted; the number of answers beyond that is logged.
+    At most 10,000 replies and 64 MB in total are accepted; the number of replies beyond that is logged.
     """
     kept: list[RawSample] = []
-    size = left_out = 0
-    for sample in filter(None, (reply.ok for reply in wait_for_answers([ask(session, selector, timeout=timeout)]))):
+    size = dropped = 0
+    replies = wait_for_replies([send_query(session, selector, timeout=timeout)])
+    for sample in filter(None, (reply.ok for reply in replies)):
         size += len(sample.payload) + len(str(sample.key_expr))
-        if size > MAX_ANSWER_BYTES or len(kept) >= MAX_ANSWERS:
-            left_out += 1
+        if size > MAX_QUERY_BYTES or len(kept) >= MAX_REPLIES:
+            dropped += 1
         else:
             kept.append(sample)
-    if left_out:
-        text = "%s: %d answers left out, beyond the limits of a query"
-        _log.warning(text, selector, left_out, extra=about("incomplete"))
+    if dropped:
+        text = "%s: dropped %d replies beyond the limits of a query"
+        _log.warning(text, selector, dropped, extra=about("incomplete"))
     return kept
 
 
-def wait_for_answers(queries: Sequence[Answers]) -> Iterator[zenoh.Reply]:
-    """Yield answers as they arrive, until all queries have ended."""
+def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:
+    """Yield replies as they arrive, until all queries have ended."""
     pause, longest = _PAUSES
-    while still := [answers for answers in queries if not answers.ended]:
-        taken = [reply for answers in still for reply in answers.take()]
+    while pending := [replies for replies in queries if not replies.ended]:
+        taken = [reply for replies in pending for reply in replies.take()]
         yield from taken
         if not taken:
             time.sleep(pause)
@@ -95,5 +95,5 @@ def wait_for_answers(queries: Sequence[Answers]) -> Iterator[zenoh.Reply]:
 
 
 def zenoh_timeout(timeout: float) -> float:
-    """Limit a timeout to the range that Zenoh accepts: neither 0 nor infinity."""
+    """Clamp a timeout to the range that Zenoh accepts: neither 0 nor infinity."""
     return min(max(timeout, 0.001), 86_400.0)

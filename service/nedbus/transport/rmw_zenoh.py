@@ -1,11 +1,11 @@
-"""Keys, attachments and liveliness tokens of ROS 2 over Zenoh, as in rmw_zenoh and PX4's own Zenoh module.
+"""Keys, attachments and liveliness tokens of ROS 2 over Zenoh, as used by rmw_zenoh and by PX4's `zenoh` module.
 
     key          <domain>/<topic>/<DDS type>/RIHS01_<hash>
     attachment   sequence number, time, 16, gid: 33 bytes, little-endian
     tokens       @ros2_lv/<domain>/<session>/<node>/<entity>/NN|MP|MS/<enclave>/<namespace>/<node name>
                  and for a publisher (MP) or a subscription (MS) /<topic>/<DDS type>/RIHS01_<hash>/<QoS>
 
-Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatible with it.
+Source: the design document of rmw_zenoh, with which PX4's module is compatible.
 """
 
 import re
@@ -17,21 +17,21 @@ import xxhash
 
 from nedbus_msgs import DecodeError
 
-NO_HASH: Final = "TypeHashNotSupported"  # in the keys of ROS 2 Humble, and of a PX4 built for it
-BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # of messages from nedbus, not to be bridged back; ROS 2 ignores it
-_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10: as PX4 offers
+NO_HASH: Final = "TypeHashNotSupported"  # in place of a hash, in keys of ROS 2 Humble and of PX4 built for it
+BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # marks messages from nedbus, to prevent loops; ROS 2 ignores it
+_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10, as PX4 publishes
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
-_MAX_KEY: Final = 512  # characters; keys of PX4 and ROS 2 have up to half of it
+_MAX_KEY: Final = 512  # characters; twice the longest keys of PX4 and ROS 2
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
-LONGEST_TOKEN: Final = 2 * _MAX_KEY  # characters; those of ROS 2 are shorter
-PX4_TYPES: Final = "px4_msgs$*"  # chunk of a key expression: the DDS types of PX4 and of its translation node
+LONGEST_TOKEN: Final = 2 * _MAX_KEY  # characters; tokens of ROS 2 are shorter
+PX4_TYPES: Final = "px4_msgs$*"  # key expression chunk for the DDS types of PX4 and of its message translation node
 
 
 @dataclass(frozen=True, slots=True)
 class TopicKey:
-    """The key of one topic: `topic` without a leading slash, `dds_type`, and `type_hash`, which may be NO_HASH."""
+    """The key of one topic; `topic` has no leading slash, `type_hash` may be NO_HASH."""
 
     domain: int
     topic: str
@@ -47,7 +47,7 @@ class TopicKey:
         return cls(int(found[1]), found[2], found[3], found[4])
 
     def token(self, kind: Literal["MP", "MS"], session: str, node: str, entity: int) -> str:
-        """Return the liveliness token of a node's publisher (MP), which ROS 2 lists, or of its subscription (MS)."""
+        """Return the liveliness token of a publisher (MP), which ROS 2 lists, or of a subscription (MS) of a node."""
         topic, end = self.topic.replace("/", "%"), f"{self.dds_type}/{self.type_hash}/{_QOS}"
         return f"@ros2_lv/{self.domain}/{session}/0/{entity}/{kind}/%/%/{node}/%{topic}/{end}"
 
@@ -57,7 +57,7 @@ class TopicKey:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """The attachment of each message: its sequence number, its source time, and its publisher's gid.
+    """The attachment of a message: sequence number, source time, and gid of the publisher.
 
     `time`: us since boot from PX4, ns since the epoch from rmw_zenoh.
     """
@@ -70,7 +70,7 @@ class Attachment:
     def parse(cls, data: bytes) -> Self:
         """Parse an attachment of rmw_zenoh; raise DecodeError for anything else."""
         if len(data) != _ATTACHMENT.size or data[_GID] != _GID:
-            raise DecodeError(f"an attachment of {len(data)} bytes that is not rmw_zenoh's of {_ATTACHMENT.size}")
+            raise DecodeError(f"an attachment of {len(data)} bytes, not in rmw_zenoh's format of {_ATTACHMENT.size}")
         sequence, time, _, gid = _ATTACHMENT.unpack(data)
         if sequence < 0:
             raise DecodeError(f"an attachment with the sequence number {sequence}")
@@ -82,9 +82,9 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class PublisherToken:
-    """The liveliness token of a publisher: its session, the name of its node, and the key of its messages.
+    """The liveliness token of a publisher: session, node name, and key of its messages.
 
-    `text`: the whole token, which is unique to each publisher.
+    `text`: the complete token, unique per publisher.
     """
 
     text: str
@@ -104,13 +104,13 @@ class PublisherToken:
 
     @property
     def gid(self) -> bytes | None:
-        """The gid of its messages, if its node is named by it, as PX4's is; all simulated PX4s have the same one."""
+        """The gid of its messages, parsed from the node name of PX4, else None; all simulated PX4s share one."""
         found = _PX4_NODE.fullmatch(self.node)
         return bytes.fromhex(found[1]) if found else None
 
 
 def gid_of_token(token: str) -> bytes:
-    """Return the gid of the owner of a token, as ROS 2 shows it and its messages carry it.
+    """Return the gid of the owner of a token, as shown by ROS 2 and sent in the attachments of its messages.
 
     Source: rmw_zenoh, liveliness_utils.cpp: the 128-bit XXH3 of the token, lower half first.
     """
@@ -118,10 +118,10 @@ def gid_of_token(token: str) -> bytes:
 
 
 def node_token(domain: int, session: str, node: str) -> str:
-    """Return the liveliness token of a node without a namespace, for ROS 2 to list."""
+    """Return the liveliness token of a node without a namespace, which makes ROS 2 list it."""
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{node}"
 
 
 def px4_publishers_key_expr(domain: int | None) -> str:
-    """Return the key expression for the tokens of all publishers of PX4's messages, in one domain or all."""
+    """Return the key expression for the tokens of all publishers of PX4 messages, in one domain or (None) in all."""
     return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{PX4_TYPES}/*/*"

@@ -1,4 +1,4 @@
-"""An embedded Zenoh router, with nedbus's settings or a configuration file of `zenohd`, and the states of routers."""
+"""Embedded Zenoh router, with default settings or a configuration file of `zenohd`, and the state of all routers."""
 
 import json
 import logging
@@ -20,18 +20,16 @@ from nedbus.timings import TIMINGS
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .queries import query
-from .session import COMMON_SETTINGS, Session, draw_retry, error_reason, insert_settings, open_session
+from .session import COMMON_SETTINGS, Session, error_reason, insert_settings, open_session, random_backoff
 from .tls import Tls
 
 _log = logging.getLogger(__name__)
 
-# Longer than the lease of clients: a router drops a silent client before that client joins another router. If two
-# routers have the same client for a moment, Zenoh 1.10.2 loses its queryables on a third router that joins later.
-_OTHER_FILES: Final = 100  # open files besides sessions: 21 of a router, and the sources and HTTP clients of a service
+_OTHER_FILES: Final = 100  # open files other than sessions: 21 of a router, plus sources and HTTP clients of a service
 _ADMIN_KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
-_MAX_ANSWER_BYTES: Final = 2**20  # about 5,700 sessions
-_MAX_SESSIONS: Final = 2**32  # greatest limit accepted from a router
-_MAX_ROUTERS: Final = 1000  # returned routers; any peer may claim to be one
+_MAX_STATE_BYTES: Final = 2**20  # a reply with about 5,700 sessions
+_MAX_SESSIONS: Final = 2**32  # largest limit accepted from a router
+_MAX_ROUTERS: Final = 1000  # routers returned, as any peer may claim to be one
 
 
 def open_router(
@@ -41,12 +39,12 @@ def open_router(
     config_file: Path | None = None,
     tls: Tls | None = None,
 ) -> Session:
-    """Open a session that is a router, by default on loopback, or as configured by a `zenohd` file.
+    """Open a session in router mode, by default on loopback, or as configured by a `zenohd` file.
 
-    Endpoints given here replace those of the file, as the flags of `zenohd` do.
-    `tls`: for the `tls/` routers that it joins, unless the file has a TLS section.
+    `listen`, `connect`: override the endpoints of the file, as the flags of `zenohd` do.
+    `tls`: files for the `tls/` routers in `connect`, unless the file has a TLS section.
 
-    Plugins in the file are not loaded, as Zenoh's Python library has none, and are logged.
+    Plugins in the file are logged, not loaded: Zenoh's Python library does not support them.
     The admin space shows `max_sessions` in `metadata`. The soft limit of open files is raised to the hard limit.
 
     Raises ListenError if it cannot listen; ConfigError for a malformed endpoint or file, an unreadable TLS file, or a
@@ -59,11 +57,13 @@ def open_router(
         settings = {
             **COMMON_SETTINGS,
             "mode": "router",
+            # Longer than the lease of clients, so a router drops a silent client before it joins another router: if two
+            # routers have the same client, Zenoh 1.10.2 loses its queryables on a third router that joins later.
             "transport/link/tx/lease": round(1000 * TIMINGS.router_lease),
-            "scouting/delay": 0,  # scouting is off, so do not wait 0.5 s for answers
+            "scouting/delay": 0,  # do not wait 0.5 s for scouting replies, as scouting is off
             "listen/endpoints": list(router_endpoints(listen)),
             "connect/endpoints": list(connect),
-            "connect/retry": draw_retry(),
+            "connect/retry": random_backoff(),
             "adminspace/enabled": True,
             "transport/unicast/accept_pending": 1000,
             "transport/link/rx/max_message_size": 2**20,
@@ -73,7 +73,7 @@ def open_router(
         if plugins := _get(config, "plugins"):
             text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
             _log.warning(text, config_file, _names(plugins), extra=about("router"))
-        for name, file in _tls_files(config).items():  # Zenoh would not name it
+        for name, file in _tls_files(config).items():  # as Zenoh does not name the file in its error
             if not os.access(file, os.R_OK):
                 reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
                 raise ConfigError.in_file(config_file, reason)
@@ -85,7 +85,7 @@ def open_router(
         insert_settings(config, files, where="tls")
     sessions = _get(config, "transport/unicast/max_sessions")
     metadata = _get(config, "metadata")
-    if metadata is None or isinstance(metadata, dict):  # the user may have set anything
+    if metadata is None or isinstance(metadata, dict):  # any JSON value is allowed
         insert_settings(config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata")
     allow_sessions(sessions)
     try:
@@ -95,17 +95,17 @@ def open_router(
 
 
 def allow_sessions(sessions: int) -> None:
-    """Raise this process's soft limit of open files to the hard limit, as each session of a router is an open file.
+    """Raise the soft limit of open files to the hard limit; each session of a router is an open file.
 
-    At the limit a router silently accepts no more connections. Logs a warning if the limit is too low for `sessions`.
+    At the limit a router stops accepting connections without an error. A warning is logged if the limit is too low.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with suppress(OSError, ValueError):  # a kernel may allow less than the hard limit
+    with suppress(OSError, ValueError):  # the kernel may allow less than the hard limit
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < sessions + _OTHER_FILES:
         text = (
-            "the limit of %s open files has room for about %s sessions, but max_sessions is %s:"
+            "the limit of %s open files allows about %s sessions, but max_sessions is %s:"
             " raise the limit (ulimit -n, LimitNOFILE=)"
         )
         _log.warning(text, soft, max(0, soft - _OTHER_FILES), sessions, extra=about("router"))
@@ -122,7 +122,7 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
 
 
 class RouterConfig(NamedTuple):
-    """Configuration of a router: endpoints, PEM files of its TLS section by name, and its limit of sessions."""
+    """Configuration of a router: endpoints, PEM files of the TLS section by name, and session limit."""
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
@@ -131,7 +131,7 @@ class RouterConfig(NamedTuple):
 
 
 def read_router_config(path: Path | None = None) -> RouterConfig:
-    """Read a configuration file of a router; without a file, return Zenoh's defaults.
+    """Read the configuration file of a router; without a file, return Zenoh's defaults.
 
     Raises ConfigError, with line and column, for a malformed file.
     """
@@ -155,7 +155,7 @@ def _tls_files(config: zenoh.Config) -> dict[str, Path]:
 
 
 def _read_config(path: Path) -> zenoh.Config:
-    """Read the file of an embedded router; raise ConfigError if it is malformed or requires a plugin."""
+    """Read the file for an embedded router; raise ConfigError if it is malformed or requires a plugin."""
     config = _parse_config(path)
     plugins = _get(config, "plugins").items()
     if required := [name for name, settings in plugins if settings and settings.get("__required__")]:
@@ -181,7 +181,7 @@ def _parse_config(path: Path) -> zenoh.Config:
         text = str(exc)
         position = re.search(r"(?:line: |--> )(\d+)(?:, column: |:)(\d+)", text)
         line, column = map(int, position.groups()) if position else (None, None)
-        # Without the source excerpt and the source paths that Zenoh's parser adds.
+        # Strip the source excerpt and source paths that Zenoh's parser adds.
         message = re.search(r'(?:msg: "|= )(.*?)(?: at /|", location)', text, re.DOTALL)
         reason = message[1].replace("`", "'") if message else "not a Zenoh configuration"
         raise ConfigError.in_file(path, reason, line=line, column=column) from exc
@@ -190,9 +190,9 @@ def _parse_config(path: Path) -> zenoh.Config:
 
 @dataclass(frozen=True, slots=True)
 class RouterState:
-    """A router: its Zenoh id, its open sessions, including those with other routers, and their limit.
+    """State of a router: Zenoh id, number of open sessions, including those to other routers, and session limit.
 
-    `max_sessions`: None unless it is in `metadata` of the router's configuration; Zenoh reports it nowhere else.
+    `max_sessions`: None unless `metadata` of the router's configuration has it; Zenoh does not report the limit itself.
     """
 
     zid: str
@@ -201,34 +201,34 @@ class RouterState:
 
     @property
     def load(self) -> float | None:
-        """Open sessions divided by their limit, 1.0 when full; None if the limit is unknown."""
+        """Open sessions divided by the limit; None if the limit is unknown."""
         return None if self.max_sessions is None else self.sessions / self.max_sessions
 
 
-def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
-    """Return the state of each router that answers within `timeout` seconds, sorted by id.
+def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
+    """Return the state of each router that replies within `timeout` seconds, sorted by id.
 
-    A router is missing if its admin space is off or denied, or if its answer exceeds the message size of this session:
+    A router is missing if its admin space is off or denied, or if its reply exceeds the message size of this session:
     2**18 bytes for a client, about 1,400 sessions.
     """
-    answers = query(session, "@/*/router", timeout=timeout)
-    small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
-    states = filter(None, (read_state(str(answer.key_expr), answer.payload.to_bytes()) for answer in small))
+    replies = query(session, "@/*/router", timeout=timeout)
+    small = (reply for reply in replies if len(reply.payload) <= _MAX_STATE_BYTES)
+    states = filter(None, (read_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small))
     by_zid = {state.zid: state for state in states}
     return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
 
 
 def read_state(key: str, payload: bytes) -> RouterState | None:
-    """Parse the state in an answer; return None if it is not a router's, as any peer may answer anything."""
+    """Parse a reply of the admin space; return None if it is malformed, as any peer may reply."""
     found = _ADMIN_KEY.fullmatch(key)
     try:
-        answer = json.loads(payload)
+        state = json.loads(payload)
     except (ValueError, RecursionError):
         return None
-    sessions = answer.get("sessions") if isinstance(answer, dict) else None
+    sessions = state.get("sessions") if isinstance(state, dict) else None
     if found is None or not isinstance(sessions, list):
         return None
-    metadata = answer.get("metadata")
+    metadata = state.get("metadata")
     limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
     is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # not a bool
     return RouterState(found[1], len(sessions), limit if is_limit else None)

@@ -1,6 +1,6 @@
-"""Log events of a service and its router: links to other routers that come up or break, and refused clients.
+"""Log uplink state and refused clients of a service and its router.
 
-Zenoh does not report links, and writes refusals only to its own log, on stdout.
+Zenoh does not report the state of links, and reports refused clients only in its own log on stdout.
 """
 
 import atexit
@@ -24,14 +24,14 @@ from .tls import Tls
 
 _log = logging.getLogger(__name__)
 
-_LINK_TIMEOUT: Final = 3.0  # s until a link that does not come up is logged
-_EXIT_TIMEOUT: Final = 1.0  # s; a child process may keep the pipe open
+_LINK_TIMEOUT: Final = 3.0  # s before a link that does not come up is logged
+_EXIT_TIMEOUT: Final = 1.0  # s; a child process may hold the pipe open
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
-_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # of a listener; all have a hint
+_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # only those of a listener have a hint
 _REASONS: Final = {  # by substring of Zenoh's text
     "certificate expired": "its certificate has expired",
-    "BadSignature": "its certificate is signed by another authority",
-    "UnknownIssuer": "its certificate is signed by another authority",
+    "BadSignature": "its certificate is signed by another CA",
+    "UnknownIssuer": "its certificate is signed by another CA",
     "sent no certificates": "it sent no certificate",
     "fatal alert": "it does not accept the certificate of this router",
     "corrupt message": "it does not speak TLS",
@@ -40,9 +40,9 @@ _REASONS: Final = {  # by substring of Zenoh's text
 
 
 class Uplinks:
-    """Log when links to routers come up, do not come up, are lost, and are back; call `check` every second.
+    """Log when uplinks (links to routers) come up, fail to come up, break and recover; call `check` every second.
 
-    A router keeps a link to each endpoint; a client, whose session is open, one link to any of them.
+    A router keeps one link to each endpoint; a client, whose session is open, keeps one link to any of them.
     """
 
     def __init__(
@@ -57,11 +57,11 @@ class Uplinks:
         self._session, self._tls, self._now = session, tls, now
         self._is_client = is_client
         names = [" or ".join(endpoints)] if is_client else endpoints
-        # The last logged state of each link, None before the first, and since when [s].
+        # Last logged state of each link, None at first, and the time of its change [s].
         self._states: dict[str, tuple[bool | None, float]] = dict.fromkeys(names, (is_client or None, now()))
 
     def check(self) -> None:
-        """Compare the expected links with the open ones."""
+        """Compare the configured links with the open ones, and log changes."""
         # The destination of an open link is the dialled endpoint, but its host name may have been resolved.
         dialled = [link.dst for link in self._session.info.links()]
         for name, (was_up, since) in self._states.items():
@@ -70,15 +70,15 @@ class Uplinks:
                 continue
             self._states[name] = is_up, since if was_up is None else self._now()
             if is_up:
-                text = f"joined {name}" if was_up is None else f"the link to {name} is up, after {lasted:.0f} s"
-                _log.info("%s", text, extra=about("link-back"))
+                text = f"joined {name}" if was_up is None else f"the link to {name} is up after {lasted:.0f} s"
+                _log.info("%s", text, extra=about("link_up"))
             elif was_up:
-                _log.warning("the link to %s is lost: still trying", name, extra=about("link-broken"))
+                _log.warning("the link to %s is lost: still trying", name, extra=about("link_lost"))
             else:
-                _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link-broken"))
+                _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link_lost"))
 
     def _is_linked(self, endpoint: str, dialled: Sequence[str]) -> bool:
-        """Return whether one of these is the endpoint; hosts only matter if several endpoints have its port."""
+        """Return whether an endpoint is dialled; hosts are compared only if several endpoints share its port."""
         protocol, host, port = split_endpoint(endpoint) or (endpoint, "", 0)
         hosts = {each[1] for each in map(split_endpoint, dialled) if each and each[::2] == (protocol, port)}
         if not hosts or sum(each[::2] == (protocol, port) for each in map(split_endpoint, self._states) if each) == 1:
@@ -86,45 +86,45 @@ class Uplinks:
         try:
             return not hosts.isdisjoint([host, *(str(each[4][0]) for each in socket.getaddrinfo(host, None))])
         except OSError:
-            return True  # the name cannot be resolved now, which says nothing about an open link
+            return True  # a failed name resolution does not affect an open link
 
     def _explain(self, endpoint: str) -> str:
         if not endpoint.startswith(("tls/", "quic/")):
             return ""
         if self._tls is None:
-            return " (no certificates are given for it: set tls_ca, tls_certificate and tls_key)"
+            return " (no certificates are configured: set tls_ca, tls_certificate and tls_key)"
         explanation = self._tls.explain()
         return f" ({explanation})" if explanation else ""
 
 
 def log_refusals() -> None:
-    """Log each client that a router of this process refuses from now on; its address is not known.
+    """Log each client that a router of this process refuses from now on; Zenoh does not report its address.
 
-    Redirects stdout through a pipe, reads refusals from Zenoh's log, and passes on all other lines.
+    Redirects stdout through a pipe, extracts refusals from Zenoh's log, and forwards all other lines.
     """
     stdout = os.dup(1)
     read, write = os.pipe()
     os.dup2(write, 1)
     os.close(write)
     zenoh.init_log_from_env_or("zenoh_link_tls=warn")
-    reader = threading.Thread(target=_filter, args=(read, stdout), name="nedbus-refusals", daemon=True)
+    reader = threading.Thread(target=_forward, args=(read, stdout), name="nedbus-refusals", daemon=True)
     reader.start()
-    atexit.register(_end_pipe, stdout, reader)
+    atexit.register(_close_pipe, stdout, reader)
 
 
-def _end_pipe(stdout: int, reader: threading.Thread) -> None:
-    """Close the pipe at the exit of the process, and wait until its last lines are passed on."""
+def _close_pipe(stdout: int, reader: threading.Thread) -> None:
+    """Close the pipe at exit, and wait until its last lines are forwarded."""
     os.dup2(stdout, 1)
     reader.join(_EXIT_TIMEOUT)
 
 
-def _filter(read: int, stdout: int) -> None:
+def _forward(read: int, stdout: int) -> None:
     with open(read, "rb") as lines:
         for line in lines:
             found = _REFUSED.search(_COLOUR.sub("", line.decode(errors="replace")))
             if found is not None:
                 reason = next((text for part, text in _REASONS.items() if part in found[1]), found[1])
-                _log.warning("a client is refused: %s", reason, extra=about("client-refused", reason=reason))
+                _log.warning("a client is refused: %s", reason, extra=about("client_refused", reason=reason))
                 continue
-            with suppress(OSError):  # the reader of stdout is gone
+            with suppress(OSError):  # the reader of stdout has closed it
                 os.write(stdout, line)

@@ -1,4 +1,4 @@
-"""Zenoh sessions of clients, and translation of Zenoh's errors."""
+"""Zenoh sessions of clients, and translation of Zenoh errors."""
 
 import json
 import math
@@ -24,9 +24,9 @@ from .tls import Tls
 Session = zenoh.Session
 RawSample = zenoh.Sample
 
-# Shared memory limits a router to 351 fewer sessions, and gains nothing at 244 bytes.
+# Shared memory limits a router to 351 local sessions, without any gain at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
-# Queues are longer than Zenoh's default, whose two batches are too few for the bursts of a fleet.
+# Queues are longer than Zenoh's default: two batches are too few for the bursts of a fleet.
 # Sessions add no timestamps: publishers stamp each message, so a router never replaces a timestamp.
 COMMON_SETTINGS: Final = {
     "scouting/multicast/enabled": False,
@@ -36,15 +36,15 @@ COMMON_SETTINGS: Final = {
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
 }
-MAX_REPLY_BYTES: Final = 2**18  # payload of a reply to a query: services split what is longer, readers refuse it
+MAX_REPLY_BYTES: Final = 2**18  # payload of a reply: services split longer ones, clients reject them
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
-_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
+_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # backoff between the first attempts to connect [s]
 
 _forks: Final[list[None]] = []  # not empty in a process that was forked from one with sessions
 
 
 def is_forked() -> bool:
-    """Return whether this process was forked from one with Zenoh sessions; Zenoh does not work in it."""
+    """Return whether this process was forked from one with Zenoh sessions, in which case Zenoh does not work."""
     return bool(_forks)
 
 
@@ -69,9 +69,9 @@ def open_session(config: zenoh.Config) -> Session:
 def open_client(
     endpoints: Sequence[str], *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
 ) -> Session:
-    """Open a session as a client of the first router that answers; Ctrl-C, or setting `stop`, ends the wait.
+    """Open a session as a client of the first router that answers; Ctrl-C or setting `stop` cancels the wait.
 
-    The session reconnects by itself when its link breaks.
+    The session reconnects automatically when its link breaks.
 
     Raises ConnectError if no endpoint answers within `timeout` seconds (None: wait forever), ConfigError for a
     malformed endpoint or an unreadable TLS file.
@@ -84,9 +84,9 @@ def open_client(
         "transport/link/tx/lease": round(1000 * TIMINGS.lease),
         "connect/endpoints": list(endpoints),
         "connect/timeout_ms": 0,
-        "connect/retry": draw_retry(),
+        "connect/retry": random_backoff(),
         "listen/endpoints": [],
-        # With key and headers; no peer is trusted with more.
+        # With key and headers; larger messages from peers are rejected.
         "transport/link/rx/max_message_size": MAX_REPLY_BYTES + 2**12,
     }
     timeout = math.inf if timeout is None else timeout
@@ -94,8 +94,8 @@ def open_client(
     stop = stop or threading.Event()
     reason = ""
     for pause in chain(_PAUSES, repeat(1.0)):
-        # Short, as an endpoint may accept and then send nothing; but at least 1 s, as the session will reconnect with
-        # the same timeout, and perhaps over a slow link.
+        # Short, as an endpoint may accept and then send nothing; but at least 1 s, as reconnects over a slow link use
+        # the same timeout.
         open_timeout = min(3.0, max(1.0, end - time.monotonic()))
         settings["transport/unicast/open_timeout"] = round(1000 * open_timeout)
         try:
@@ -106,14 +106,14 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # For most failures Zenoh reports only "Unable to connect".
-    known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
-    if not known and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
-        known = "no certificate given: routers of a fleet ask for one (tls_certificate, tls_key)"
-    raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
+    cause = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
+    if not cause and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
+        cause = "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
+    raise ConnectError(endpoints, timeout, cause or ("" if "Unable to connect" in reason else reason))
 
 
-def draw_retry() -> dict[str, float]:
-    """Return random pauses between attempts to reconnect, so a fleet does not reconnect all at once."""
+def random_backoff() -> dict[str, float]:
+    """Return Zenoh's `connect/retry` section with a random backoff, so a fleet does not reconnect all at once."""
     first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - not a secret
     return {"period_init_ms": round(first), "period_max_ms": round(longest), "period_increase_factor": 1.5}
 
@@ -129,13 +129,13 @@ def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, whe
 
 
 def entity_name(entity: zenoh.EntityGlobalId) -> str:
-    """Return the id of a publisher or reader as text: the id of its session, and its id within the session."""
+    """Return the id of a publisher or reader as text: session id and entity id, separated by a colon."""
     return f"{entity.zid}:{entity.eid}"
 
 
 @contextmanager
-def while_open() -> Iterator[None]:
-    """Translate Zenoh's errors: to ClosedError if the session was closed, else to NedbusError with Zenoh's reason."""
+def translate_zenoh_errors() -> Iterator[None]:
+    """Translate Zenoh errors: to ClosedError if the session is closed, else to NedbusError with Zenoh's reason."""
     try:
         yield
     except zenoh.ZError as exc:
@@ -143,15 +143,15 @@ def while_open() -> Iterator[None]:
 
 
 def translate_error(error: zenoh.ZError) -> NedbusError:
-    """Return the error that `while_open` raises for an error of Zenoh's.
+    """Return the error that `translate_zenoh_errors` raises for a Zenoh error.
 
-    Decides by the text: `Session.is_closed` would wait for a lock of Zenoh's without releasing the GIL.
+    Decides by the text, as `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
     """
     return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
 
 
 def error_reason(error: zenoh.ZError) -> str:
-    """Return the reason from the operating system, else the whole text without source paths."""
+    """Return the reason reported by the operating system, else the whole text without source paths."""
     text = re.sub(r" at /\S+", "", str(error)).strip()
     found = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
     return found[1].lower() if found else text

@@ -1,4 +1,4 @@
-"""TLS files of a client for `tls/` endpoints, and the detection of mistakes in them."""
+"""TLS files of a client for `tls/` endpoints, and the diagnosis of invalid files."""
 
 import os
 import re
@@ -12,11 +12,11 @@ from nedbus.errors import ConfigError
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
 UNKNOWN_AUTHORITY: Final = (7, 18, 19, 20, 21)
-"""OpenSSL's codes for a certificate of another authority."""
-_VERIFY_REASONS: Final = {  # by OpenSSL's codes
-    9: "or its authority is not valid yet: check the clock of this host",
-    10: "or its authority has expired",
-    **dict.fromkeys(UNKNOWN_AUTHORITY, "is not signed by the authority in tls_ca"),
+"""OpenSSL's verification codes for a certificate that was signed by another CA."""
+_VERIFY_REASONS: Final = {  # by verification code of OpenSSL
+    9: "or its CA is not valid yet: check the clock of this host",
+    10: "or its CA has expired",
+    **dict.fromkeys(UNKNOWN_AUTHORITY, "is not signed by the CA in tls_ca"),
 }
 
 
@@ -24,8 +24,8 @@ _VERIFY_REASONS: Final = {  # by OpenSSL's codes
 class Tls:
     """PEM files for `tls/` endpoints.
 
-    `ca`: certificate of the authority that signed the router's certificate.
-    `certificate`, `key`: this client's own, for routers that require them (mutual TLS); both or neither.
+    `ca`: certificate of the CA that signed the router's certificate.
+    `certificate`, `key`: client certificate and its key, for routers with mutual TLS; both or neither.
 
     Raises ConfigError for a certificate without its key, or a key without its certificate.
     """
@@ -36,12 +36,12 @@ class Tls:
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.key is None):
-            raise ConfigError("tls", "a certificate needs its key, and a key its certificate: give both or neither")
+            raise ConfigError("tls", "a certificate needs its key, and a key its certificate: set both or neither")
 
     def zenoh_settings(self) -> dict[str, object]:
         """Return Zenoh's `transport/link/tls` section.
 
-        Raises ConfigError for a file that cannot be read or is of another kind, and for a key that does not match.
+        Raises ConfigError for a file that is unreadable or of another kind, and for a key that does not match.
         """
         check_pem(self.ca, "CERTIFICATE")
         settings: dict[str, object] = {"root_ca_certificate": str(self.ca)}
@@ -54,9 +54,9 @@ class Tls:
         return settings
 
     def context(self, *, server: bool = False) -> ssl.SSLContext:
-        """Return the context of one side of a connection, which trusts the authority and shows the certificate.
+        """Return the SSL context for one side of a connection, which trusts the CA and presents the certificate.
 
-        Raises OSError, also as SSLError, unless `ca` is a certificate, ConfigError for a key that does not match.
+        Raises OSError (or SSLError) unless `ca` is a certificate, ConfigError for a key that does not match.
         """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(self.ca)
@@ -65,21 +65,21 @@ class Tls:
         return context
 
     def explain(self) -> str | None:
-        """Return the reason if a router would refuse these files, such as an expired certificate; else None.
+        """Return the reason why a router would reject these files, such as an expired certificate; else None.
 
-        Needs no network and no other package: performs a handshake in memory, with a server that trusts the authority.
+        Needs neither network nor other packages: performs a handshake in memory, with a server that trusts the CA.
         """
         try:
             own, authority = self.context(), self.context(server=True)
         except OSError:
-            return f"{self.ca} is not the certificate of an authority"
+            return f"{self.ca} is not a CA certificate"
         if self.certificate is None:
             if not authority.get_ca_certs():
-                return f"{self.ca} is not the certificate of an authority: it cannot sign others"
+                return f"{self.ca} is not a CA certificate: it cannot sign others"
             until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
             return f"{self.ca} has expired" if until < clock.utc() else None
         own.check_hostname = False
-        own.verify_mode = ssl.CERT_NONE  # of the server, which is in this process
+        own.verify_mode = ssl.CERT_NONE  # the server is this process
         authority.verify_mode = ssl.CERT_REQUIRED
         to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
         client = own.wrap_bio(to_client, to_server)
@@ -97,22 +97,22 @@ class Tls:
 
 
 def check_pem(path: str | Path, kind: str) -> None:
-    """Raise ConfigError unless a file holds PEM of this kind, such as CERTIFICATE or PRIVATE KEY."""
+    """Raise ConfigError unless a file has a PEM block of this kind, such as CERTIFICATE or PRIVATE KEY."""
     if not os.access(path, os.R_OK) or not Path(path).is_file():
         raise ConfigError("tls", f"{path} cannot be read: check that it exists and that this user may read it")
     text = Path(path).read_text(errors="replace")
     labels = _LABEL.findall(text)
     if not any(label.endswith(kind) for label in labels):
-        found = f"a {labels[0].lower()}" if labels else "no PEM" if text else "nothing"
-        hint = "check that two files are not swapped" if labels else "'nedbus pki' makes such files"
-        raise ConfigError("tls", f"{path} holds {found}, where a {kind.lower()} is needed: {hint}")
+        found = f"contains a {labels[0].lower()}" if labels else "is not PEM" if text else "is empty"
+        hint = "check whether two files are swapped" if labels else "create one with 'nedbus pki'"
+        raise ConfigError("tls", f"{path} {found}, but a {kind.lower()} is required: {hint}")
 
 
 def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except ssl.SSLError as exc:
-        reason = f"{certificate} or {key} is damaged, or the key has a password: make new ones"
+        reason = f"{certificate} or {key} is damaged, or the key has a password: create new ones"
         if exc.reason == "KEY_VALUES_MISMATCH":
-            reason = f"{key} is not the key of {certificate}: give the two that were made together"
+            reason = f"{key} is not the key of {certificate}: use the two files that were created together"
         raise ConfigError("tls", reason) from exc

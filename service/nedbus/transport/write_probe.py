@@ -1,7 +1,7 @@
-"""Probe for permission to publish vehicles, as Zenoh drops forbidden messages without an error at the sender.
+"""Probe for write permission, as Zenoh drops forbidden messages without an error at the sender.
 
-One session subscribes to keys of the vehicles that are not topics, and another one publishes on them.
-The publisher sees a match once the router has announced the subscriber; a match without a message means denied.
+One session subscribes to keys of the vehicles that are not topics, and another session publishes on them. The publisher
+has a matching subscriber once the router has announced it; a match without a received message means denied.
 """
 
 import secrets
@@ -13,13 +13,13 @@ import zenoh
 
 from nedbus_msgs import ANY
 
-from .session import Session, while_open
+from .session import Session, translate_zenoh_errors
 
 Verdict = Literal["allowed", "denied", "unknown"]
 
 _POLL: Final = 0.02  # s
-_RETRY: Final = 0.2  # s until a probe is sent again, as declarations may still be on their way
-_SPARE: Final = 16  # room in the channel beyond one probe per vehicle
+_RETRY: Final = 0.2  # s before a probe is sent again, as declarations may still be in flight
+_SPARE: Final = 16  # slots in the channel beyond one probe per vehicle
 
 
 def probe_writes(
@@ -27,9 +27,9 @@ def probe_writes(
 ) -> dict[str, Verdict]:
     """Return for each vehicle whether `writer` may publish it; "unknown" if `reader` may not subscribe.
 
-    `timeout`: seconds for the router to announce the subscriber, and again for an allowed message to arrive.
+    `timeout`: time for the router to announce the subscriber, and again for an allowed message to arrive [s].
     """
-    probe = f"@doctor/{secrets.token_hex(8)}"  # chunks with @ are not matched by a reader's `**`
+    probe = f"@doctor/{secrets.token_hex(8)}"  # `**` of readers does not match a chunk with @
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
     missing = dict(keys)
 
@@ -38,16 +38,16 @@ def probe_writes(
             missing.pop(str(sample.key_expr), None)
         return not missing
 
-    with while_open():
-        room = len(keys) + _SPARE
-        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(room))
-        # Dropped rather than undeclared: `undeclare` waits without releasing the GIL.
+    with translate_zenoh_errors():
+        capacity = len(keys) + _SPARE
+        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(capacity))
+        # Deleted rather than undeclared, as `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))
-        # Zenoh's stubs call the status a bool; it is an object, always true.
+        # Zenoh's stubs declare a bool, but it is an object, which is always true.
         matched = _wait(lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, timeout)
         for _ in range(round(timeout / _RETRY)):
             for key in missing:
-                # Ahead of the data, whose queue may be full: the probe would be dropped there.
+                # Above the priority of data, whose queue may be full and would drop the probe.
                 writer.put(
                     key,
                     b"probe",

@@ -1,7 +1,7 @@
-"""Formats of zenoh-ext: heartbeats of advanced publishers, and queries for the samples in their caches.
+"""Heartbeats and cache queries of zenoh-ext's advanced publishers.
 
-Source: the code of zenoh-ext 1.10.2; Zenoh does not document them as stable. They let advanced subscribers of any
-language recover samples from nedbus's publishers, and nedbus's from any advanced publisher.
+Source: the code of zenoh-ext 1.10.2, as Zenoh does not document the formats as stable. With them, advanced subscribers
+in any language recover samples from publishers of nedbus, and nedbus recovers samples from any advanced publisher.
 """
 
 import re
@@ -13,41 +13,41 @@ from typing import Final
 
 import zenoh
 
-from .queries import MAX_ANSWERS, ask
-from .session import RawSample, Session, entity_name, while_open
+from .queries import MAX_REPLIES, send_query
+from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
-Heartbeats = dict[tuple[str, str], int]  # newest sequence number, by key of a stream and name of its publisher
+Heartbeats = dict[tuple[str, str], int]  # newest sequence number by key and publisher
 
 _MAX_HEARTBEATS: Final = 16_384  # in the channel
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
-_MAX_KEY: Final = 1024  # characters of a heartbeat's key, as keys are cached
+_MAX_KEY: Final = 1024  # characters of a heartbeat key; longer keys are ignored, as keys are cached
 _PAYLOAD_BYTES: Final = 4
-_SPARE: Final = 64  # room for unexpected answers, of other publishers
+_SPARE: Final = 64  # slots for unexpected replies of other publishers
 
 
 def heartbeat_key(key: str, publisher: str) -> str:
-    """Return the key of a publisher's heartbeats and cache; `publisher` is its name from `entity_name`."""
+    """Return the key of heartbeats and cache of a publisher, which is named by `entity_name`."""
     return f"{key}/@adv/pub/{publisher.replace(':', '/')}/_"
 
 
 def heartbeat_payload(published: int) -> bytes:
-    """Return the heartbeat of a publisher that has published `published` messages, at least 1."""
+    """Return the heartbeat payload after `published` messages (at least 1): the last sequence number."""
     return ((published - 1) % 2**32).to_bytes(_PAYLOAD_BYTES, "little")
 
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
     """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
-    with while_open():
+    with translate_zenoh_errors():
         key = f"{key_expr}/@adv/pub/**"
         subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_MAX_HEARTBEATS))
 
     def drain() -> Heartbeats:
         newest: Heartbeats = {}
-        with suppress(zenoh.ZError):  # undeclared meanwhile
+        with suppress(zenoh.ZError):  # already undeclared
             for heartbeat in islice(iter(subscriber.handler.try_recv, None), _MAX_HEARTBEATS):
                 key, payload = str(heartbeat.key_expr), heartbeat.payload.to_bytes()
                 publisher = _parse_key(key) if len(key) <= _MAX_KEY else None
-                if publisher is not None and len(payload) == _PAYLOAD_BYTES:  # any peer may send anything
+                if publisher is not None and len(payload) == _PAYLOAD_BYTES:  # peers may send malformed heartbeats
                     newest[publisher] = int.from_bytes(payload, "little")
         return newest
 
@@ -61,27 +61,28 @@ def _parse_key(heartbeat: str) -> tuple[str, str] | None:
 
 
 class RetransmitRequest:
-    """A request for samples in the cache of one advanced publisher by sequence number; used by one thread.
+    """A retransmission request to the cache of one advanced publisher, by sequence numbers; used by one thread.
 
-    `publisher`: its name from `entity_name`. The key has no wildcards, which lets a router look it up instead of
-    matching it against the queryables of all publishers.
+    `publisher`: its name from `entity_name`. The key has no wildcards, so a router looks it up instead of matching it
+    against the queryables of all publishers.
     """
 
     def __init__(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> None:
         self._key, self._publisher, self._numbers = key, publisher, numbers
         selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
-        room = min(len(numbers), MAX_ANSWERS) + _SPARE
-        self._answers = ask(session, selector, timeout=timeout, room=room, accept_replies=zenoh.ReplyKeyExpr.ANY)
+        capacity = min(len(numbers), MAX_REPLIES) + _SPARE
+        any_key = zenoh.ReplyKeyExpr.ANY
+        self._replies = send_query(session, selector, timeout=timeout, capacity=capacity, accept_replies=any_key)
 
     @property
     def ended(self) -> bool:
-        """True once the last answer was taken, or the timeout has passed."""
-        return self._answers.ended
+        """True once all replies were taken, or the timeout has passed."""
+        return self._replies.ended
 
     def take(self) -> dict[int, RawSample]:
         """Return the samples received since the last call, by sequence number."""
         samples: dict[int, RawSample] = {}
-        for sample in filter(None, (reply.ok for reply in self._answers.take())):
+        for sample in filter(None, (reply.ok for reply in self._replies.take())):
             info = sample.source_info
             if info is None or info.source_sn not in self._numbers or str(sample.key_expr) != self._key:
                 continue

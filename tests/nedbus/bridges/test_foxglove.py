@@ -20,7 +20,7 @@ from nedbus.bridges.foxglove import orientation_of
 from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection, to_global
 from nedbus_msgs.messages.vehicle_attitude import VehicleAttitude
-from tests.flights.first_message import CURRENT, ROS2_TYPE, decode_cdr, message_definition, upgrade
+from tests.flights.local_position import CURRENT, ROS2_TYPE, decode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_port

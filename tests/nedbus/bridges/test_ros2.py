@@ -34,7 +34,7 @@ from nedbus_msgs import (
     split_ros2_topic,
     upgrade_with,
 )
-from tests.flights.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, encode, type_hash, upgrade
+from tests.flights.local_position import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, encode, type_hash, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS

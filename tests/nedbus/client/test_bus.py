@@ -25,9 +25,9 @@ import nedbus
 from nedbus import Mode
 from nedbus.timings import Timings
 from nedbus.transport import Session, alive_tokens, open_router
-from nedbus.transport.queries import Answers
+from nedbus.transport.queries import Replies
 from nedbus_msgs import DEFAULT, Address
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import Link, wait_for_demand
 from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
@@ -140,12 +140,12 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
     """
     asked: list[str] = []
 
-    def ask(session: Session, key_expr: str, timeout: float) -> Answers:
+    def record_query(session: Session, key_expr: str, timeout: float) -> Replies:
         asked.extend([key_expr] if "*" in key_expr else [])
-        return ask_router(session, key_expr, timeout)
+        return query_tokens(session, key_expr, timeout)
 
-    ask_router = alive_tokens._ask
-    monkeypatch.setattr(alive_tokens, "_ask", ask)
+    query_tokens = alive_tokens._query_tokens
+    monkeypatch.setattr(alive_tokens, "_query_tokens", record_query)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
             other.publisher("estimator_local_position", vehicle=vehicle, instance=2)
@@ -177,7 +177,7 @@ def test_vehicles_beyond_the_limit_are_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Two of three are an incomplete list, which is logged once; it completes once there is room."""
-    monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 2)
+    monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with nedbus.connect(endpoint) as other:
@@ -322,12 +322,12 @@ def test_answers_that_are_too_many_are_left_out(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The bytes kept of one query are bounded, and the number of ignored replies is logged."""
-    monkeypatch.setattr("nedbus.transport.queries.MAX_ANSWER_BYTES", 10_500)
+    monkeypatch.setattr("nedbus.transport.queries.MAX_QUERY_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
     with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
-    assert "nedbus/@service/*/status: 40 answers left out, beyond the limits of a query" in caplog.messages
+    assert "nedbus/@service/*/status: dropped 40 replies beyond the limits of a query" in caplog.messages
 
 
 def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) -> None:

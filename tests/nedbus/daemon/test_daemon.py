@@ -1,4 +1,4 @@
-"""The service as its users run it: in a process of its own, with subscribers in others."""
+"""The service in a subprocess, with subscribers in other processes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from nedbus.events import Account
 from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition
-from tests.flights.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
+from tests.flights.local_position import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS, UlogWriter, write_log
@@ -33,36 +33,36 @@ from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
 
 Serve = Callable[..., tuple[Process, nedbus.Bus]]
-until_connected = partial(nedbus.connect, timeout=DEADLINE)
+connect = partial(nedbus.connect, timeout=DEADLINE)
 
 
 @pytest.fixture
 def serve(run_nedbus: Start) -> Iterator[Serve]:
-    """Start services with these sources and options, each with a router of its own, and connect to it."""
+    """Start services with given arguments, each with its own router, and connect to them."""
     with ExitStack() as closing:
 
         def start_service(*arguments: str, **options: str) -> tuple[Process, nedbus.Bus]:
             endpoint = free_endpoint()
             service = run_nedbus("serve", "-l", endpoint, *arguments, **options)
             wait_for(lambda: "router on" in service.err, what="the router")
-            return service, closing.enter_context(until_connected(endpoint))
+            return service, closing.enter_context(connect(endpoint))
 
         yield start_service
 
 
 def source_of(bus: nedbus.Bus, number: int = 0) -> nedbus.health.SourceStatus:
-    """Return what the service says of a source; an empty status while it does not answer."""
+    """Return the status of a source; an empty status if the service does not reply."""
     sources = [status.sources for status in bus.services()]
     return sources[0][number] if sources and sources[0] else nedbus.health.SourceStatus()
 
 
 def has_state(bus: nedbus.Bus, state: str, number: int = 0) -> Callable[[], bool]:
-    """Return the condition that a source has this state."""
+    """Return a condition that is true while a source has this state."""
     return lambda: source_of(bus, number).state == state
 
 
 def expected_rows(path: Path) -> dict[str, list[list[str]]]:
-    """Return what a log holds, by address, read here by the source itself (test_ulog.py proves that against pyulog)."""
+    """Return the messages of a log by address, read by the source (which test_ulog.py compares with pyulog)."""
     found: dict[str, list[list[str]]] = {}
     for each in open_replay(f"ulog:{path}?topics=VehicleLocalPosition").messages:
         found.setdefault(str(each.address), []).append(row_of(upgrade(each.fields)))
@@ -70,20 +70,17 @@ def expected_rows(path: Path) -> dict[str, list[list[str]]]:
 
 
 def row_of(message: VehicleLocalPosition) -> list[str]:
-    """Return the values of a message, so that two that are not a number are the same."""
+    """Return the values of a message as texts, as NaN does not equal NaN."""
     return [repr(value) for value in message.__dict__.values()]
 
 
 def real_logs() -> list[Path]:
-    return sorted(LOGS.glob("*.ulg")) or pytest.skip(f"the real logs are not here: {LOGS}")
+    return sorted(LOGS.glob("*.ulg")) or pytest.skip(f"no real logs in {LOGS}")
 
 
 @pytest.mark.logs
-def test_plain_zenoh_and_msgpack_see_every_sample(run_nedbus: Start, endpoint: str) -> None:
-    """A reader that knows nothing of nedbus, as it could be in any language, gets each message as a 54-element array.
-
-    It has zenoh, msgpack, and the documented keys.
-    """
+def test_plain_zenoh_reader_receives_every_message(run_nedbus: Start, endpoint: str) -> None:
+    """A reader in any language, with Zenoh, msgpack and the documented keys, receives each message as an array."""
     path = next(log for log in real_logs() if "1.13" in log.name)
     config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
     with zenoh.open(config) as session:
@@ -105,44 +102,44 @@ def test_plain_zenoh_and_msgpack_see_every_sample(run_nedbus: Start, endpoint: s
 
 
 def take(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[zenoh.Sample]:
-    """Wait until this number of samples has arrived, and return them."""
+    """Wait for a number of samples, and return them."""
     samples: list[zenoh.Sample] = []
 
-    def are_there() -> bool:
+    def are_received() -> bool:
         while (sample := handler.try_recv()) is not None:
             samples.append(sample)
         return len(samples) >= count
 
-    wait_for(are_there, what=f"{count} samples")
+    wait_for(are_received, what=f"{count} samples")
     return samples
 
 
 def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
-    """A source's message never gets the time of this host, as a script's does."""
+    """A message of a source never gets the time of this host as timestamp, unlike a message of a script."""
     output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, Account())
     output.publish_live(SourceMessage(0.0, Address("1", VLP), {"x": 1.0}))
     assert (output.published, output.rejected) == (0, 1)
 
 
-def test_replay_at_full_speed_loses_nothing_to_a_slow_reader(tmp_path: Path, serve: Serve) -> None:
-    """speed=max waits for whoever reads, and the service stays until a slow reader has all of it."""
+def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serve: Serve) -> None:
+    """A replay at speed=max waits for its readers, and the service exits only after a slow reader has everything."""
     total = 12_000
     path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
     service, bus = serve("--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
     with bus.subscribe(mode="every") as subscription:
-        stayed = 0
+        last_while_running = 0
         for number in range(total):
             if number % 100 == 0:
-                time.sleep(0.01)  # what makes it slow
-                stayed = number if service.popen.poll() is None else stayed
+                time.sleep(0.01)  # makes the reader slow
+                last_while_running = number if service.popen.poll() is None else last_while_running
             sample = subscription.receive(DEADLINE)
             assert (sample.message.x, sample.lost) == (number, 0)
-    assert stayed > total - 10_000, "only what the reader's process holds may be unread when the service ends"
+    assert last_while_running > total - 10_000, "only messages in the reader's process may be unread at exit"
     assert service.wait() == 0
 
 
-def test_replay_keeps_its_order_and_speed(tmp_path: Path, serve: Serve) -> None:
-    """At speed=10 a flight of 4 s takes about 0.4 s, never less; wait=1 starts it when a subscriber is there."""
+def test_replay_keeps_order_and_speed(tmp_path: Path, serve: Serve) -> None:
+    """At speed=10 a flight of 4 s takes about 0.4 s, never less; with wait=1 it starts with the first subscriber."""
     path = write_log(tmp_path / "a.ulg", range(0, 4_000_001, 100_000))
     service, bus = serve("--until-done", "-s", f"ulog:{path}?speed=10&wait=1")
     wait_for(has_state(bus, "waiting"), what="the service")
@@ -155,8 +152,8 @@ def test_replay_keeps_its_order_and_speed(tmp_path: Path, serve: Serve) -> None:
 
 
 @pytest.mark.parametrize("locale", ["C.UTF-8", "C"])
-def test_any_file_name_is_served(tmp_path: Path, serve: Serve, locale: str) -> None:
-    """With ?, % or bytes that are no UTF-8 in it, and in the C locale: served, and named in the status."""
+def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: str) -> None:
+    """File names with ?, % or invalid UTF-8 are replayed and appear in the status, also in the C locale."""
     written = {
         "what%3F.ulg?": b"what?.ulg",
         "what?.ulg?": b"what?.ulg",
@@ -177,8 +174,8 @@ def test_any_file_name_is_served(tmp_path: Path, serve: Serve, locale: str) -> N
         assert status.source.startswith(f"ulog:{tmp_path}/")
 
 
-def test_ended_replay_starts_again_or_keeps_its_last_value(tmp_path: Path, serve: Serve) -> None:
-    """loop=1 flies the log for ever; a service that goes on after a replay still answers with its last message."""
+def test_ended_replay_loops_or_retains_its_last_message(tmp_path: Path, serve: Serve) -> None:
+    """With loop=1 a replay repeats; otherwise the service still replies with the last message after its end."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 10_000))
     _, bus = serve("-s", f"ulog:{path}?loop=1&wait=1", "-s", f"ulog:{path}?vehicle=2&speed=max")
     wait_for(has_state(bus, "done", 1), what="the end of the replay")
@@ -191,7 +188,7 @@ def test_ended_replay_starts_again_or_keeps_its_last_value(tmp_path: Path, serve
 def test_invalid_message_is_rejected_counted_and_reported(
     tmp_path: Path, run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus
 ) -> None:
-    """An invalid message is never published: it is on the rejected key with its reason, and counted in status."""
+    """An invalid message is not published, but reported with its reason on the rejection key, counted and logged."""
     writer = UlogWriter()
     writer.define([VLP])
     for number in range(10):
@@ -210,20 +207,20 @@ def test_invalid_message_is_rejected_counted_and_reported(
     assert "1/vehicle_local_position rejected: z: must be finite" in service.err
 
 
-def test_failing_source_stops_nobody(tmp_path: Path, serve: Serve) -> None:
-    """One source that fails is retried with back-off and shown in status; once it can be read, it is."""
+def test_failing_source_does_not_affect_others(tmp_path: Path, serve: Serve) -> None:
+    """A failed source is retried with backoff, with its error in the status, and published once it is readable."""
     missing = tmp_path / "later.ulg"
     service, bus = serve("-s", f"ulog:{missing}?vehicle=late", "-s", "sim:")
-    wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the good source")
+    wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the other source")
     wait_for(has_state(bus, "retrying"), what="a retry")
     assert "no such file" in str(source_of(bus).error)
     write_log(missing, [0, 1000])
-    wait_for(lambda: bus.latest(VLP, vehicle="late"), what="the source that came later")
+    wait_for(lambda: bus.latest(VLP, vehicle="late"), what="the recovered source")
     assert service.popen.poll() is None
 
 
-def test_until_done_tells_failure(tmp_path: Path, run_nedbus: Start) -> None:
-    """With --until-done a source that cannot be read makes exit code 1, after the other finite ones have ended."""
+def test_until_done_exits_with_1_after_a_failure(tmp_path: Path, run_nedbus: Start) -> None:
+    """With --until-done an unreadable source causes exit code 1, after all other finite sources have ended."""
     good = f"ulog:{write_log(tmp_path / 'a.ulg', [0, 1000])}?speed=max"
     sources = ("-s", "sim:?vehicle=2", "-s", "ulog:/nowhere.ulg", "-s", good)
     service = run_nedbus("serve", "-l", free_endpoint(), "--until-done", *sources)
@@ -233,52 +230,52 @@ def test_until_done_tells_failure(tmp_path: Path, run_nedbus: Start) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_signal_ends_the_service(tmp_path: Path, serve: Serve, number: signal.Signals, code: int) -> None:
-    """SIGTERM and SIGINT end the service, whatever its sources do, and nothing has to be forced."""
+def test_signal_stops_the_service(tmp_path: Path, serve: Serve, number: signal.Signals, code: int) -> None:
+    """SIGTERM and SIGINT stop the service in any state of its sources, without a traceback or lost messages."""
     path = write_log(tmp_path / "a.ulg", range(0, 10_000_000, 10_000))
     sources = ("sim:", f"ulog:{path}?vehicle=2", f"ulog:{path}?vehicle=3&speed=max&loop=1", "ulog:/nowhere.ulg")
     service, bus = serve(*(f"--source={source}" for source in sources), coverage=False)
-    for place, state in enumerate(("running", "running", "running", "retrying")):
-        wait_for(has_state(bus, state, place), what=sources[place])
+    for index, state in enumerate(("running", "running", "running", "retrying")):
+        wait_for(has_state(bus, state, index), what=sources[index])
     service.signal(number)
     assert service.wait() == code
     assert "Traceback" not in service.err
     assert "lost" not in service.err
 
 
-def test_signal_ends_a_replay_that_a_stuck_reader_holds(tmp_path: Path, serve: Serve) -> None:
-    """A reader that never reads holds a replay at full speed, for up to ten minutes, but not the end of the service."""
+def test_signal_stops_a_replay_blocked_by_a_stuck_reader(tmp_path: Path, serve: Serve) -> None:
+    """A stuck reader blocks a replay at full speed for up to ten minutes, but not the exit of the service."""
     path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000))
     service, bus = serve("-s", f"ulog:{path}?speed=max&loop=1&wait=1")
     with bus.subscribe(VLP, mode="every"):
         published: list[object] = [0]
 
-        def stands() -> bool:
+        def is_blocked() -> bool:
             published.append(source_of(bus).published)
             return published[-1] == published[-2] != 0
 
-        wait_for(stands, what="the replay to be held")
+        wait_for(is_blocked, what="the replay to block")
         service.signal(signal.SIGTERM)
         service.wait()
 
 
-def test_service_as_a_client_waits_for_its_router_and_comes_back(run_nedbus: Start) -> None:
-    """With --connect the service starts before its router, and survives the router's death; a signal ends each wait."""
+def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -> None:
+    """With --connect a service waits for its router, reconnects after a router crash, and stops on a signal."""
     endpoint = free_endpoint()
-    ended, service = (run_nedbus("serve", "--connect", endpoint, "-s", "sim:") for _ in range(2))
-    wait_for(lambda: "client of" in ended.err, what="the service to begin to wait")
-    ended.signal(signal.SIGTERM)
-    assert ended.wait() == 0
-    wait_for(lambda: "still trying" in service.err, what="the service to say that it waits")
+    interrupted, service = (run_nedbus("serve", "--connect", endpoint, "-s", "sim:") for _ in range(2))
+    wait_for(lambda: "client of" in interrupted.err, what="the service to wait")
+    interrupted.signal(signal.SIGTERM)
+    assert interrupted.wait() == 0
+    wait_for(lambda: "still trying" in service.err, what="the warning")
     router = run_nedbus("router", "--listen", endpoint)
-    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+    with connect(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
         samples = [subscription.receive(DEADLINE)]
         router.kill()
         wait_for(lambda: not bus.connected, what="the link to break")
         run_nedbus("router", "--listen", endpoint)
-        wait_for(lambda: bus.connected, what="the link to come back")
-        back = time.time_ns()
-        while (samples[-1].sent or 0) < back:
+        wait_for(lambda: bus.connected, what="the link to recover")
+        recovered = time.time_ns()
+        while (samples[-1].sent or 0) < recovered:
             samples.append(subscription.receive(DEADLINE))
         first = samples[0].message.timestamp
         assert [each.message.timestamp for each in samples] == [first + 10_000 * step for step in range(len(samples))]
@@ -287,55 +284,55 @@ def test_service_as_a_client_waits_for_its_router_and_comes_back(run_nedbus: Sta
     assert service.wait() == 0
 
 
-def test_service_says_what_made_it_a_client(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """NEDBUS_CONNECT is set for scripts: a service that follows it says so, and how to be a router all the same."""
+def test_client_service_logs_the_origin_of_connect(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """A service that is a client because of NEDBUS_CONNECT or a file logs that, and how to run a router instead."""
     hint = "use --listen to run a router instead"
     file, here = tmp_path / "some.toml", free_endpoint()
     file.write_text(f'connect = "{endpoint}"')
     variable = {"NEDBUS_CONNECT": endpoint}
     services = {
-        said: run_nedbus("serve", "-s", "ulog:/gone.ulg", *flags, **environment)
-        for flags, environment, said in (
+        text: run_nedbus("serve", "-s", "ulog:/gone.ulg", *flags, **environment)
+        for flags, environment, text in (
             ((), variable, f"client of {endpoint}, set by NEDBUS_CONNECT; {hint}"),
             (("--config", str(file)), {}, f"client of {endpoint}, set by {file}; {hint}"),
             (("--connect", endpoint), {}, f"client of {endpoint}\n"),
             (("--listen", here), variable, f"router on {here}, joining {endpoint}"),
         )
     }
-    wait_for(lambda: all(said in service.err for said, service in services.items()), what=f"all of {[*services]}")
+    wait_for(lambda: all(text in service.err for text, service in services.items()), what=f"all of {[*services]}")
 
 
-def test_links_to_other_routers_are_said(caplog: pytest.LogCaptureFixture) -> None:
-    """A router that joins another says when the link is up, that it does not come up, and that it is lost."""
+def test_uplink_state_of_a_router_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    """A router logs when its link to another router does not come up, is up, is lost, and recovers."""
     far, now = free_endpoint(), 0.0
     caplog.set_level("INFO", "nedbus")
-    said = [
-        f"no link to {far}: still trying", f"the link to {far} is up, after 3 s",
-        f"the link to {far} is lost: still trying", f"the link to {far} is up, after 12 s",
+    expected = [
+        f"no link to {far}: still trying", f"the link to {far} is up after 3 s",
+        f"the link to {far} is lost: still trying", f"the link to {far} is up after 12 s",
     ]  # fmt: skip
     session = open_router(listen=(free_endpoint(),), connect=(far,))
     uplinks = Uplinks(session, (far,), now=lambda: now)
 
-    def has_said(count: int) -> bool:
+    def has_logged(count: int) -> bool:
         uplinks.check()
-        return caplog.messages == said[:count]
+        return caplog.messages == expected[:count]
 
-    assert has_said(0)
+    assert has_logged(0)
     now = 3.0
-    assert has_said(1)
+    assert has_logged(1)
     other = open_router(listen=(far,))
-    wait_for(lambda: has_said(2), what="the link")
+    wait_for(lambda: has_logged(2), what="the link")
     other.close()
-    wait_for(lambda: has_said(3), what="the loss")
+    wait_for(lambda: has_logged(3), what="the loss")
     now += 12.0
     other = open_router(listen=(far,))
-    wait_for(lambda: has_said(4), what="the link to come back")
+    wait_for(lambda: has_logged(4), what="the link to recover")
     other.close()
     session.close()
 
 
-def test_link_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    """A client logs once that its link is lost, and that it is up again, with its endpoints and the duration."""
+def test_uplink_state_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    """A client logs once that its link is lost, and that it is up again, with endpoints and duration."""
     here, other, now = free_endpoint(), free_endpoint(), 0.0
     caplog.set_level("INFO", "nedbus")
     router = open_router(listen=(here,))
@@ -351,12 +348,12 @@ def test_link_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) -> None:
         wait_for(lambda: has_logged("lost: still trying"), what="the loss")
         now = 12.0
         router = open_router(listen=(here,))
-        wait_for(lambda: has_logged("lost: still trying", "up, after 12 s"), what="the link to come back")
+        wait_for(lambda: has_logged("lost: still trying", "up after 12 s"), what="the link to recover")
     router.close()
 
 
-def test_dead_router_on_a_shared_port_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    """Of two routers on one port number, the one that does not answer is reported, also by its host name."""
+def test_unreachable_router_on_a_shared_port_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    """Of two routers on the same port number, the one that does not answer is reported, also with host names."""
     port, now = free_endpoint().rpartition(":")[2], 0.0
     live, dead, named = (f"tcp/{host}:{port}" for host in ("127.0.0.1", "127.0.0.2", "localhost"))
     router = open_router(listen=(live,))
@@ -376,13 +373,13 @@ def test_dead_router_on_a_shared_port_is_named(caplog: pytest.LogCaptureFixture)
     router.close()
 
 
-def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
-    """The error names the endpoint, the reason, and both ways out."""
+def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -> None:
+    """The error has the endpoint, the reason and two remedies."""
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:")
     assert service.wait() == 1
-    ways = "choose another endpoint with --listen, or join the router that runs there with --connect"
+    remedy = "choose another endpoint with --listen, or join the router that runs there with --connect"
     reason = f"nedbus: cannot listen on {endpoint} (address already in use)"
-    assert service.err.strip().splitlines()[-1] == f"{reason}: {ways}"
+    assert service.err.strip().splitlines()[-1] == f"{reason}: {remedy}"
 
 
 @pytest.mark.parametrize(
@@ -411,67 +408,56 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
         ("-s sim: --prefix a/*", "prefix: prefix 'a/*' is not valid"),
     ],
 )
-def test_wrong_flag_is_a_usage_error(arguments: str, text: str) -> None:
-    """Exit code 2, and one line that says what to write instead; no option ends in a traceback.
-
-    Opening a pipe would wait for a writer, for ever and without a word.
-    """
-    os.mkfifo("pipe")
+def test_invalid_option_is_a_usage_error(arguments: str, text: str) -> None:
+    """An invalid option exits with 2 and one line with the remedy, without a traceback."""
+    os.mkfifo("pipe")  # opening it would block forever
     service = run_command("serve", *arguments.split())
     assert service.exit_code == 2
     assert text in service.err
     assert len(service.err.splitlines()) == 1
 
 
-def test_service_reads_its_file(tmp_path: Path, run_nedbus: Start) -> None:
-    """Sources, endpoint and prefix from nedbus.toml; a flag wins over the environment, which wins over the file."""
+def test_service_reads_its_settings_file(tmp_path: Path, run_nedbus: Start) -> None:
+    """Sources, endpoint and prefix come from the file; flags override the environment, which overrides the file."""
     endpoint = free_endpoint()
     file = tmp_path / "nedbus.toml"
     file.write_text('source = ["sim:"]\nlisten = ["tcp/127.0.0.1:1"]\nprefix = "fleet"\nvehicle = 7\n')
     run_nedbus("serve", "--config", str(file), "--vehicle", "9", NEDBUS_LISTEN=endpoint, NEDBUS_VEHICLE="8")
-    with until_connected(endpoint, prefix="fleet") as bus:
+    with connect(endpoint, prefix="fleet") as bus:
         wait_for(lambda: list(bus.vehicles()) == ["9"], what="vehicle 9")
 
 
 @pytest.mark.parametrize("command", ["serve -s sim: --router-config", "router"])
-def test_router_file_is_that_of_zenohd(tmp_path: Path, run_nedbus: Start, command: str) -> None:
-    """A router takes its endpoints from a file that zenohd reads too, a comment in it and all.
-
-    It listens and joins where flags say, as zenohd does, if there are any: one file serves several of a network.
-    """
+def test_router_accepts_a_zenohd_file(tmp_path: Path, run_nedbus: Start, command: str) -> None:
+    """A router reads a configuration file of zenohd, and its flags override the endpoints of the file, as in zenohd."""
     near, far = free_endpoint(), free_endpoint()
     file = tmp_path / "router.json5"
     file.write_text(f"{{ mode: 'router', listen: {{ endpoints: ['{near}'] }}, // a comment\n}}")
     run_nedbus(*command.split(), str(file))
-    with until_connected(near) as writer:
+    with connect(near) as writer:
         router = run_nedbus(*command.replace("sim:", "sim:?vehicle=2").split(), str(file), "-l", far, "-c", near)
-        with until_connected(far) as reader:
+        with connect(far) as reader:
             writer.publisher(VLP, vehicle="7").publish(message(1))
             vehicles = {"7", *(["1", "2"] if "sim:" in command else [])}
-            wait_for(lambda: {sample.vehicle for sample in reader.latest()} == vehicles, what="all behind the second")
-            wait_for(lambda: {sample.vehicle for sample in writer.latest()} == vehicles, what="all behind the first")
+            wait_for(lambda: {sample.vehicle for sample in reader.latest()} == vehicles, what="second router")
+            wait_for(lambda: {sample.vehicle for sample in writer.latest()} == vehicles, what="first router")
     wait_for(lambda: f"joined {near}" in router.err, what="the link")
 
 
-def ask(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
-    """Return what is answered, as any Zenoh client can ask."""
+def query_json(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
+    """Return the JSON replies to a plain Zenoh query."""
     return [json.loads(reply.ok.payload.to_bytes()) for reply in zenoh_session.get(key) if reply.ok]
 
 
-def test_status_schema_and_last_values_are_on_the_network(
-    run_nedbus: Start, zenoh_session: Session, endpoint: str
-) -> None:
-    """Any Zenoh client can ask for the status - who, since when, where, and each source - and what the fields are.
-
-    A plain get on a key or a wildcard is answered with the last payload of each key, stamped.
-    """
+def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, zenoh_session: Session, endpoint: str) -> None:
+    """A plain Zenoh client can query service status, schemas, and the last message of each key, with timestamp."""
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?topics=VehicleLocalPosition")
     status_key = "nedbus/@service/*/status"
     wait_for(
-        lambda: [s for each in ask(zenoh_session, status_key) for s in each["sources"] if s["published"]],
+        lambda: [s for each in query_json(zenoh_session, status_key) for s in each["sources"] if s["published"]],
         what="messages",
     )
-    [status] = ask(zenoh_session, status_key)
+    [status] = query_json(zenoh_session, status_key)
     assert {"service", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"} == set(status)
     assert (status["role"], status["endpoints"]) == ("client", [endpoint])
     [source] = status["sources"]
@@ -488,11 +474,11 @@ def test_status_schema_and_last_values_are_on_the_network(
         *(f"estimator_local_position/{n}" for n in (0, 1)),
     )
     assert source["addresses"] == [f"1/{topic}" for topic in topics]
-    layouts = ask(zenoh_session, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
+    layouts = query_json(zenoh_session, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
     [current] = [layout for layout in layouts if layout["wire"] == 1]
     assert [field["name"] for field in current["fields"]] == list(VehicleLocalPosition.model_fields)
 
-    wait_for(lambda: len(list(zenoh_session.get("nedbus/**"))) == 5, what="five answers")
+    wait_for(lambda: len(list(zenoh_session.get("nedbus/**"))) == 5, what="five replies")
     [reply] = zenoh_session.get("nedbus/1/estimator_local_position/1")
     assert reply.ok is not None
     assert str(reply.ok.encoding) == "application/msgpack;px4_msgs/VehicleLocalPosition;source=sim"
@@ -501,8 +487,8 @@ def test_status_schema_and_last_values_are_on_the_network(
     assert str(reply.ok.key_expr) == "nedbus/1/estimator_local_position/1"
 
 
-def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """Two services of one vehicle mix two flights: both log it once, and every command reports it while it lasts."""
+def test_duplicate_vehicle_is_logged_and_reported(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """If two services publish one vehicle, both log it once, and every command reports it until one of them stops."""
     none = run_command("health", "-c", endpoint)
     assert none.exit_code == 1
     assert "no service of" in none.err
@@ -525,10 +511,10 @@ def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: s
     assert "duplicate: 2 publishers" in listed
     wait_for(lambda: [each.vehicles["1"].kinds[0] for each in bus.accounts()] == ["duplicate"] * 2, what="accounts")
     explained = run_command("why", NEDBUS_CONNECT=endpoint).out
-    assert explained.startswith(f"1: several publishers of {VLP}"), "and once, though both services report it"
+    assert explained.startswith(f"1: several publishers of {VLP}"), "once, though both services report it"
     assert "\n1: " not in explained
     assert "2 publishers of this address" in run_command("doctor", NEDBUS_CONNECT=endpoint).out
     second.signal(signal.SIGTERM)
-    wait_for(lambda: bus.publishers()[Address("1", VLP)] == 1, what="the second one to end")
+    wait_for(lambda: bus.publishers()[Address("1", VLP)] == 1, what="the second service to stop")
     wait_for(lambda: run_command("health", NEDBUS_CONNECT=endpoint).exit_code == 0, what="health")
     assert [service.err.count(warning) for service in (first, second)] == [1, 1]

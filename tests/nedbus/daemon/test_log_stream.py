@@ -1,6 +1,6 @@
-"""A service that receives PX4's ULog stream: what users of another process see of it, in full and when it is refused.
+"""The ULog stream of PX4 in a service: messages, status, metrics and the saved log, and a refused stream.
 
-The peer plays a recording of a real PX4 (SITL, main of 2026-05-14).
+The simulated PX4 replays a recording of a real one (SITL, main of 2026-05-14).
 """
 
 from __future__ import annotations
@@ -26,20 +26,18 @@ from tests.waits import DEADLINE, wait_for
 
 
 def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
-    """Return the status of the only stream; None before there is one."""
+    """Return the status of the only log stream; None before it exists."""
     return next((log for each in bus.services() for source in each.sources for log in source.log_streams), None)
 
 
 @pytest.mark.process
-def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
-    """The stream arrives in full at a subscriber; `info`, /metrics and the saved log have the same totals."""
+def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path: Path) -> None:
+    """A subscriber receives the complete stream; `info`, /metrics and the saved log agree on the totals."""
     link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), HttpClient(free_port())
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
-    patient = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # of a busy machine
-    service = start_with_timings(
-        start, patient, "serve", "--listen", endpoint, "--http", pages.where, "--source", source
-    )
+    slow = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # for a busy host
+    service = start_with_timings(start, slow, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,
@@ -52,7 +50,7 @@ def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
         wait_for(lambda: (log := log_stream(bus)) and log.received == total, what=f"the stream: {service.err}")
         status: Any = log_stream(bus)
         assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0)
-        assert status.header_time > 0.25  # a round trip of 4 ms for each of 125 messages
+        assert status.header_time > 0.25  # one round trip of 4 ms for each of 125 messages
         info = run_command("info", "--connect", endpoint)
         assert "ULog stream of vehicle 1: streaming" in info.out, info.out
         wait_for(lambda: pages.values("nedbus_log_stream_bytes_total", vehicle="1") == [total], what="the metrics")
@@ -62,7 +60,7 @@ def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
         assert sample.missing == frozenset()
         assert sample.message.delta_heading is not None
         (saved,) = tmp_path.glob("1_*.ulg")
-        why = run_command("why", str(saved))  # while the file grows
+        why = run_command("why", str(saved))  # while the file is being written
         assert why.exit_code in (0, 1), why.err
         assert "damaged" not in why.err
         service.signal(signal.SIGTERM)
@@ -73,8 +71,8 @@ def test_stream_in_another_process(start: Start, tmp_path: Path) -> None:
 
 
 @pytest.mark.process
-def test_refused_stream_is_explained(run_nedbus: Start) -> None:
-    """Another client has the stream: info, doctor and the log of the service say so, and positions are converted."""
+def test_refused_log_stream_is_explained(run_nedbus: Start) -> None:
+    """If another client has the stream, `info`, doctor and the log report it, and MAVLink positions are converted."""
     endpoint, port = free_endpoint(), free_port()
     service = run_nedbus("serve", "--listen", endpoint, "--source", f"mavlink:udpin:127.0.0.1:{port}?log=1")
     with (

@@ -1,4 +1,4 @@
-"""Publishing topics without a rate of a live source, with a fake clock."""
+"""Output of a live source: topics without a rate, and the limit of addresses; with a fake clock."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ HOME, POSITION, OTHER = Address("1", "home_position"), Address("1", VLP), Addres
 ATTITUDE = Address("1", "vehicle_attitude")
 
 
-class Sky:
-    """A live source, and the address and timestamp of each message that it published."""
+class FakeOutput:
+    """The output of a live source without a session; records address and timestamp of each published message."""
 
     def __init__(self) -> None:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
@@ -26,8 +26,8 @@ class Sky:
             "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, Account()
         )
 
-    def hear(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:
-        """Advance the clock, receive a message on each of these addresses, and check for silent ones."""
+    def receive(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:
+        """Advance the clock, receive a message on each address, and expire stale addresses."""
         self.now += seconds
         for address in addresses:
             fields = {"timestamp": round(self.now * 1e6) if timestamp is None else timestamp}
@@ -46,68 +46,68 @@ class Sky:
         )
 
 
-def test_home_stays_while_its_vehicle_is_heard() -> None:
-    """A topic sent on events only stays published as long as other messages of its vehicle arrive."""
-    sky = Sky()
-    sky.hear(1, HOME, POSITION, OTHER)
+def test_home_position_stays_published_while_its_vehicle_sends() -> None:
+    """A topic without a rate stays published while other messages of its vehicle arrive."""
+    fake = FakeOutput()
+    fake.receive(1, HOME, POSITION, OTHER)
     for _ in range(10):
-        sky.hear(1, POSITION, OTHER)
-    assert set(sky.output.addresses) == {HOME, POSITION, OTHER}
+        fake.receive(1, POSITION, OTHER)
+    assert set(fake.output.addresses) == {HOME, POSITION, OTHER}
     for _ in range(4):
-        sky.hear(1, OTHER)
-    assert (sky.output.addresses, set(sky.output.stale)) == ([OTHER], {HOME, POSITION})
+        fake.receive(1, OTHER)
+    assert (fake.output.addresses, set(fake.output.stale)) == ([OTHER], {HOME, POSITION})
 
 
-def test_home_is_back_with_its_vehicle() -> None:
-    """It is published again after a link outage, as the vehicle would not repeat it, but not after a reboot."""
-    sky = Sky()
-    sky.hear(1, HOME, POSITION)
-    sky.hear(4)
-    assert sky.output.addresses == []
-    sky.hear(1, OTHER)
-    assert sky.output.addresses == [OTHER]
-    sky.hear(1, POSITION)
-    assert set(sky.output.addresses) == {HOME, POSITION, OTHER}
-    assert sky.published[-2:] == [(HOME, 1_000_000), (POSITION, 7_000_000)]
-    sky.hear(4)
-    sky.hear(1, POSITION, timestamp=5)
-    assert sky.output.addresses == [POSITION]
-    assert sky.published[-1] == (POSITION, 5)
+def test_home_position_is_republished_after_an_outage() -> None:
+    """The last home position is republished after a link outage, as PX4 does not repeat it, but not after a reboot."""
+    fake = FakeOutput()
+    fake.receive(1, HOME, POSITION)
+    fake.receive(4)
+    assert fake.output.addresses == []
+    fake.receive(1, OTHER)
+    assert fake.output.addresses == [OTHER]
+    fake.receive(1, POSITION)
+    assert set(fake.output.addresses) == {HOME, POSITION, OTHER}
+    assert fake.published[-2:] == [(HOME, 1_000_000), (POSITION, 7_000_000)]
+    fake.receive(4)
+    fake.receive(1, POSITION, timestamp=5)
+    assert fake.output.addresses == [POSITION]
+    assert fake.published[-1] == (POSITION, 5)
 
 
-def test_home_of_before_a_reboot_is_never_back() -> None:
-    """A home position from before a reboot is not published again, even if it was sent seconds after that boot."""
-    sky = Sky()
-    sky.hear(2, HOME, POSITION)
+def test_home_position_is_not_republished_after_a_reboot() -> None:
+    """A home position from before a reboot is not republished, even if its timestamp is lower than the new uptime."""
+    fake = FakeOutput()
+    fake.receive(2, HOME, POSITION)
     for _ in range(30):
-        sky.hear(1, POSITION)
-    sky.hear(4)
-    sky.hear(1, POSITION, timestamp=12_000_000)
-    sky.hear(0, ATTITUDE, timestamp=12_100_000)
-    assert set(sky.output.addresses) == {POSITION, ATTITUDE}
-    assert [address for address, _ in sky.published].count(HOME) == 1
+        fake.receive(1, POSITION)
+    fake.receive(4)
+    fake.receive(1, POSITION, timestamp=12_000_000)
+    fake.receive(0, ATTITUDE, timestamp=12_100_000)
+    assert set(fake.output.addresses) == {POSITION, ATTITUDE}
+    assert [address for address, _ in fake.published].count(HOME) == 1
 
 
-def test_addresses_that_come_one_after_the_other_are_published() -> None:
-    """Of more addresses than a source may have, the one that is stale longest makes room for the next."""
-    sky = Sky()
+def test_stalest_address_is_replaced_at_the_limit() -> None:
+    """At the limit of addresses, a new address replaces the one that has been stale longest."""
+    fake = FakeOutput()
     for number in range(1500):
-        sky.hear(1, Address(f"v{number}", VLP))
-    assert Address("v1499", VLP) in sky.output.addresses
-    assert 990 <= len(sky.output.addresses + sky.output.stale) <= 1000
-    assert not sky.output.rejected
+        fake.receive(1, Address(f"v{number}", VLP))
+    assert Address("v1499", VLP) in fake.output.addresses
+    assert 990 <= len(fake.output.addresses + fake.output.stale) <= 1000
+    assert not fake.output.rejected
 
 
-def test_address_beyond_the_limit_is_refused_until_another_is_stale() -> None:
-    """Of a thousand addresses that are published none makes room; what is left out is counted, and said once."""
-    sky = Sky()
+def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
+    """While 1,000 addresses are published, messages of further ones are rejected, counted, and logged once."""
+    fake = FakeOutput()
     present = [Address(f"v{number}", VLP) for number in range(1000)]
-    sky.hear(1, *present, OTHER)
-    sky.hear(1, *present, OTHER)
-    assert OTHER not in sky.output.addresses
-    assert sky.output.rejections == {"too many addresses": 2}
-    assert sky.output.warnings == (f"vehicles: more than 1000 addresses: {OTHER} is ignored",)
-    sky.hear(4, *present[1:])
-    sky.hear(1, OTHER)
-    assert OTHER in sky.output.addresses
-    assert present[0] not in sky.output.stale
+    fake.receive(1, *present, OTHER)
+    fake.receive(1, *present, OTHER)
+    assert OTHER not in fake.output.addresses
+    assert fake.output.rejections == {"too many addresses": 2}
+    assert fake.output.warnings == (f"vehicles: more than 1000 addresses: {OTHER} is ignored",)
+    fake.receive(4, *present[1:])
+    fake.receive(1, OTHER)
+    assert OTHER in fake.output.addresses
+    assert present[0] not in fake.output.stale

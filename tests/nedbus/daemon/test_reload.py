@@ -1,4 +1,4 @@
-"""SIGHUP: a running service reads its settings again, and what is unchanged is not disturbed."""
+"""Reload on SIGHUP: the service applies changed settings, and does not interrupt unchanged sources."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
 
 
-def write(file: Path, vehicles: Iterable[object], *, more: str = "") -> None:
-    """Write a settings file with a simulated vehicle for each name."""
+def write_settings(file: Path, vehicles: Iterable[object], *, header: str = "") -> None:
+    """Write a settings file with one simulated vehicle per name."""
     sources = [f'[[source]]\nkind = "sim"\nvehicle = "{vehicle}"\n' for vehicle in vehicles]
-    file.write_text(more + "\n".join(sources))
+    file.write_text(header + "\n".join(sources))
 
 
-def reload(service: Process, answers: int) -> str:
-    """Send SIGHUP, wait until the service has said so often what came of it, and return its last words."""
+def reload(service: Process, count: int) -> str:
+    """Send SIGHUP, wait until the service has logged `count` results, and return the last one."""
     service.popen.send_signal(signal.SIGHUP)
-    wait_for(lambda: service.err.count("reloaded") == answers, what="the answer")
+    wait_for(lambda: service.err.count("reloaded") == count, what="the result")
     return [line for line in service.err.splitlines() if "reloaded" in line][-1]
 
 
-def test_ten_reloads_under_load_lose_nothing(run_nedbus: Start, tmp_path: Path) -> None:
-    """Ten vehicles with all their topics go on, message by message, while an eleventh comes and goes."""
+def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path: Path) -> None:
+    """Ten vehicles lose no message during ten reloads that add and remove an eleventh."""
     endpoint, file, vehicles = free_endpoint(), tmp_path / "fleet.toml", [str(number) for number in range(10)]
-    write(file, vehicles)
+    write_settings(file, vehicles)
     service = run_nedbus("serve", "--listen", endpoint, "--config", str(file))
     wait_for(lambda: service.err.count("seed 0") == len(vehicles), what="the vehicles")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(VLP, mode="every") as subscription:
@@ -52,7 +52,7 @@ def test_ten_reloads_under_load_lose_nothing(run_nedbus: Start, tmp_path: Path) 
 
         for number in range(1, 11):
             take_until("0")
-            write(file, [*vehicles, "guest"] if number % 2 else vehicles)
+            write_settings(file, [*vehicles, "guest"] if number % 2 else vehicles)
             changed = "1 started, 0 stopped" if number % 2 else "0 started, 1 stopped"
             assert f"{changed}, 10 unchanged" in reload(service, number)
             if number % 2:
@@ -63,20 +63,20 @@ def test_ten_reloads_under_load_lose_nothing(run_nedbus: Start, tmp_path: Path) 
     assert times.keys() == {*vehicles, "guest"}
     for vehicle in vehicles:
         steps = {after - before for before, after in pairwise(times[vehicle])}
-        assert steps == {10_000}, vehicle  # us; a source that began anew would begin at 0
+        assert steps == {10_000}, vehicle  # us; a restarted source would begin at 0
     assert "retrying" not in service.err
 
 
-def test_broken_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> None:
-    """A file is taken whole or not at all: one wrong source among good ones, or another prefix, refuses it."""
+def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> None:
+    """A file is applied completely or not at all: one invalid source, or a changed prefix, rejects it."""
     endpoint, file = free_endpoint(), tmp_path / "nedbus.toml"
-    write(file, ["1"])
+    write_settings(file, ["1"])
     service = run_nedbus("serve", "--listen", endpoint, "--config", str(file))
     wait_for(lambda: "seed 0" in service.err, what="the vehicle")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
-        write(file, ["1", "2", "a b"])
+        write_settings(file, ["1", "2", "a b"])
         assert f"{file}, line 11, column 1: source 'sim:?vehicle=a+b': " in reload(service, 1)
-        write(file, ["2"], more='prefix = "other"\n')
+        write_settings(file, ["2"], header='prefix = "other"\n')
         reason = "prefix cannot be changed by a reload: restart the service"
         assert f"{file}, line 1, column 1: {reason}" in reload(service, 2)
         file.write_text("[[source")
@@ -84,20 +84,20 @@ def test_broken_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> No
         file.unlink()
         assert "there is no such file" in reload(service, 4)
         assert list(bus.vehicles()) == ["1"]
-        write(file, ["2"])
+        write_settings(file, ["2"])
         assert "1 started, 1 stopped, 0 unchanged" in reload(service, 5)
         wait_for(lambda: list(bus.vehicles()) == ["2"], what="the other vehicle")
 
 
-def test_address_can_move_from_one_source_to_another(run_nedbus: Start, tmp_path: Path) -> None:
-    """A removed source has given its addresses back before a new one takes them; a replay at full speed too.
+def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_path: Path) -> None:
+    """A removed source releases its addresses before a new source claims them, also a replay at full speed.
 
-    A source that names no vehicle is another one where the default vehicle is.
+    A source without a vehicle is restarted if the default vehicle changes.
     """
     endpoint, file = free_endpoint(), tmp_path / "nedbus.toml"
     file.write_text('source = "sim:?speed=max&duration=1e8"\n')
     service = run_nedbus("serve", "--listen", endpoint, "--config", str(file))
-    wait_for(lambda: "seed 0" in service.err, what="the first")
+    wait_for(lambda: "seed 0" in service.err, what="the first source")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
         for number, vehicle in enumerate(("1", "2"), 1):
             file.write_text(f'vehicle = "{vehicle}"\nsource = "sim:?seed=5"\n')
@@ -107,15 +107,15 @@ def test_address_can_move_from_one_source_to_another(run_nedbus: Start, tmp_path
     assert "this process already publishes" not in service.err
 
 
-def test_sources_of_flags_stay(run_nedbus: Start) -> None:
-    """Flags are above the file: without a change there SIGHUP does nothing, and says so."""
+def test_reload_keeps_sources_given_by_flags(run_nedbus: Start) -> None:
+    """Flags override the file, so SIGHUP changes nothing, and the result is logged."""
     service = run_nedbus("serve", "--listen", free_endpoint(), "-s", "sim:", "-s", "sim:?vehicle=2")
     wait_for(lambda: service.err.count("seed 0") == 2, what="the vehicles")
     assert "0 started, 0 stopped, 2 unchanged" in reload(service, 1)
 
 
-def test_reload_before_the_start_is_taken_at_the_start(tmp_path: Path) -> None:
-    """A service that still waits for its router starts with what was read last."""
+def test_reload_during_startup_applies_to_the_start(tmp_path: Path) -> None:
+    """A service that is still waiting for its router starts with the latest settings."""
     daemon = Daemon(load_settings(connect=(free_endpoint(),), source=("sim:",)), version="test")
     assert (
         daemon.reload(load_settings(connect=daemon.endpoints, source=("sim:?vehicle=2",))) == "no source is running yet"

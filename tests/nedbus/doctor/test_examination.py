@@ -29,7 +29,7 @@ from nedbus.settings import load_settings
 from nedbus.timings import TIMINGS, Timings
 from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router
 from nedbus_msgs import dds_type, status_key
-from tests.flights.first_message import ROS2_TYPE, encode
+from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
 from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_settings, write_config
@@ -454,7 +454,7 @@ def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timi
     for files, reason in (
         ({**tls_settings(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
-        ({"tls_certificate": pki / "reader.crt"}, "not the authority to trust"),
+        ({"tls_certificate": pki / "reader.crt"}, "not the CA to trust"),
     ):
         found(look(secure, tls=files), "certificate", "wrong", reason)
 

@@ -93,7 +93,7 @@ class World:
             if tick == 22 * RATE:
                 self.output.reject(Rejection("port", "not a message", address=ADDRESSES[0]))
             if tick % (RATE // 2) == 0:
-                self.daemon.look()
+                self.daemon.update_events()
                 self.reader.poll()
         for account in (self.daemon.account, self.reader.account):
             account.settle(START + self.now + 60)

@@ -57,7 +57,7 @@ class World:
 
     def look(self, *alive: Address) -> None:
         self.alive = Counter(alive)
-        self.daemon.look()
+        self.daemon.update_events()
         self.output.expire_stale()
         snapshot, account = self.reader.poll(), self.reader.account
         states = {name: account.state(name, self.now) for name in account.vehicles}

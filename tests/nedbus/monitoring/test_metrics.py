@@ -33,7 +33,7 @@ from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import Address, VehicleLocalPosition
 from nedbus_msgs.messages import VehicleStatus
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command

@@ -20,7 +20,7 @@ from nedbus.pki import make_authority, make_certificate, write_access_rules
 from nedbus.transport import Session
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleStatus
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
 from tests.peers.ports import free_endpoint, free_port

@@ -21,7 +21,7 @@ from nedbus.errors import SourceError
 from nedbus.recording import RecordingReader, RecordingWriter
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
-from tests.flights.first_message import ROS2_TYPE, downgrade, encode_cdr, message_definition
+from tests.flights.local_position import ROS2_TYPE, downgrade, encode_cdr, message_definition
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.nedbus.sources.test_damage import payloads_of

@@ -21,7 +21,7 @@ from nedbus.recording import RecordingWriter
 from nedbus_msgs import DEFAULT, Address, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from nedbus_msgs.frames import MapProjection
-from tests.flights.first_message import FIELD_TYPES, upgrade
+from tests.flights.local_position import FIELD_TYPES, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import UlogWriter

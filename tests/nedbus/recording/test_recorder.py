@@ -30,7 +30,7 @@ from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import LogMessage
-from tests.flights.first_message import LAYOUTS, ROS2_TYPE, downgrade, encode, encode_cdr, message_definition, upgrade
+from tests.flights.local_position import LAYOUTS, ROS2_TYPE, downgrade, encode, encode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import UlogWriter, write_log

@@ -37,7 +37,7 @@ from nedbus.errors import SourceError
 from nedbus.recording import RecordingReader, RecordingWriter
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import MessageArray, to_array
-from tests.flights.first_message import ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
+from tests.flights.local_position import ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import LOGS, UlogWriter
@@ -426,7 +426,7 @@ def test_service_goes_on_after_a_message_that_cannot_be_decoded(tmp_path: Path) 
     service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
     assert service.exit_code == 0, service.err
     assert "rejected: message 2 of the recording: " in service.err
-    assert "xy_valid: 2, where a bool is 0 or 1" in service.err
+    assert "xy_valid: 2 is not a bool (0 or 1)" in service.err
     assert "done, 2 published, 1 rejected" in service.err
 
 

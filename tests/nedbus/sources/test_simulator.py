@@ -13,7 +13,7 @@ from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, DEFAULT, TOPICS, VehicleLocalPosition, upgrade_with
 from nedbus_msgs.frames import quaternion_to_euler, to_global
-from tests.flights.first_message import FIELD_TYPES, encode, upgrade
+from tests.flights.local_position import FIELD_TYPES, encode, upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 

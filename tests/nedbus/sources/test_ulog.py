@@ -15,7 +15,7 @@ import nedbus
 from nedbus.errors import SourceError
 from nedbus.sources import ReplayRun
 from nedbus_msgs import DEFAULT, VehicleLocalPosition
-from tests.flights.first_message import LAYOUTS, upgrade
+from tests.flights.local_position import LAYOUTS, upgrade
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import LOGS, UlogWriter, write_log, write_raw_log

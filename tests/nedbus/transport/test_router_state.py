@@ -1,4 +1,4 @@
-"""Limits of a router: its own report, the command that shows it, and the files that it may open."""
+"""Router state and limits: admin space, doctor, metrics, session limit, and the limit of open files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
-from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, read_router_config, router
+from nedbus.transport import RouterState, Session, open_client, open_router, query_routers, read_router_config, router
 from nedbus.transport.router import allow_sessions, read_state
 from tests.peers.certificates import CONFIG
 from tests.peers.certificates import write_config as write_shipped
@@ -38,96 +38,95 @@ ZID = "1ae1e25d2f7221abc366ddc8a944c8a4"
 
 
 def write_config(folder: Path, endpoint: str, **settings: object) -> Path:
-    """Write a router's file with room for ten sessions."""
+    """Write a router configuration with a limit of ten sessions."""
     file = folder / "router.json5"
-    known = {"mode": "router", "listen": {"endpoints": [endpoint]}, "transport": {"unicast": {"max_sessions": 10}}}
+    base = {"mode": "router", "listen": {"endpoints": [endpoint]}, "transport": {"unicast": {"max_sessions": 10}}}
     admin = {"adminspace": {"enabled": True, "permissions": {"read": True, "write": False}}}
-    alone = {"scouting": {"multicast": {"enabled": False}, "delay": 0}}
-    file.write_text(json.dumps({**known, **admin, **alone, **settings}))
+    scouting = {"scouting": {"multicast": {"enabled": False}, "delay": 0}}
+    file.write_text(json.dumps({**base, **admin, **scouting, **settings}))
     return file
 
 
 @contextmanager
-def in_thread(target: Callable[..., object], *arguments: object, end: Callable[[], None]) -> Iterator[None]:
-    """Run something meanwhile, and end it."""
+def in_thread(target: Callable[..., object], *arguments: object, stop: Callable[[], None]) -> Iterator[None]:
+    """Run a function in a thread, and stop it on exit."""
     thread = threading.Thread(target=target, args=arguments)
     thread.start()
     try:
         yield
     finally:
-        end()
+        stop()
         thread.join(DEADLINE)
 
 
 @pytest.fixture
-def small(tmp_path: Path) -> Iterator[str]:
-    """Run a router with room for ten sessions, whose file says otherwise to those who ask."""
+def limited(tmp_path: Path) -> Iterator[str]:
+    """Run a router limited to ten sessions, whose file has another limit in `metadata`."""
     where = free_endpoint()
     with open_router(config_file=write_config(tmp_path, where, metadata={"max_sessions": 7, "name": "base"})):
         yield where
 
 
-def router_in(endpoint: str, seen: str) -> Finding:
-    """Return what the doctor finds of the only router when it sees this; who has just left counts for a moment."""
+def router_finding(endpoint: str, seen: str) -> Finding:
+    """Return the doctor's finding about the only router; wait for it, as closed sessions count for a moment."""
     found: list[Finding] = []
 
-    def look() -> bool:
+    def is_found() -> bool:
         findings = check_network(Observation("nedbus", "0", None), endpoint, None)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
     with changing_timings() as timings:
         timings.listen = timings.min_listen = 0.0
-        wait_for(look, what=f"{seen}, not {found}")
+        wait_for(is_found, what=f"{seen}, not {found}")
     return found[0]
 
 
-def ask(endpoint: str) -> list[RouterState]:
+def router_states(endpoint: str) -> list[RouterState]:
     with open_client([endpoint], timeout=5.0) as session:
-        return ask_routers(session, timeout=5.0)
+        return query_routers(session, timeout=5.0)
 
 
-def test_every_router_of_a_mesh_answers(endpoint: str) -> None:
-    """Each has its own sessions, a joined router among them, and Zenoh's default of 1,000."""
+def test_every_router_of_a_mesh_reports_its_state(endpoint: str) -> None:
+    """Each router reports its sessions, including those to other routers, and Zenoh's default limit of 1,000."""
     second = free_endpoint()
     with open_router(listen=[second], connect=[endpoint]) as router:
-        wait_for(lambda: sorted(state.sessions for state in ask(endpoint)) == [1, 2], what="both routers")
-        states = ask(endpoint)
+        wait_for(lambda: sorted(state.sessions for state in router_states(endpoint)) == [1, 2], what="both routers")
+        states = router_states(endpoint)
         assert [state.max_sessions for state in states] == [1000, 1000]
         assert str(router.zid()) in {state.zid for state in states}
         assert [state.zid for state in states] == sorted(state.zid for state in states)
 
 
-def test_router_tells_what_it_really_accepts(small: str) -> None:
-    """A number that was changed in one place of the file only does not deceive anybody; the rest of it stays."""
-    assert [(state.max_sessions, state.load) for state in ask(small)] == [(10, 0.1)]
-    with open_client([small], timeout=5.0) as session:
+def test_embedded_router_reports_its_actual_limit(limited: str) -> None:
+    """The reported limit is max_sessions, even if `metadata` in the file differs; other metadata is kept."""
+    assert [(state.max_sessions, state.load) for state in router_states(limited)] == [(10, 0.1)]
+    with open_client([limited], timeout=5.0) as session:
         (answer,) = (reply.ok for reply in session.get("@/*/router", timeout=5.0) if reply.ok)
     assert json.loads(answer.payload.to_bytes())["metadata"] == {"max_sessions": 10, "name": "base"}
 
 
 @pytest.mark.parametrize("name", ["router.json5", "router-secure.json5"])
-def test_shipped_files_say_it_twice_alike(name: str) -> None:
-    """A zenohd tells only what stands in `metadata`: it is the limit itself; both files have the same blocks."""
+def test_shipped_metadata_repeats_max_sessions(name: str) -> None:
+    """Both shipped files repeat max_sessions in `metadata`, as zenohd reports only that, and have the same sections."""
     config = zenoh.Config.from_file(CONFIG / name)
     limit = json.loads(config.get_json("transport/unicast/max_sessions"))
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
-    blocks = re.findall(r"^  (\w+):", (CONFIG / name).read_text(), re.MULTILINE)
-    assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(blocks)
+    sections = re.findall(r"^  (\w+):", (CONFIG / name).read_text(), re.MULTILINE)
+    assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(sections)
     assert read_router_config().max_sessions == limit == 1000
 
 
 @pytest.mark.slow
-def test_zenohd_tells_what_its_file_says(start: Start, tmp_path: Path) -> None:
-    """The shipped file, in the real program."""
+def test_zenohd_reports_the_limit_of_the_shipped_file(start: Start, tmp_path: Path) -> None:
     where = free_endpoint()
     start_zenohd(start, "-c", str(write_shipped(tmp_path, tmp_path / "router.json5", where)))
     with open_client([where], timeout=DEADLINE) as session:
-        assert [(state.sessions, state.max_sessions) for state in ask_routers(session, timeout=5.0)] == [(1, 1000)]
+        assert [(state.sessions, state.max_sessions) for state in query_routers(session, timeout=5.0)] == [(1, 1000)]
 
 
-def test_limit_of_a_broken_file_is_an_error(tmp_path: Path) -> None:
-    """It is not taken for the default."""
+def test_malformed_router_file_raises(tmp_path: Path) -> None:
+    """The limit does not fall back to the default."""
     file = tmp_path / "router.json5"
     file.write_text("{ mode: ")
     with pytest.raises(ConfigError):
@@ -145,24 +144,26 @@ def test_limit_of_a_broken_file_is_an_error(tmp_path: Path) -> None:
         (f"a/{ZID}/router", b'{"sessions": []}'),
     ],
 )
-def test_answers_that_make_no_sense(key: str, answer: bytes) -> None:
-    """Any peer may answer anything: it is no router; an id is at most 16 bytes in hexadecimal digits, for a label."""
+def test_malformed_state_replies_are_ignored(key: str, answer: bytes) -> None:
+    """A reply is ignored unless it has a session list and a key with a Zenoh id of at most 32 hexadecimal digits."""
     assert read_state(key, answer) is None
 
 
-@pytest.mark.parametrize("room", [True, False, 0, -1, 0.5, 1e3, "1000", None, [1000], {}, 2**33])
-def test_limits_that_make_no_sense(room: object) -> None:
-    """The sessions count, and the limit is not known."""
-    answer = json.dumps({"sessions": [{}, {}], "metadata": {"max_sessions": room}}).encode()
+@pytest.mark.parametrize("limit", [True, False, 0, -1, 0.5, 1e3, "1000", None, [1000], {}, 2**33])
+def test_invalid_session_limit_is_unknown(limit: object) -> None:
+    """With an invalid limit the sessions are reported, and the limit is None."""
+    answer = json.dumps({"sessions": [{}, {}], "metadata": {"max_sessions": limit}}).encode()
     assert read_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
-    for metadata in (room, [room], None):
+    for metadata in (limit, [limit], None):
         answer = json.dumps({"sessions": [{}, {}], "metadata": metadata}).encode()
         assert read_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
 
 
-def test_large_and_many_answers(endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A peer that claims to be many routers, or one with a book of sessions, fills no reader's memory."""
-    (real,) = ask_routers(zenoh_session, timeout=5.0)
+def test_large_and_many_state_replies_are_bounded(
+    endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A peer that pretends to be many routers, or one with a huge session list, cannot exhaust memory."""
+    (real,) = query_routers(zenoh_session, timeout=5.0)
 
     def answer(query: zenoh.Query) -> None:
         for number in range(20):
@@ -171,46 +172,46 @@ def test_large_and_many_answers(endpoint: str, zenoh_session: Session, monkeypat
 
     with open_client([endpoint], timeout=DEADLINE) as impostor:
         impostor.declare_queryable("@/*/router", answer)
-        wait_for(lambda: len(ask_routers(zenoh_session, timeout=5.0)) == 21, what="the answers of the impostor")
-        assert real.zid in {state.zid for state in ask_routers(zenoh_session, timeout=5.0)}
+        wait_for(lambda: len(query_routers(zenoh_session, timeout=5.0)) == 21, what="the replies of the impostor")
+        assert real.zid in {state.zid for state in query_routers(zenoh_session, timeout=5.0)}
         monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
-        assert len(ask_routers(zenoh_session, timeout=5.0)) == 5
+        assert len(query_routers(zenoh_session, timeout=5.0)) == 5
 
 
-def test_doctor_warns_from_four_fifths_on(small: str) -> None:
-    """Below it is told how many there are of how many; the doctor itself is one of them."""
-    with ExitStack() as closing_them:
+def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None:
+    """Below 80 % the finding is ok; the session of the doctor counts."""
+    with ExitStack() as stack:
         for _ in range(6):
-            closing_them.enter_context(open_client([small], timeout=5.0))
-        finding = router_in(small, "7 of 10 sessions")
+            stack.enter_context(open_client([limited], timeout=5.0))
+        finding = router_finding(limited, "7 of 10 sessions")
         assert (finding.state, finding.advice) == ("ok", "")
-        closing_them.enter_context(open_client([small], timeout=5.0))
-        finding = router_in(small, "8 of 10 sessions")
+        stack.enter_context(open_client([limited], timeout=5.0))
+        finding = router_finding(limited, "8 of 10 sessions")
         assert finding.state == "warning"
         assert "max_sessions" in finding.advice
         assert "docs/hosts.md" in finding.advice
 
 
-def test_router_whose_limit_is_not_told(tmp_path: Path) -> None:
-    """Metadata is the user's, and may be anything: the count alone is no reason to warn, nor is no answer at all."""
+def test_unknown_session_limit_causes_no_warning(tmp_path: Path) -> None:
+    """The doctor does not warn if `metadata` has no limit, or if the admin space is disabled."""
     where = free_endpoint()
     for metadata in (["a", "list"], "mine"):
         with open_router(config_file=write_config(tmp_path, where, metadata=metadata)):
-            assert [(state.max_sessions, state.load) for state in ask(where)] == [(None, None)]
-            assert router_in(where, "connected sessions: 1").state == "ok"
+            assert [(state.max_sessions, state.load) for state in router_states(where)] == [(None, None)]
+            assert router_finding(where, "connected sessions: 1").state == "ok"
     with open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False})):
-        assert router_in(where, "connected; its other sessions are not visible to this client").state == "ok"
+        assert router_finding(where, "connected; its other sessions are not visible to this client").state == "ok"
 
 
-def test_metrics_of_a_service_with_a_router(tmp_path: Path) -> None:
-    """They have the limit of the embedded router; a client has none."""
+def test_service_metrics_have_the_session_limit_of_its_router(tmp_path: Path) -> None:
+    """/metrics has sessions and limit of an embedded router; a client service has no limit."""
     where = free_endpoint()
     daemon = Daemon(load_settings(source=("sim:",), router_config=write_config(tmp_path, where)), version="0")
 
     def shows(text: str, daemon: Daemon = daemon) -> bool:
         return text in service_pages(daemon)["/metrics"]().content.decode()
 
-    with in_thread(daemon.run, end=daemon.stop):
+    with in_thread(daemon.run, stop=daemon.stop):
         wait_for(daemon.ready.is_set, what="the service")
         with open_client([where], timeout=5.0):
             wait_for(lambda: shows('nedbus_sessions{role="router"} 1.0\n'), what="the session")
@@ -221,7 +222,7 @@ def test_metrics_of_a_service_with_a_router(tmp_path: Path) -> None:
 
 @contextmanager
 def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
-    """Run an exporter, and yield whether its metrics of routers have all of these lines."""
+    """Run an exporter, and yield a function that checks its router metrics for given lines."""
     exporter = Exporter(bus, nedbus.Selection(), version="0")
 
     def shows(*wanted: str) -> bool:
@@ -230,32 +231,34 @@ def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
 
     assert not shows("sessions{")
     stop = threading.Event()
-    with in_thread(exporter.run, stop, end=stop.set):
+    with in_thread(exporter.run, stop, stop=stop.set):
         yield shows
 
 
-def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
-    """It asks the routers now and then, keeps the first few, and knows nothing of them when they are silent."""
+def test_exporter_metrics_have_sessions_and_limits_of_routers(
+    limited: str, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
+    """The exporter queries routers periodically, for a limited number of them."""
     timings.routers_interval = 0.05
-    with nedbus.connect(small) as bus, exporting(bus) as shows:
-        (state,) = ask(small)
+    with nedbus.connect(limited) as bus, exporting(bus) as shows:
+        (state,) = router_states(limited)
         label = f'{{router="{state.zid}"}}'
         wait_for(lambda: shows(f"sessions{label} 2.0\n", f"sessions_max{label} 10.0\n"), what="the exporter's sessions")
-        with open_client([small], timeout=5.0):
-            wait_for(lambda: shows(f"sessions{label} 3.0\n"), what="one more")
-        wait_for(lambda: shows(f"sessions{label} 2.0\n"), what="its end")
+        with open_client([limited], timeout=5.0):
+            wait_for(lambda: shows(f"sessions{label} 3.0\n"), what="another session")
+        wait_for(lambda: shows(f"sessions{label} 2.0\n"), what="its close")
         monkeypatch.setattr(exporter, "_MAX_ROUTERS", 0)
-        wait_for(lambda: not shows(f"sessions{label}"), what="nobody")
+        wait_for(lambda: not shows(f"sessions{label}"), what="no router")
 
 
-def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
-    """Without a session to ask with it goes on reading, and asks as soon as there is room for one."""
+def test_exporter_retries_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
+    """If a router has no free session for queries, the exporter retries until one is available."""
     timings.routers_interval = 0.05
     timings.routers_session = 0.1
-    where, tries, original = free_endpoint(), [], nedbus.Bus.open_session
+    where, attempts, original = free_endpoint(), [], nedbus.Bus.open_session
 
     def count(bus: nedbus.Bus, *, timeout: float) -> Session:
-        tries.append(timeout)
+        attempts.append(timeout)
         return original(bus, timeout=timeout)
 
     monkeypatch.setattr(nedbus.Bus, "open_session", count)
@@ -266,79 +269,79 @@ def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         open_client([where], timeout=5.0) as last,
         exporting(bus) as shows,
     ):
-        wait_for(lambda: len(tries) > 1, what="a second attempt")
+        wait_for(lambda: len(attempts) > 1, what="a second attempt")
         assert not shows("sessions{")
         last.close()
-        wait_for(lambda: shows("sessions{"), what="room")
+        wait_for(lambda: shows("sessions{"), what="a free session")
 
 
-def test_exporter_ends_while_a_router_does_not_answer(small: str) -> None:
-    """Its end waits for no answer: after a signal a command has less time than a router has for it."""
-    kept: list[zenoh.Query] = []
-    with open_client([small], timeout=5.0) as silent, nedbus.connect(small) as bus:
-        silent.declare_queryable(f"@/{ZID}/router", kept.append)
+def test_exporter_stops_during_an_unanswered_query(limited: str) -> None:
+    """Stopping does not wait for pending replies, as the time to exit after a signal is shorter."""
+    queries: list[zenoh.Query] = []
+    with open_client([limited], timeout=5.0) as silent, nedbus.connect(limited) as bus:
+        silent.declare_queryable(f"@/{ZID}/router", queries.append)
         with exporting(bus):
-            wait_for(lambda: kept, what="the question")
+            wait_for(lambda: queries, what="the query")
             begin = time.monotonic()
         assert time.monotonic() - begin < Timings().routers_timeout / 2
 
 
-def test_client_of_a_full_router(tmp_path: Path) -> None:
-    """It is told of the sessions as one cause, in the error and by the doctor; when one has gone it gets in."""
+def test_connect_error_at_a_full_router_names_the_limit(tmp_path: Path) -> None:
+    """The error and the doctor name the session limit; a client can connect once a session closes."""
     endpoint = free_endpoint()
     unicast = {"unicast": {"max_sessions": 1}}
     with open_router(config_file=write_config(tmp_path, endpoint, transport=unicast)):
         with open_client([endpoint], timeout=5.0):
-            with pytest.raises(nedbus.ConnectError, match=r"no room for more sessions .*'nedbus doctor'"):
+            with pytest.raises(nedbus.ConnectError, match=r"at its session limit .*'nedbus doctor'"):
                 nedbus.connect(endpoint, timeout=0.1)
             *_, finding = check_endpoint(endpoint, None)
             assert (finding.state, "max_sessions" in finding.advice) == ("wrong", True)
         nedbus.connect(endpoint, timeout=DEADLINE).close()
 
 
-class Limits:
-    """Limits of a process that is not this one, in place of the module `resource`."""
+class FakeResource:
+    """Replacement for the module `resource` with fake limits."""
 
     RLIMIT_NOFILE, RLIM_INFINITY = resource.RLIMIT_NOFILE, resource.RLIM_INFINITY
 
     def __init__(self, soft: int, hard: int, *, refused: bool = False) -> None:
-        self.now = soft, hard
+        self.limits = soft, hard
         self._refused = refused
 
     def getrlimit(self, which: int) -> tuple[int, int]:
         assert which == self.RLIMIT_NOFILE
-        return self.now
+        return self.limits
 
     def setrlimit(self, _: int, limits: tuple[int, int]) -> None:
         if self._refused:
             raise PermissionError
-        self.now = limits
+        self.limits = limits
 
 
 @pytest.mark.parametrize(
-    ("limits", "soft", "warns"),
+    ("fake", "soft", "warns"),
     [
-        (Limits(1024, 500_000), 500_000, False),
-        (Limits(1024, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
-        (Limits(20_000, 20_000), 20_000, False),
-        (Limits(resource.RLIM_INFINITY, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
-        (Limits(1024, 1500), 1500, False),
-        (Limits(256, 1024), 1024, True),
-        (Limits(256, 4096, refused=True), 256, True),
+        (FakeResource(1024, 500_000), 500_000, False),
+        (FakeResource(1024, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
+        (FakeResource(20_000, 20_000), 20_000, False),
+        (FakeResource(resource.RLIM_INFINITY, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
+        (FakeResource(1024, 1500), 1500, False),
+        (FakeResource(256, 1024), 1024, True),
+        (FakeResource(256, 4096, refused=True), 256, True),
     ],
     ids=["raised", "no hard limit", "enough", "none", "just enough", "too low", "refused"],
 )
-def test_files_of_a_router(
-    limits: Limits, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_soft_limit_of_open_files_is_raised(
+    fake: FakeResource, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The soft limit is raised to the hard one; a warning says that this is too low."""
-    monkeypatch.setattr(router, "resource", limits)
+    """The soft limit is raised to the hard limit; a warning is logged if that is too low."""
+    monkeypatch.setattr(router, "resource", fake)
     with caplog.at_level(logging.WARNING):
         allow_sessions(1000)
-    assert limits.now[0] == soft
+    assert fake.limits[0] == soft
     assert bool(caplog.records) is warns
     if warns:
-        assert f"the limit of {soft} open files has room for about {soft - 100} sessions" in caplog.text
+        assert f"the limit of {soft} open files allows about {soft - 100} sessions" in caplog.text
 
 
 LIMITED = """
@@ -349,8 +352,8 @@ main()
 """
 
 
-def test_router_takes_more_sessions_than_the_soft_limit(start: Start) -> None:
-    """With `ulimit -S -n 64` a router takes a hundred sessions, each of them an open file."""
+def test_router_accepts_more_sessions_than_the_soft_limit(start: Start) -> None:
+    """With `ulimit -S -n 64` a router accepts 100 sessions, each with an open file."""
     where, hard = free_endpoint(), resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     router = start("-c", LIMITED, "64", str(hard), "router", "--listen", where)
     with ExitStack() as sessions:
@@ -360,8 +363,8 @@ def test_router_takes_more_sessions_than_the_soft_limit(start: Start) -> None:
     assert "open files" not in router.err
 
 
-def test_router_that_may_not_says_so(start: Start) -> None:
-    """With a hard limit of 300 it starts, and logs how many sessions it has room for."""
+def test_router_warns_if_the_hard_limit_is_too_low(start: Start) -> None:
+    """With a hard limit of 300 open files a router starts, and logs the number of sessions that fit."""
     router = start("-c", LIMITED, "300", "300", "router", "--listen", free_endpoint())
     wait_for(lambda: "router on" in router.err, what="the router")
-    assert "the limit of 300 open files has room for about 200 sessions" in router.err
+    assert "the limit of 300 open files allows about 200 sessions" in router.err

@@ -1,4 +1,4 @@
-"""The shipped configurations in a real zenohd: routers, a storage, and HTTP for readers."""
+"""The shipped configurations in a real zenohd: routers, storage, and read-only HTTP."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import zenoh
 
 import nedbus
 from nedbus.transport import Session, open_client
-from tests.flights.first_message import decode, encode
+from tests.flights.local_position import decode, encode
 from tests.flights.messages import VLP, message
 from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import run_command
@@ -55,27 +55,27 @@ def secure(start: Start, pki: Path, tmp_path: Path) -> str:
 
 @pytest.fixture
 def raw(zenohd: str) -> Iterator[Session]:
-    """Open a plain session beside the buses."""
+    """Open a plain Zenoh session."""
     with open_client([zenohd], timeout=DEADLINE) as session:
         yield session
 
 
 def join(endpoint: str, pki: Path, name: str) -> nedbus.Bus:
-    """Connect as somebody."""
+    """Connect with the certificate of this name."""
     return nedbus.connect(endpoint, tls=client_tls(pki, name), timeout=DEADLINE)
 
 
 def start_storage(start: Start, tmp_path: Path, router: str) -> Process:
-    """Run config/storage.json5 beside a router."""
+    """Run config/storage.json5 in a second zenohd, as a client of a router."""
     file = write_config(tmp_path, tmp_path / "storage.json5", router, **{ROUTER: router})
     return start_zenohd(start, "-c", str(file))
 
 
 def http(method: str, url: str, body: bytes | None = None) -> tuple[int, bytes]:
-    """Return the status and the body of an answer; 0 where nobody listens yet."""
+    """Return status and body of an HTTP response; status 0 if the connection is refused."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, body, method=method), timeout=DEADLINE) as answer:  # noqa: S310 - loopback
-            return answer.status, answer.read()
+        with urllib.request.urlopen(urllib.request.Request(url, body, method=method), timeout=DEADLINE) as response:  # noqa: S310 - loopback
+            return response.status, response.read()
     except urllib.error.HTTPError as exc:
         return exc.code, b""
     except OSError:
@@ -83,15 +83,15 @@ def http(method: str, url: str, body: bytes | None = None) -> tuple[int, bytes]:
 
 
 def last_messages(session: Session) -> list[int]:
-    """Return the timestamps of all answers for vehicle 1."""
+    """Return the timestamps in all replies for vehicle 1."""
     replies = session.get(f"nedbus/1/{VLP}", target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE)
     return [decode(reply.ok.payload.to_bytes()).timestamp for reply in replies if reply.ok]
 
 
-def test_storage_keeps_what_a_vehicle_sent_last(
+def test_storage_retains_the_last_message_of_a_vehicle(
     start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
 ) -> None:
-    """config/storage.json5 answers for a vehicle that is gone, and stamps nothing anew that others receive."""
+    """config/storage.json5 replies for a vehicle that has gone, and does not change timestamps that others receive."""
     start_storage(start, tmp_path, zenohd)
     with nedbus.connect(zenohd) as reader, open_client([zenohd], timeout=DEADLINE) as vehicle:
         subscription = reader.subscribe(VLP, mode="every")
@@ -100,7 +100,7 @@ def test_storage_keeps_what_a_vehicle_sent_last(
         received: list[nedbus.Sample[Any]] = []
         stamps: list[zenoh.Timestamp] = []
 
-        def are_both_there() -> bool:
+        def are_received() -> bool:
             number = next(timestamps)
             stamps.append(zenoh.Timestamp(ahead + dt.timedelta(milliseconds=number), b"\x07"))
             vehicle.put(f"nedbus/1/{VLP}", encode(message(number)), timestamp=stamps[-1])
@@ -108,7 +108,7 @@ def test_storage_keeps_what_a_vehicle_sent_last(
                 received.append(subscription.receive(0.1))
             return bool(received and last_messages(zenoh_session))
 
-        wait_for(are_both_there, what="the storage and the reader")
+        wait_for(are_received, what="the storage and the reader")
         vehicle.close()
         last = next(timestamps) - 1
         wait_for(lambda: last_messages(zenoh_session) == [last], what="the last message")
@@ -118,10 +118,10 @@ def test_storage_keeps_what_a_vehicle_sent_last(
         assert reader.vehicles() == {}
 
 
-def test_vehicle_that_restarted_wins_over_the_storage(
+def test_live_reply_takes_precedence_over_the_storage(
     start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
 ) -> None:
-    """A real storage keeps a message of the last run, whose clock was ahead: live answers win, and `get` tells."""
+    """After a restart with an earlier clock, live replies take precedence, and `get` marks stored ones."""
     start_storage(start, tmp_path, zenohd)
     ahead = zenoh.Timestamp(zenoh_session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
 
@@ -140,7 +140,7 @@ def test_vehicle_that_restarted_wins_over_the_storage(
         assert (listed.exit_code, "stored" in listed.out) == (0, True)
         with nedbus.connect(zenohd) as vehicle:
             vehicle.publisher(VLP, vehicle="1").publish(message(1))
-            wait_for(lambda: not reader.latest()[0].stored, what="the live answer")
+            wait_for(lambda: not reader.latest()[0].stored, what="the live reply")
             assert reader.latest()[0].message == message(1)
             live = run_command("get", "-c", zenohd)
         assert live.exit_code == 0, live.err
@@ -148,8 +148,8 @@ def test_vehicle_that_restarted_wins_over_the_storage(
         assert "stored" not in live.out
 
 
-def test_storage_waits_for_its_router(start: Start, tmp_path: Path) -> None:
-    """It may be started first, and joins again a router that was away."""
+def test_storage_waits_for_its_router_and_reconnects(start: Start, tmp_path: Path) -> None:
+    """The storage may start before its router, and reconnects after a router restart."""
     endpoint = free_endpoint()
     start_storage(start, tmp_path, endpoint)
     file = write_config(tmp_path, tmp_path / "router.json5", endpoint)
@@ -165,8 +165,8 @@ def test_storage_waits_for_its_router(start: Start, tmp_path: Path) -> None:
         router.kill()
 
 
-def test_http_reads_and_cannot_write(start: Start, secure: str, pki: Path, tmp_path: Path) -> None:
-    """config/rest-reader.json5: a GET gets the vehicle, a PUT and a DELETE reach nobody beyond that zenohd."""
+def test_http_is_read_only(start: Start, secure: str, pki: Path, tmp_path: Path) -> None:
+    """With config/rest-reader.json5 a GET returns messages, and PUT and DELETE have no effect beyond that zenohd."""
     address = free_endpoint().removeprefix("tcp/")
     changes = {"tls/127.0.0.1:7447": secure, HTTP: address}
     start_zenohd(start, "-c", str(write_config(pki, tmp_path / "rest-reader.json5", secure, **changes)))
@@ -191,8 +191,8 @@ def test_http_reads_and_cannot_write(start: Start, secure: str, pki: Path, tmp_p
         assert [answer["key"] for answer in json.loads(http("GET", f"{url}/**")[1])] == [f"nedbus/1/{VLP}"]
 
 
-def test_bridge_to_ros_2_needs_its_router(run_nedbus: Start, secure: str, zenohd: str, pki: Path) -> None:
-    """The secure router has no rule for ROS 2: `nedbus ros2` says so, and works with ROS 2's own router beside it."""
+def test_ros_2_bridge_requires_a_separate_router(run_nedbus: Start, secure: str, zenohd: str, pki: Path) -> None:
+    """`nedbus ros2` exits at the secure router, which has no rules for ROS 2, and works with --to."""
     flags = tls_options(pki, "reader")
     with join(secure, pki, "vehicle-1") as vehicle:
         vehicle.publisher(VLP, vehicle="1")

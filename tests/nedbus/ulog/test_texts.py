@@ -15,7 +15,7 @@ from pyulog.px4_events import PX4Events
 
 import nedbus
 from nedbus.ulog import Texts, to_statement
-from tests.flights.ulogs import LOGS, UlogWriter, said_in
+from tests.flights.ulogs import LOGS, UlogWriter, log_messages_in
 
 REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
 ARMED: Final = {"arguments": [{"name": "by", "type": "by_t"}], "message": "Armed by {1}", "name": "armed"}
@@ -91,7 +91,7 @@ class Log(UlogWriter):
 
     def said(self, texts: Texts | None = None) -> list[tuple[int, int, str]]:
         """Return timestamp, severity and text of each message."""
-        return said_in(bytes(self.data), texts)
+        return log_messages_in(bytes(self.data), texts)
 
 
 @pytest.mark.logs
@@ -102,7 +102,7 @@ def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
     logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
     events = {(int(time), text) for time, _, text in (PX4Events().get_logged_events(log) if has_metadata else ())}
-    left = said_in(path)
+    left = log_messages_in(path)
     for time, text in events:
         [one] = [each for each in left if each[0] == time and each[2].startswith(text)]
         left.remove(one)

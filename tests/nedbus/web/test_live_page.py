@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.transport import open_client
-from tests.flights.first_message import LAYOUTS, ROS2_TYPE, type_hash
+from tests.flights.local_position import LAYOUTS, ROS2_TYPE, type_hash
 from tests.flights.messages import VLP
 from tests.nedbus.bridges.test_ros2 import Peer, peer
 from tests.nedbus.sources.mavlink.test_source import Fly, fly, port

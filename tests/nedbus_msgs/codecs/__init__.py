@@ -1,1 +1,1 @@
-"""Messages as bytes, rows and arrays."""
+"""Tests of the codecs: payloads, rows and arrays."""

@@ -1,4 +1,4 @@
-"""CDR, compared with what a real ROS 2 serialised, and with rosbags."""
+"""CDR codec, compared with payloads of a real ROS 2 and with rosbags."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from nedbus_msgs import DecodeError, EncodeError, VehicleLocalPosition
-from tests.flights.first_message import LAYOUTS, decode_cdr, downgrade, encode_cdr
+from tests.flights.local_position import LAYOUTS, decode_cdr, downgrade, encode_cdr
 from tests.nedbus_msgs.strategies import DATA, messages
 
 VECTORS = DATA / "cdr_vectors.jsonl"
@@ -25,7 +25,7 @@ STORE = get_typestore(Stores.EMPTY)
 
 
 def rosbags_type(layout: str) -> str:
-    """Return the name under which rosbags knows this layout."""
+    """Register a layout with rosbags, and return its type name there."""
     name = f"oracle/msg/L{layout.replace('.', '')}"
     if name not in STORE.types:
         lines = [f"{LAYOUTS[layout].types[field]!s} {field}\n" for field in LAYOUTS[layout].fields]
@@ -46,8 +46,8 @@ def as_python(value: object) -> object:
 
 
 @pytest.mark.parametrize(("layout", "vector"), [*vectors(VECTORS), *vectors(SHARED_VECTORS)])
-def test_real_ros_2_is_decoded_and_encoded(layout: str, vector: Mapping[str, Any]) -> None:
-    """Payloads of a real rclpy decode to their fields, whatever is in the padding, and the fields encode to them."""
+def test_ros_2_payload_round_trip(layout: str, vector: Mapping[str, Any]) -> None:
+    """Payloads of a real rclpy decode to their fields, with any padding, and the fields encode to the same bytes."""
     clean, raw = bytes.fromhex(vector["cdr_hex"]), bytes.fromhex(vector["cdr_hex_raw"])
     fields = decode_cdr(clean, layout=layout)
     assert list(fields) == list(LAYOUTS[layout].fields)
@@ -60,8 +60,8 @@ def test_real_ros_2_is_decoded_and_encoded(layout: str, vector: Mapping[str, Any
 
 
 @given(messages())
-def test_rosbags_agrees(message: VehicleLocalPosition) -> None:
-    """In every layout, any message is the same bytes by rosbags' own serialisation, and decodes to the same fields."""
+def test_payload_equals_that_of_rosbags(message: VehicleLocalPosition) -> None:
+    """Any message in any layout encodes to the same bytes as with rosbags, and decodes to the same fields."""
     for layout in LAYOUTS:
         fields = downgrade(message, layout)
         kind = rosbags_type(layout)
@@ -76,8 +76,8 @@ def as_array(value: object) -> Any:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_only_what_px4_appends_is_ignored(layout: str) -> None:
-    """PX4 sends the size of its struct and 28 bytes; one byte more, or one less than CDR needs, is rejected."""
+def test_payload_size_is_limited_to_px4s_trailer(layout: str) -> None:
+    """PX4's struct size plus 28 bytes is accepted; one byte more, or one less than CDR needs, is rejected."""
     payload = encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout)
     longest = {"1.13": 196, "1.14": 196, "1.15": 212, "V0": 220, "1.16": 220}[layout]
     assert decode_cdr(payload + (longest - len(payload)) * b"\xff", layout=layout)["timestamp"] == 7
@@ -95,8 +95,8 @@ def test_other_encapsulation_is_rejected(head: str) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_bool_is_0_or_1(layout: str) -> None:
-    """Any other byte in a bool means that the payload has another layout."""
+def test_bool_other_than_0_or_1_is_rejected(layout: str) -> None:
+    """Any other byte indicates a payload of another layout."""
     payload = bytearray(encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout))
     payload[4 + 16] = 2
     with pytest.raises(DecodeError, match="xy_valid: 2"):
@@ -104,9 +104,9 @@ def test_bool_is_0_or_1(layout: str) -> None:
 
 
 @pytest.mark.parametrize(("layout", "size"), {"1.13": 184, "1.14": 188, "1.15": 204, "V0": 216, "1.16": 220}.items())
-def test_padding_may_hold_anything(layout: str, size: int) -> None:
-    """ROS leaves garbage of its memory in the padding: it is ignored."""
-    # No byte of these is 0, so that each 0 is padding.
+def test_padding_is_ignored(layout: str, size: int) -> None:
+    """ROS leaves uninitialized memory in the padding."""
+    # No byte of these values is 0, so each 0 is padding.
     filled = {"bool": True, "uint8": 255, "uint64": 2**64 - 1, "float32": 0.1, "float64": 0.1}
     values = {name: filled.get(str(LAYOUTS[layout].types[name]), (0.1, 0.1)) for name in LAYOUTS[layout].fields}
     payload = encode_cdr(values, layout=layout)
@@ -129,22 +129,22 @@ def test_padding_may_hold_anything(layout: str, size: int) -> None:
     ],
     ids=lambda value: repr(value)[:20],
 )  # fmt: skip
-def test_value_of_another_type_or_range_is_rejected(name: str, value: object) -> None:
-    """ROS 2's Python sends such values as 0, 44 or infinity; here each is rejected with the name of its field."""
+def test_value_of_wrong_type_or_range_raises(name: str, value: object) -> None:
+    """The error names the field; rclpy would send such values as 0, 44 or infinity."""
     fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {name: value}
     with pytest.raises(EncodeError, match=f"{name}: "):
         encode_cdr(fields, layout="1.16")
 
 
-def test_whole_numbers_are_floats_too() -> None:
-    """An int where a float is meant is that float, as everywhere here."""
+def test_int_is_accepted_for_float() -> None:
+    """An int in a float field is encoded as that float, as in the model."""
     fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {"x": 3, "delta_xy": (1, 2)}
     assert decode_cdr(encode_cdr(fields, layout="1.16"), layout="1.16")["x"] == 3.0
 
 
 @given(st.binary(max_size=300))
-def test_garbage_is_rejected_or_decoded(payload: bytes) -> None:
-    """Random bytes decode to fields or raise DecodeError, nothing else."""
+def test_random_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
+    """Random bytes never raise any other error."""
     for layout in LAYOUTS:
         for data in (payload, b"\x00\x01\x00\x00" + payload):
             with suppress(DecodeError):

@@ -1,4 +1,4 @@
-"""The msgpack codec: the golden bytes, round trips, foreign encodings, hostile input."""
+"""The msgpack codec: golden bytes, round trips, foreign encodings, hostile input."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from nedbus_msgs import PAYLOAD_LIMIT, DecodeError, EncodeError, UnknownLayoutError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_message
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     FIELD_TYPES,
     PAYLOAD_SIZE,
     decode,
@@ -29,7 +29,7 @@ GOLDEN = json.loads((DATA / "golden.json").read_text())
 
 @pytest.mark.parametrize("name", GOLDEN)
 def test_golden_bytes(name: str) -> None:
-    """These bytes are the wire format; to change them is a breaking release."""
+    """These bytes are the wire format; changing them breaks compatibility."""
     message = VehicleLocalPosition.model_validate_json(json.dumps(GOLDEN[name]["message"]))
     payload = bytes.fromhex(GOLDEN[name]["payload"])
     assert encode(message) == payload
@@ -38,7 +38,7 @@ def test_golden_bytes(name: str) -> None:
 
 @given(messages())
 def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) -> None:
-    """Any msgpack decoder returns an array of the layout and the 53 fields, with PX4's types; ours the same message."""
+    """Any msgpack decoder returns an array of layout number and 53 fields; the codec returns the same message."""
     payload = encode(message)
     assert len(payload) == PAYLOAD_SIZE
     array = msgpack.unpackb(payload, use_list=False)
@@ -48,8 +48,8 @@ def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) ->
 
 
 @given(messages(), st.booleans(), st.booleans())
-def test_other_encodings_are_decoded(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
-    """Short ints, doubles for floats, and ints where a float is meant decode to the same message, or row."""
+def test_other_msgpack_encodings_are_decoded(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
+    """Short ints, doubles, and ints in float fields decode to the same message and row."""
     values = [value for name, value in message.model_dump().items()]
     if whole:
         values = [int(each) if isinstance(each, float) and each.is_integer() and each else each for each in values]
@@ -61,53 +61,53 @@ def test_other_encodings_are_decoded(message: VehicleLocalPosition, single: bool
 
 @given(messages())
 def test_layout_0_is_decoded(message: VehicleLocalPosition) -> None:
-    """V0 has 52 fields and one hagl_max."""
+    """V0 has 52 fields, with a single hagl_max."""
     older = downgrade(message, "V0")
     decoded = decode(msgpack.packb([0, *older.values()]))
     assert bits(decoded) == bits(message.model_copy(update={"hagl_max_xy": message.hagl_max_z}))
 
 
-def test_newer_layout_is_decoded_by_names() -> None:
-    """With the field names of an unknown layout, known fields are decoded and the others ignored."""
+def test_newer_layout_is_decoded_by_field_names() -> None:
+    """Given the field names of an unknown layout, known fields are decoded and the others ignored."""
     names = ["timestamp", "x", "y", "brand_new"]
     payload = msgpack.packb([2, 5, 1.0, 2.0, True])
-    with pytest.raises(UnknownLayoutError, match="layout 2 with 4 fields; this reader knows layouts 0, 1") as info:
+    with pytest.raises(UnknownLayoutError, match=r"unknown layout 2 with 4 fields \(known: 0, 1\)") as info:
         decode(payload)
     assert (info.value.layout, info.value.count, info.value.known) == (2, 4, (0, 1))
     message = decode(payload, newer={2: names})
     assert (message.timestamp, message.x, message.y) == (5, 1.0, 2.0)
-    with pytest.raises(DecodeError, match="3 fields where layout 2 has 4"):
+    with pytest.raises(DecodeError, match="3 fields, expected 4 for layout 2"):
         decode(msgpack.packb([2, 5, 1.0, 2.0]), newer={2: names})
 
 
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (b"", "0 bytes that are not one msgpack value"),
+        (b"", "0 bytes are not a single msgpack value"),
         (b"\xc1", "1 bytes"),
         (b"hello", "5 bytes"),
-        (msgpack.packb({"x": 1}), "not one msgpack value"),
+        (msgpack.packb({"x": 1}), "not a single msgpack value"),
         (msgpack.packb([]), "does not start|not an array that starts"),
         (msgpack.packb(["1"]), "not an array that starts"),
         (msgpack.packb([True, 1]), "not an array that starts"),
-        (msgpack.packb([1, 2, 3]), "2 fields where layout 1 has 53"),
+        (msgpack.packb([1, 2, 3]), "2 fields, expected 53 for layout 1"),
         (msgpack.packb(7), "not an array"),
-        (b"\x00" * (PAYLOAD_LIMIT + 1), "4097 bytes, more than the 4096"),
-        (b"\xdd\xff\xff\xff\xff", "not one msgpack value"),
-        (b"\x91" * 4000, "not one msgpack value"),
-        (REAL[0] + b"\x00", "245 bytes that are not one msgpack value"),
-        (REAL[0][:-1], "243 bytes that are not one msgpack value"),
-        (REAL[0][1:], "243 bytes that are not one msgpack value"),
+        (b"\x00" * (PAYLOAD_LIMIT + 1), "4097 bytes, more than the limit of 4096"),
+        (b"\xdd\xff\xff\xff\xff", "not a single msgpack value"),
+        (b"\x91" * 4000, "not a single msgpack value"),
+        (REAL[0] + b"\x00", "245 bytes are not a single msgpack value"),
+        (REAL[0][:-1], "243 bytes are not a single msgpack value"),
+        (REAL[0][1:], "243 bytes are not a single msgpack value"),
     ],
 )
-def test_reason_of_a_bad_payload(payload: bytes, reason: str) -> None:
-    """Each kind of bad payload has a reason of its own."""
+def test_invalid_payload_raises_with_reason(payload: bytes, reason: str) -> None:
+    """The error states what is wrong with the payload."""
     with pytest.raises(DecodeError, match=reason):
         decode(payload)
 
 
-def test_violation_in_a_payload_is_rejected() -> None:
-    """A received message is validated like a sent one, on both paths of the decoder."""
+def test_payload_that_breaks_a_rule_is_rejected() -> None:
+    """A received message is validated like a sent one, on the fast and the general path of the decoder."""
     values = [1, *VehicleLocalPosition(timestamp=1).model_dump().values()]
     values[3] = True  # xy_valid, while x is NaN
     with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):
@@ -119,8 +119,8 @@ def test_violation_in_a_payload_is_rejected() -> None:
         decode(bytes(payload))
 
 
-def test_flipped_bit_is_the_same_in_every_form() -> None:
-    """A payload with one bit that is wrong is decoded or rejected, alone, as a row and among others in an array."""
+def test_flipped_bit_has_the_same_effect_in_model_row_and_array() -> None:
+    """A payload with one flipped bit is decoded or rejected alike as a model, as a row and in an array."""
     number = int.from_bytes(REAL[0], "big")
     payloads = [(number ^ 1 << bit).to_bytes(PAYLOAD_SIZE, "big") for bit in range(8 * PAYLOAD_SIZE)]
     array, valid = decode_array(b"".join(payloads))
@@ -141,8 +141,8 @@ def test_flipped_bit_is_the_same_in_every_form() -> None:
 @example(b"\xdc\x00\x36")
 @example(b"\xc7\x0c\xff" + bytes(12))
 @MANY
-def test_any_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
-    """Any byte string decodes or raises DecodeError."""
+def test_random_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
+    """Random bytes never raise any other error."""
     try:
         decode(payload)
     except DecodeError as exc:
@@ -159,8 +159,10 @@ msgpack_values = st.recursive(
 
 @given(st.sampled_from(FLIGHTS), st.integers(0, 53), msgpack_values)
 @MANY
-def test_any_value_at_any_index_is_the_models_decision(good: VehicleLocalPosition, index: int, value: object) -> None:
-    """A payload with one odd value decodes only if the model accepts that value."""
+def test_payload_with_one_random_value_keeps_it_or_is_rejected(
+    good: VehicleLocalPosition, index: int, value: object
+) -> None:
+    """The value is decoded unchanged, up to rounding to float32, or DecodeError is raised."""
     array: list[object] = [1, *good.model_dump().values()]
     array[index] = value
     try:
@@ -175,18 +177,18 @@ def test_any_value_at_any_index_is_the_models_decision(good: VehicleLocalPositio
     assert index == 0 or repr(message.model_dump()[list(FIELD_TYPES)[index - 1]]) in map(repr, forms)
 
 
-def test_bypassed_validation_is_an_error_at_encode() -> None:
-    """A message of model_construct with values that do not fit its fields raises, and never encodes other values."""
+def test_encoding_after_bypassed_validation_raises() -> None:
+    """A message from model_construct with values that do not fit raises, and never encodes other values."""
     for field, value in (("x", 1e39), ("timestamp", -1), ("xy_reset_counter", 300), ("x", "1"), ("delta_xy", None)):
         message = VehicleLocalPosition.model_construct(**{**VehicleLocalPosition(timestamp=1).__dict__, field: value})
         with pytest.raises(EncodeError, match="VehicleLocalPosition"):
             encode(message)
 
 
-def test_deep_nesting_is_rejected() -> None:
-    """An array nested a thousand deep is rejected before anything prints it: that would exhaust the stack."""
+def test_deeply_nested_array_is_rejected() -> None:
+    """An array nested 400 deep is rejected before it is formatted, which would overflow the stack."""
     deep = b"\x91" * 400 + b"\x01"
     values = [msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()]
     values[6] = deep
-    with pytest.raises(DecodeError, match="x: an array within an array"):
+    with pytest.raises(DecodeError, match="x: nested array"):
         decode(b"\xdc\x00\x36\x01" + b"".join(values))

@@ -1,1 +1,1 @@
-"""Messages with a file."""
+"""Tests of the built-in messages."""

@@ -1,4 +1,4 @@
-"""The model: types, ranges, rules between fields, and the reasons of its errors."""
+"""The model of VehicleLocalPosition: types, ranges, rules and error texts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs import InvalidMessageError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_array
-from tests.flights.first_message import FIELD_TYPES, describe, encode, encode_fields, json_schema
+from tests.flights.local_position import FIELD_TYPES, describe, encode, encode_fields, json_schema
 from tests.nedbus_msgs.strategies import BREAKING, KEEPING, WITHIN, bits, fields, messages
 
 FLOATS = [name for name, kind in FIELD_TYPES.items() if kind == "float32"]
@@ -26,8 +26,8 @@ def rejection(**fields: object) -> str:
     return describe(info.value)
 
 
-def test_not_provided_is_nan_false_or_zero() -> None:
-    """A field that is not given holds NaN, false or 0, and is not in model_fields_set."""
+def test_omitted_field_is_nan_false_or_zero() -> None:
+    """An omitted field holds NaN, false or 0, and is absent from model_fields_set."""
     message = VehicleLocalPosition(timestamp=1)
     assert math.isnan(message.x)
     assert all(map(math.isnan, message.delta_xy))
@@ -36,8 +36,8 @@ def test_not_provided_is_nan_false_or_zero() -> None:
 
 
 @pytest.mark.parametrize("name", FLOATS)
-def test_float32_field_holds_the_nearest_float32(name: str) -> None:
-    """A double is rounded as a C float is, and rejected beyond; NaN and infinity pass where no rule forbids them."""
+def test_float32_field_is_rounded_to_float32(name: str) -> None:
+    """A double is rounded, and rejected beyond the range; NaN and infinity pass unless a rule forbids them."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, name: 0.1})
     assert getattr(message, name) == float(np.float32(0.1)) != 0.1
     for value in (3.5e38, 1e39, 1e308):
@@ -48,8 +48,8 @@ def test_float32_field_holds_the_nearest_float32(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ref_lat", "ref_lon"])
-def test_origin_is_never_rounded(name: str) -> None:
-    """ref_lat and ref_lon are doubles: float32 steps would be 0.4 m."""
+def test_origin_keeps_double_precision(name: str) -> None:
+    """Float32 would have a resolution of 0.4 m."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, name: 47.397742123456789})
     assert getattr(message, name) == 47.397742123456789
 
@@ -65,44 +65,44 @@ def test_origin_is_never_rounded(name: str) -> None:
     ],
 )  # fmt: skip
 def test_wrong_type_is_rejected(field: str, value: object) -> None:
-    """No value is converted silently, unlike in ROS 2's Python."""
+    """No value is converted silently, unlike in rclpy."""
     assert field in rejection(**{field: value})
 
 
-def test_int_is_a_float_where_a_float_is_meant() -> None:
-    """0 and 1 are accepted for 0.0 and 1.0."""
+def test_int_is_accepted_for_float() -> None:
+    """An int in a float field is converted to float."""
     message = VehicleLocalPosition(timestamp=1, x=3)
     assert (message.x, type(message.x)) == (3.0, float)
 
 
 @pytest.mark.parametrize("changes", BREAKING)
-def test_broken_rule_is_named(changes: dict[str, object]) -> None:
-    """Flags, signs, bounds and the order of the times: just beyond each, the field is rejected."""
+def test_broken_rule_names_the_field(changes: dict[str, object]) -> None:
+    """A value just beyond a rule (flags, signs, bounds, order of timestamps) is rejected."""
     assert list(changes)[-1] in rejection(**changes)
 
 
-def test_values_within_all_rules_pass() -> None:
-    """The bounds themselves, -0.0, NaN and infinity where nothing forbids them, and NaN while a flag is not set."""
+def test_extreme_valid_values_pass() -> None:
+    """Bounds, -0.0, NaN and infinity unless a rule forbids them, and NaN while a flag is not set are valid."""
     for changes in KEEPING:
         VehicleLocalPosition.model_validate({"timestamp": 1, **changes})
 
 
 def test_all_violations_are_reported_at_once() -> None:
-    """One error lists every field that violates a rule."""
+    """One error lists every field that breaks a rule."""
     text = rejection(xy_valid=True, eph=-1.0, heading=7.0)
     assert all(name in text for name in ("x:", "y:", "eph:", "heading:"))
     assert "-1.0" in text
 
 
 def test_message_is_immutable() -> None:
-    """A message can be shared between threads."""
+    """Assigning to a field raises, so a message can be shared between threads."""
     name = "x"
     with pytest.raises(ValidationError, match="frozen"):
         setattr(VehicleLocalPosition(timestamp=1), name, 1.0)
 
 
 def test_copy_with_updates_is_validated() -> None:
-    """model_copy validates updates, and keeps which fields were provided."""
+    """model_copy validates updates, and preserves model_fields_set."""
     message = VehicleLocalPosition(timestamp=1, y=2.0)
     copy = message.model_copy(update={"x": 0.1})
     assert copy.x == np.float32(0.1)
@@ -114,7 +114,7 @@ def test_copy_with_updates_is_validated() -> None:
 
 @given(messages())
 def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
-    """JSON has NaN and infinities as strings, and every validation of it makes the same message to the bit."""
+    """JSON has NaN and infinities as strings, and is read back to a bit-identical message."""
     text = message.model_dump_json()
     assert "nan" not in text
     assert "inf" not in text
@@ -131,7 +131,7 @@ def test_copy_of_a_valid_message_is_the_same(message: VehicleLocalPosition, name
 
 
 def test_json_schema_describes_the_json() -> None:
-    """Every field has a type and a description; floats may be the three strings; there is no NaN in it."""
+    """Every field has a description and no default, and floats may be one of the three strings."""
     schema = json_schema()
     properties = schema["properties"]
     assert isinstance(properties, dict)
@@ -142,8 +142,8 @@ def test_json_schema_describes_the_json() -> None:
     assert schema["additionalProperties"] is False
 
 
-def test_messages_are_equal_by_their_values() -> None:
-    """NaN equals NaN here: a message equals its own copy, and can be found in a set."""
+def test_messages_are_compared_by_value() -> None:
+    """NaN equals NaN, so that a message equals its copy and can be found in a set."""
     one, two = VehicleLocalPosition(timestamp=1, x=0.5), VehicleLocalPosition(timestamp=1, x=0.5)
     assert one == two
     assert len({one, two}) == 1
@@ -155,15 +155,15 @@ def test_messages_are_equal_by_their_values() -> None:
 @pytest.mark.parametrize(
     "fields", [{"x": "nan"}, {"x": "1.0"}, {"timestamp": "NaN"}, {"xy_valid": "NaN"}, {"delta_xy": [1.0]}, {"x": [1.0]}]
 )
-def test_only_what_json_writes_is_read_back(fields: dict[str, object]) -> None:
-    """The model stays strict: other text, and other lengths, are no numbers."""
+def test_other_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
+    """The model accepts only the strings and lengths that its own JSON has."""
     with pytest.raises(ValidationError) as info:
         VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
     assert [detail["loc"][0] for detail in info.value.errors()] == list(fields)
 
 
-def test_numpy_scalars_make_a_message() -> None:
-    """Elements of arrays can be given to the model, also beside Python's values; those that do not fit are rejected."""
+def test_numpy_scalars_are_accepted() -> None:
+    """NumPy scalars can be mixed with Python values; those that do not fit are rejected."""
     array = np.array([1.5, np.nan], "f4")
     scalars = {
         "timestamp": np.uint64(2**63),
@@ -175,21 +175,21 @@ def test_numpy_scalars_make_a_message() -> None:
     plain = {"timestamp": 2**63, "xy_reset_counter": 7, "xy_valid": True, "x": 1.5, "y": 0.5}
     assert message == VehicleLocalPosition.model_validate({**plain, "delta_xy": (1.5, math.nan)})
     assert {type(value) for value in message.__dict__.values()} == {int, bool, float, tuple}
-    fits_not = {"xy_valid": np.uint8(1), "timestamp": np.int64(-1), "xy_reset_counter": np.uint16(256), "x": array}
-    for name, wrong in fits_not.items():
+    wrong_values = {"xy_valid": np.uint8(1), "timestamp": np.int64(-1), "xy_reset_counter": np.uint16(256), "x": array}
+    for name, wrong in wrong_values.items():
         rejection(**{name: wrong})
 
 
-def test_element_of_an_array_makes_a_message() -> None:
-    """`dict(zip(names, element))` of what `nedbus.read` returns is a message."""
+def test_array_element_is_accepted() -> None:
+    """The columns of an element returned by `nedbus.read` are valid fields of a message."""
     [element] = to_array([VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))])
     fields = {name: element[name] for name in FIELD_TYPES}
     assert VehicleLocalPosition(**fields) == VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))
 
 
 @given(fields=fields(), names=st.sets(st.sampled_from(sorted(FIELD_TYPES))))
-def test_fields_that_are_not_given_are_the_same_on_the_fast_path(fields: dict[str, object], names: set[str]) -> None:
-    """A message of some fields is made, and encoded, without the model's validator: as the model would do it."""
+def test_omitted_fields_are_the_same_on_the_fast_path(fields: dict[str, object], names: set[str]) -> None:
+    """A message with some fields is created and encoded exactly as with the model's validator."""
     given_fields: dict[str, Any] = {"timestamp": fields["timestamp"], **{name: fields[name] for name in sorted(names)}}
     try:
         slow = VehicleLocalPosition.model_validate(given_fields)

@@ -1,1 +1,1 @@
-"""Definitions and layouts of messages."""
+"""Tests of definitions and layouts."""

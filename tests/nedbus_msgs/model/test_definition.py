@@ -1,4 +1,4 @@
-"""Definitions made at run time, which any peer may send: what is kept of them."""
+"""Lifetime of definitions made at run time, which any peer may send."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nedbus_msgs.codecs.cdr import cdr_layout
 
 
 def use(name: str) -> Definition[Message]:
-    """Return a definition that was used in all forms."""
+    """Return a definition after using all of its codecs."""
     definition = define(name, [("timestamp", field_type("uint64")), ("q", field_type("float32[4]"))])
     codec, message = codec_of(definition), definition.model(timestamp=1)
     assert codec.decode(codec.encode(message)) == message
@@ -23,8 +23,8 @@ def use(name: str) -> Definition[Message]:
     return definition
 
 
-def test_definition_out_of_use_is_freed_with_its_codecs() -> None:
-    """No cache keeps a definition, and each form of it is made once while it is in use."""
+def test_unused_definition_is_freed_with_its_codecs() -> None:
+    """No cache keeps a definition alive, and its codecs are cached while it is in use."""
     kept = use("Kept")
     departed = [weakref.ref(use(f"Departed{number}")) for number in range(50)]
     gc.collect()

@@ -1,4 +1,4 @@
-"""The layout table, compared with the documents that the project started from, and conversion between layouts."""
+"""The layout table, compared with PX4's message pages, and conversion between layouts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given
 from pydantic import ValidationError
 
 from nedbus_msgs import VehicleLocalPosition, field_type
-from tests.flights.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
+from tests.flights.local_position import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
 from tests.nedbus_msgs.strategies import DATA, bits, messages
 
 SEEDS = json.loads((DATA / "seeds.json").read_text())
@@ -20,18 +20,18 @@ SHARED = Path(__file__).parents[4] / "shared" / "seeds"
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_layout_is_the_documents(name: str) -> None:
-    """Names, order and types of each document's message definition are those of the table."""
+def test_layout_equals_px4s_page(name: str) -> None:
+    """The table has the names, order and types of each page's message definition."""
     layout = LAYOUTS[name]
     assert [[field, str(kind)] for field, kind in layout.types.items()] == SEEDS[name]["fields"]
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_fixture_is_the_documents(name: str) -> None:
-    """tests/data/seeds.json has the fields of the documents."""
+def test_fixture_equals_px4s_page(name: str) -> None:
+    """tests/data/seeds.json has the fields of the original pages."""
     path = SHARED / SEEDS[name]["seed"]
     if not path.exists():
-        pytest.skip(f"the document is not here: {path.name}")
+        pytest.skip(f"page not found: {path.name}")
     rows = re.findall(
         r"^(uint64|uint8|bool|float32(?:\[2\])?|float64)\s+(\w+)\s*(?=#|$)", path.read_text(), re.MULTILINE
     )
@@ -39,7 +39,7 @@ def test_fixture_is_the_documents(name: str) -> None:
 
 
 def test_table_has_px4s_layouts() -> None:
-    """Five layouts, with PX4's numbers of fields; two are used on the wire; publishers send it as JSON."""
+    """There are five layouts with PX4's field counts, two of them used on the wire, and the table is JSON."""
     table = json.loads(json.dumps(layout_table()))
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
         ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),
@@ -52,14 +52,14 @@ def test_table_has_px4s_layouts() -> None:
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_layout_is_found_from_names_in_any_order(name: str) -> None:
-    """A ULog sorts fields by size; the names alone determine the layout."""
+    """A ULog sorts fields by size, so field names alone identify the layout."""
     assert find_layout(reversed(LAYOUTS[name].fields)) is LAYOUTS[name]
     assert find_layout(LAYOUTS[name].fields[1:]) is None
 
 
 @given(messages())
-def test_downgrade_then_upgrade_keeps_what_the_layout_has(message: VehicleLocalPosition) -> None:
-    """Every field that both layouts have survives to the bit; hagl_max follows PX4's translation."""
+def test_downgrade_and_upgrade_keep_common_fields(message: VehicleLocalPosition) -> None:
+    """Fields that both layouts have are unchanged bit for bit; hagl_max follows PX4's translation."""
     for name, layout in LAYOUTS.items():
         older = downgrade(message, name)
         assert tuple(older) == layout.fields
@@ -74,8 +74,8 @@ def test_downgrade_then_upgrade_keeps_what_the_layout_has(message: VehicleLocalP
         assert not set(lost) & back.model_fields_set
 
 
-def test_not_provided_fields_of_an_old_layout() -> None:
-    """Fields that 1.13 lacks are NaN, false or 0 and not in model_fields_set."""
+def test_fields_missing_in_an_old_layout_are_not_provided() -> None:
+    """Fields that 1.13 lacks are NaN, false or 0."""
     older = downgrade(VehicleLocalPosition(timestamp=7, dead_reckoning=True, tilt_var=1.0, hagl_max_z=5.0), "1.13")
     message = upgrade(older)
     assert (message.dead_reckoning, message.dist_bottom_reset_counter) == (False, 0)
@@ -83,15 +83,15 @@ def test_not_provided_fields_of_an_old_layout() -> None:
     assert (message.hagl_max_z, message.hagl_max_xy) == (5.0, 5.0)
 
 
-def test_yaw_of_1_11_is_heading() -> None:
-    """1.11 and before have yaw; 2016 logs have 24 fields: known fields are used, the rest is not provided."""
+def test_yaw_of_1_11_becomes_heading() -> None:
+    """In logs up to 1.11, yaw is renamed, unknown fields are ignored, and missing ones are not provided."""
     message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
     assert (message.heading, message.x) == (0.5, 1.0)
     assert message.model_fields_set == {"timestamp", "x", "heading"}
 
 
-def test_upgrade_keeps_the_rules() -> None:
-    """Old layouts are validated like the current one."""
+def test_upgrade_validates_the_message() -> None:
+    """Messages of old layouts are validated like current ones."""
     with pytest.raises(ValidationError, match="xy_valid"):
         upgrade({"timestamp": 1, "xy_valid": True})
 
@@ -107,14 +107,14 @@ def test_upgrade_keeps_the_rules() -> None:
         ("uint8[1]", (1, 2), None), ("uint8", (1,), None), ("uint8[1]", 1, None),
     ],
 )  # fmt: skip
-def test_number_fits_only_if_it_keeps_its_value(kind: str, value: object, fitted: object) -> None:
-    """A number of another type, or an array of fewer of them, is converted exactly, or not at all."""
+def test_number_fits_only_if_its_value_is_unchanged(kind: str, value: object, fitted: object) -> None:
+    """A number of another type, or a shorter array, is converted exactly or not at all."""
     found = field_type(kind).fit(value)
     assert found == fitted
     assert type(found) is type(fitted)
 
 
-def test_not_a_number_fits_any_float() -> None:
-    """NaN is kept, and a shorter array is filled up with it."""
+def test_nan_fits_any_float_type() -> None:
+    """NaN is kept, and pads a shorter array."""
     assert math.isnan(field_type("float32").fit(math.nan))
     assert repr(field_type("float32[3]").fit((1, math.nan))) == "(1.0, nan, nan)"

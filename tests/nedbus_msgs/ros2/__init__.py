@@ -1,1 +1,1 @@
-"""Names, types and definitions of ROS 2."""
+"""Tests of ROS 2 names, types and .msg files."""

@@ -1,4 +1,4 @@
-"""PX4's .msg files: what they define, their hashes as a real PX4 sent them, and what is said of those that are none."""
+"""PX4's .msg files: definitions, hashes as sent by a real PX4, and errors for invalid files."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ import pytest
 from pydantic import ValidationError
 
 from nedbus_msgs import MESSAGES, MsgError, define_msg, definition_text, hash_of, hash_of_msg, read_msg, ros2_type
-from tests.flights.first_message import decode, encode
+from tests.flights.local_position import decode, encode
 from tests.nedbus_msgs.strategies import DATA
 
 TRIPLET_HASH = "RIHS01_e05aa5eb29374ce845899062b5810cc8487743bb95a976094821c1d0312e45aa"
-"""Of the key on which PX4 main of 2026-05 sent it."""
-WITHIN = "\n" + "=" * 80 + "\nMSG: px4_msgs/"
+"""From the key on which PX4 main of 2026-05 published it."""
+NESTED = "\n" + "=" * 80 + "\nMSG: px4_msgs/"
 MANY = "".join(f"uint8 f{number}\n" for number in range(300))
 TRIPLET = (
     (DATA / "msg" / "PositionSetpointTriplet.msg").read_text()
-    + f"{WITHIN}PositionSetpoint\n"
+    + f"{NESTED}PositionSetpoint\n"
     + (DATA / "msg" / "PositionSetpoint.msg").read_text()
 )
 
 
 @pytest.mark.parametrize("name", list(MESSAGES))
-def test_definitions_of_ours_are_read_back(name: str) -> None:
-    """The .msg text of each message is one again: the same fields, and the same hash."""
+def test_definition_text_round_trip(name: str) -> None:
+    """The .msg text of each layout is parsed to the same fields and the same hash."""
     definition = MESSAGES[name]
     for layout in definition.layouts.values():
         text = definition_text(definition, layout)
@@ -34,18 +34,18 @@ def test_definitions_of_ours_are_read_back(name: str) -> None:
         assert hash_of_msg(name, text) == hash_of(layout, ros2_type(definition))
 
 
-def test_messages_within_a_message_are_fields_and_part_of_the_hash() -> None:
-    """PositionSetpointTriplet has three times the 20 fields of a PositionSetpoint; the hash is the one a PX4 sent."""
+def test_nested_messages_are_flattened_and_hashed() -> None:
+    """PositionSetpointTriplet has the 20 fields of PositionSetpoint three times, and the hash sent by a real PX4."""
     assert hash_of_msg("PositionSetpointTriplet", TRIPLET) == TRIPLET_HASH
     definition = define_msg("PositionSetpointTriplet", TRIPLET)
     assert len(definition.types) == 61
     assert list(definition.types)[:4] == ["timestamp", "previous_timestamp", "previous_valid", "previous_type"]
-    many = define_msg("Many", f"uint64 timestamp\nPart[2] parts{WITHIN}Part\nuint8[3] of\nbool is\n")
+    many = define_msg("Many", f"uint64 timestamp\nPart[2] parts{NESTED}Part\nuint8[3] of\nbool is\n")
     assert list(many.types) == ["timestamp", "parts_0_of", "parts_0_is", "parts_1_of", "parts_1_is"]
 
 
-def test_annotations_are_rules() -> None:
-    """@range bounds a value or each element of an array; @invalid is what stands for "not known"; units are kept."""
+def test_annotations_become_rules() -> None:
+    """@range bounds a value or each array element, @invalid names the value for "unknown", and units are kept."""
     text = """
         # A comment
         uint64 timestamp        # [us] time since system start
@@ -70,48 +70,48 @@ def test_annotations_are_rules() -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", r"line 1, column 1: it lacks the field 'uint64 timestamp'"),
+        ("", r"line 1, column 1: missing field 'uint64 timestamp'"),
         ("uint64 timestamp\nfloat32 x y\n", r"line 2, column 1: expected a field"),
         ("uint64 timestamp\n  float16 x\n", r"line 2, column 3: 'float16' is not a type"),
         ("uint64 timestamp\nfloat32[] x\n", r"line 2, column 1: 'float32\[\]' is not a type"),
         ("uint64 timestamp\nfloat32[<=4] x\n", r"line 2, column 1: expected a field, such as"),
         ("uint64 timestamp\nstring name\n", r"line 2, column 1: 'string' is not a type"),
-        ("uint64 timestamp\nfloat32[100000] x\n", r"line 2, column 1: an array of 100000: expected 1 to 1024"),
-        ("uint64 timestamp\nbool x\nuint8  x\n", r"line 3, column 8: a second field 'x'"),
+        ("uint64 timestamp\nfloat32[100000] x\n", r"line 2, column 1: array of 100000 elements: expected 1 to 1024"),
+        ("uint64 timestamp\nbool x\nuint8  x\n", r"line 3, column 8: duplicate field 'x'"),
         ("uint64 timestamp\nOther other\n", r"line 2, column 1: 'Other' is not a type"),
-        (f"uint64 timestamp\nSelf a{WITHIN}Self\nSelf a\n", r"line 5, column 1: 'Self' is not a type"),
-        ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: a constant of type 'Other'"),
-        ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: a field cannot be called 'Upper'"),
-        ("uint64 timestamp\nfloat32 copy\n", r"cannot be called 'copy': a message has a method of that name"),
-        (f"uint64 timestamp\nfloat32 a_b\nBar a{WITHIN}Bar\nfloat32 b\n", r"two fields are called 'a_b'"),
+        (f"uint64 timestamp\nSelf a{NESTED}Self\nSelf a\n", r"line 5, column 1: 'Self' is not a type"),
+        ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: unsupported constant type 'Other'"),
+        ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: invalid field name 'Upper'"),
+        ("uint64 timestamp\nfloat32 copy\n", r"invalid field name 'copy': the Python class Message has"),
+        (f"uint64 timestamp\nfloat32 a_b\nBar a{NESTED}Bar\nfloat32 b\n", r"duplicate field 'a_b'"),
         (
-            f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nC[999] c{WITHIN}C\n",
+            f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nC[999] c{NESTED}C\n",
             r"line 8, .* 'C' is not a type",
         ),
-        (f"uint64 timestamp\n{MANY}", r"301 fields, more than the 256"),
-        ("uint64 timestamp\nfloat64[1000] x\n", r"bytes, more than the 4096"),
-        ("uint8 timestamp\n", r"lacks the field 'uint64 timestamp'"),
+        (f"uint64 timestamp\n{MANY}", r"301 fields, more than the limit of 256"),
+        ("uint64 timestamp\nfloat64[1000] x\n", r"bytes, more than the limit of 4096"),
+        ("uint8 timestamp\n", r"missing field 'uint64 timestamp'"),
         ("#" * 300_000, r"300000 characters, more than the limit of 262144"),
         ("PNG\x00\xff\n", r"line 1, column 1: expected a field"),
     ],
 )
-def test_text_that_is_no_message_says_where(text: str, reason: str) -> None:
-    """The error has line and column, and what is wrong there."""
+def test_invalid_msg_file_raises(text: str, reason: str) -> None:
+    """The error has line, column and reason."""
     with pytest.raises(MsgError, match=reason):
         define_msg("Wrong", text)
 
 
-def test_unknown_value_is_one_as_it_is_sent_too() -> None:
-    """The value that `@invalid` names passes before and after it is rounded to float32; bounds may be infinite."""
+def test_invalid_annotation_survives_float32_rounding() -> None:
+    """The value named by `@invalid` is valid before and after rounding to float32; it may be infinite."""
     text = "uint64 timestamp\nfloat32 a # @range 1, 5 @invalid 0.1\nfloat32 b # @range 1, 5 @invalid inf\n"
     definition = define_msg("Gauge", text)
     message = definition.model.model_validate({"timestamp": 1, "a": 0.1, "b": math.inf})
     assert decode(encode(message), definition.model) == message
 
 
-def test_messages_within_messages_are_bounded() -> None:
-    """A text of some lines that stands for a million fields is refused."""
-    text = f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nuint8 c\n"
+def test_too_many_nested_fields_raise() -> None:
+    """A short text that expands to a million fields is rejected."""
+    text = f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nuint8 c\n"
     with pytest.raises(MsgError, match="more than 1000 fields"):
         define_msg("Large", text)
 
@@ -124,8 +124,8 @@ def test_messages_within_messages_are_bounded() -> None:
         "float32 angle # \u2028 line separator", "float32 angle # \x85 next line", "float32 angle\r\n",
     ],
 )  # fmt: skip
-def test_text_of_ros2_is_accepted(line: str) -> None:
-    """Defaults, constants of strings, a byte order mark, and separators of lines in Unicode, which end no line."""
+def test_ros_2_syntax_is_accepted(line: str) -> None:
+    """Defaults, string constants, a byte order mark, and Unicode line separators in comments are accepted."""
     fields = read_msg(f"\ufeffuint64 timestamp\n{line}\nuint8 mode\n")
     assert [field.name for field in fields] == ["timestamp", "angle", "mode"]
 
@@ -136,14 +136,14 @@ def test_text_of_ros2_is_accepted(line: str) -> None:
         "".join(f"uint8 f{number}\n" for number in range(19_000)),
         "uint8 a # @range" + " " * 200_000,
         "uint8 a # @range " + "9" * 200_000,
-        f"A[999] a{WITHIN}A\nuint8 b #" + "@range " * 30_000,
-        f"A[999] a{WITHIN}A\nB[999] b{WITHIN}B\n" + "".join(f"C[0] c{i}\n" for i in range(9000)) + f"{WITHIN}C\nbool d",
-        "A[999] " + "a" * 200_000 + f"{WITHIN}A\nuint8 b",
+        f"A[999] a{NESTED}A\nuint8 b #" + "@range " * 30_000,
+        f"A[999] a{NESTED}A\nB[999] b{NESTED}B\n" + "".join(f"C[0] c{i}\n" for i in range(9000)) + f"{NESTED}C\nbool d",
+        "A[999] " + "a" * 200_000 + f"{NESTED}A\nuint8 b",
     ],
     ids=["fields", "spaces", "digits", "comment", "empty arrays", "long name"],
 )
 def test_parsing_takes_linear_time(text: str) -> None:
-    """No text of 200,000 characters takes more than a fraction of a second, whatever it stands for."""
+    """Hostile texts of 200,000 characters are parsed or rejected within the time limit."""
     begin = time.process_time()
     with suppress(MsgError):
         define_msg("Long", f"uint64 timestamp\n{text}")

@@ -1,4 +1,4 @@
-"""Names of ROS 2 topics, and ROS 2's types of the message, compared with PX4's known type hashes."""
+"""ROS 2 topic names, types and type hashes, compared with those of PX4."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nedbus_msgs import (
     ros2_types,
     split_ros2_topic,
 )
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     ROS2_TYPE,
     decode_cdr,
     downgrade,
@@ -36,7 +36,7 @@ ADDRESSES = st.sampled_from(sorted(TOPICS)).flatmap(
 
 @given(ADDRESSES, NAMESPACES, st.sampled_from(["", "/"]))
 def test_topic_round_trip(address: Address, namespace: str, slash: str) -> None:
-    """The name of an address's topic splits into its namespace, topic and instance, with a leading slash or not."""
+    """A ROS 2 topic name splits into namespace, topic and instance again, with or without a leading slash."""
     name = ros2_topic_of(address, namespace)
     assert split_ros2_topic(slash + name) == (namespace, address.topic, address.instance)
 
@@ -49,8 +49,8 @@ def test_topic_round_trip(address: Address, namespace: str, slash: str) -> None:
         (Address("1", "vehicle_local_position"), "/fleet/a/", "fleet/a/fmu/out/vehicle_local_position"),
     ],
 )
-def test_topic_is_px4s(address: Address, namespace: str, name: str) -> None:
-    """The name is PX4's, below the namespace; an instance is a suffix."""
+def test_topic_name_equals_px4s(address: Address, namespace: str, name: str) -> None:
+    """The name is PX4's, below the namespace, with the instance as suffix."""
     assert ros2_topic_of(address, namespace) == name
 
 
@@ -69,14 +69,14 @@ def test_topic_is_px4s(address: Address, namespace: str, name: str) -> None:
         ("fmu/out/wheel_encoders_1", ("", "wheel_encoders", 1)),
     ],
 )
-def test_other_spellings_are_accepted(name: str, parts: tuple[str, str, int | None]) -> None:
+def test_variants_of_topic_names_are_accepted(name: str, parts: tuple[str, str, int | None]) -> None:
     """A version suffix is ignored, an instance may lack its underscore, and instance 0 may lack its number."""
     assert split_ros2_topic(name) == parts
 
 
 @pytest.mark.parametrize("name", ["", "/", "fmu/out/Attitude", "fmu/out/vehicle_local_position_x", "a_/", "fmu/out/_0"])
-def test_other_topics_are_rejected(name: str) -> None:
-    """A name that no topic of PX4 can have, or that is nearly a topic's, is an AddressError."""
+def test_invalid_topic_name_raises(name: str) -> None:
+    """A name that no PX4 topic can have, or a misspelled one, raises AddressError."""
     with pytest.raises(AddressError, match="topic"):
         split_ros2_topic(name)
 
@@ -94,8 +94,8 @@ HASHES = {
 
 
 @pytest.mark.parametrize(("layout", "ros2_type"), HASHES)
-def test_hash_is_ros_2s(layout: str, ros2_type: str) -> None:
-    """The hash is the one that ROS 2 computes of each type, and the layout is found by it."""
+def test_type_hash_equals_ros_2s(layout: str, ros2_type: str) -> None:
+    """Each type has the hash that ROS 2 computes, and the layout is found by that hash."""
     assert ros2_type in ros2_types()
     assert type_hash(layout, name=ros2_type) == f"RIHS01_{HASHES[layout, ros2_type]}"
     assert layout_of_type_hash(type_hash(layout, name=ros2_type)) == layout
@@ -103,7 +103,7 @@ def test_hash_is_ros_2s(layout: str, ros2_type: str) -> None:
 
 
 def test_layout_is_found_by_hash() -> None:
-    """A payload is decoded by the hash of its type as by the name of its layout."""
+    """A payload is decoded by type hash exactly as by layout name."""
     fields = downgrade(VehicleLocalPosition(timestamp=1), "1.14")
     payload = encode_cdr(fields, layout=type_hash("1.14"))
     assert payload == encode_cdr(fields, layout="1.14")
@@ -111,6 +111,6 @@ def test_layout_is_found_by_hash() -> None:
     assert layout_of_type_hash("RIHS01_" + 64 * "0") is None
 
 
-def test_dds_type_is_the_keys() -> None:
-    """A ROS 2 type is written in a key as rmw_zenoh writes it."""
+def test_dds_type_equals_that_of_rmw_zenoh() -> None:
+    """A ROS 2 type appears in keys as rmw_zenoh writes it."""
     assert dds_type(ROS2_TYPE) == "px4_msgs::msg::dds_::VehicleLocalPosition_"

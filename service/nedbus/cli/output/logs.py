@@ -153,7 +153,7 @@ class RateLimit(logging.Filter):
         with self._lock:
             for (_, event, _), bucket in self._buckets.items():
                 if bucket.suppressed and is_due(bucket):
-                    about, args = About("left-out", count=bucket.suppressed, of=event), (bucket.suppressed,)
+                    about, args = About("suppressed", count=bucket.suppressed, of=event), (bucket.suppressed,)
                     reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
                     bucket.suppressed = 0
         for report in reports:

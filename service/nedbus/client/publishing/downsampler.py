@@ -13,7 +13,7 @@ from typing import Final
 import zenoh
 
 from nedbus.client.rate_gate import RATES, RateGate
-from nedbus.transport import Session, while_open
+from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ANY, Address, Topic, get_topic
 
 from .writer import Heartbeats, Writer
@@ -26,7 +26,7 @@ class MatchingListener:
     """Matching status of a key expression, from a publisher that never publishes. Thread-safe."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
-        with while_open():
+        with translate_zenoh_errors():
             self._probe = session.declare_publisher(key_expr)
             # It reports the current status first.
             self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))

@@ -13,7 +13,7 @@ from nedbus.client.protocol import CLOSED
 from nedbus.errors import ClosedError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import Answers, ask
+from nedbus.transport import Replies, send_query
 from nedbus_msgs import ack_key
 
 from .writer import Writer
@@ -90,7 +90,7 @@ class _Request:
     def __init__(self, number: int, routers: list[str], *, read: bool, now: float) -> None:
         self.number, self.read, self.routers = number, read, routers
         self.sent = self.last_reply = now
-        self.queries: set[Answers] = set()  # without those that timed out
+        self.queries: set[Replies] = set()  # without those that timed out
         self.replies: dict[str, bool] = {}  # by reader, True if it is closed
 
     def poll(self, now: float) -> bool:
@@ -135,7 +135,7 @@ class FlowControl:
         if self._wait(published, self._window, read=True, timeout=_TRICKLE_PERIOD):
             return
         if not self._logged:
-            _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow-reader"))
+            _log.info("%s: waiting for a slow reader", self._writer.key, extra=about("slow_reader"))
         self._logged = True
         self._wait(published, _MAX_UNACKNOWLEDGED, read=True, timeout=math.inf)
 
@@ -174,7 +174,7 @@ class FlowControl:
         number = (request.number - 1) % 2**32
         selector = f"{ack_key(writer.key)}?publisher={writer.name};number={number};read={request.read:d}"
         session, priority, timeout = writer.session, writer.priority, _QUERY_TIMEOUT
-        request.queries.add(ask(session, selector, timeout=timeout, priority=priority, congestion_control=_DROP))
+        request.queries.add(send_query(session, selector, timeout=timeout, priority=priority, congestion_control=_DROP))
 
     def _poll(self, now: float) -> None:
         request, is_stale, self._polled = self._request, now - self._polled > _STALE_POLL, now

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import zenoh
 
 from nedbus.errors import NedbusError
-from nedbus.transport import require_unforked, translate_error, while_open
+from nedbus.transport import require_unforked, translate_error, translate_zenoh_errors
 from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, encoding_of, get_topic
 
 from .downsampler import Downsampler, MatchingListener
@@ -61,7 +61,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         self._encoding = self._declared = encoding_of(definition, source)
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # fields of the last message with missing ones
         topic = get_topic(address.topic)
-        with while_open():
+        with translate_zenoh_errors():
             token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
             self._token = heartbeats.session.liveliness().declare_token(token)
         cache = CACHE if lossless else topic.kept

@@ -17,7 +17,7 @@ from nedbus.client.discovery import VehicleDirectory
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
-from nedbus.transport import Session, alive_keys, while_open
+from nedbus.transport import Session, alive_keys, translate_zenoh_errors
 from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
 
 from .downsampler import MatchingListener
@@ -95,7 +95,7 @@ class PublisherRegistry:
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
         """Publish a rejection report for an address; values that JSON cannot represent become text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)
-        with while_open():
+        with translate_zenoh_errors():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
     def shared_vehicles(self) -> set[str]:
@@ -140,10 +140,10 @@ class PublisherRegistry:
             while not publisher.flush(min(_FLUSH_POLL, max(0.0, end - time.monotonic()))):
                 if (stop and stop.is_set()) or time.monotonic() >= end:
                     text = "%s: a reader has not received all messages"
-                    _log.warning(text, address, extra=about("slow-reader", address))
+                    _log.warning(text, address, extra=about("slow_reader", address))
                     return
                 if not logged:
-                    _log.info("%s: waiting for a slow reader", address, extra=about("slow-reader", address))
+                    _log.info("%s: waiting for a slow reader", address, extra=about("slow_reader", address))
                 logged = True
 
     def forget(self, address: Address) -> None:

@@ -11,7 +11,7 @@ import zenoh
 
 from nedbus.client.io_thread import TICK, CallThread, Job
 from nedbus.log_event import about
-from nedbus.transport import Session, while_open
+from nedbus.transport import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class QueryServer:
 
 class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
-        with while_open():
+        with translate_zenoh_errors():
             self._queryable = session.declare_queryable(key_expr, zenoh.handlers.RingChannel(_MAX_PENDING))
         self._take, self._reply = self._queryable.handler.try_recv, reply
         self._query: zenoh.Query | None = None  # to be replied to
@@ -100,5 +100,5 @@ class _Queryable:
                 except zenoh.ZError as exc:
                     _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
                 except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
-                    _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))
+                    _log.exception("%s: failed to reply to a query", key_expr, extra=about("internal_error"))
                 self._query = self._take() if time.monotonic() < end else None

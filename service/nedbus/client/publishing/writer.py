@@ -12,7 +12,7 @@ from zenoh import Priority
 
 from nedbus.client.io_thread import TICK, Job
 from nedbus.errors import ClosedError
-from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payload, while_open
+from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payload, translate_zenoh_errors
 from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
@@ -33,7 +33,7 @@ class Writer:
         self.silent_since, self.sent_heartbeats = 0.0, 0  # time of the last message [s], and heartbeats since then
         self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a look at `last_put` [s]
         self._heartbeats = heartbeats
-        with while_open():
+        with translate_zenoh_errors():
             # Interconnected routers cache the route of a message only if something is declared on its exact key.
             self._token = self.session.liveliness().declare_token(key)
             self._publisher: zenoh.ext.AdvancedPublisher | None = zenoh.ext.declare_advanced_publisher(

@@ -17,7 +17,7 @@ from nedbus.client.discovery import parse_replies
 from nedbus.errors import NedbusError, UnknownLayoutError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_ANSWERS, Session, ask, wait_for_answers
+from nedbus.transport import MAX_REPLIES, Session, send_query, wait_for_replies
 from nedbus_msgs import MESSAGES, Codec, Definition, codec_of, define, field_type, schema_key, short_hash
 
 _log = logging.getLogger(__name__)
@@ -175,7 +175,7 @@ class LayoutLookup:
             return False
         self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
         text = "%s is not installed here: using the publisher's description"
-        _log.info(text, name, extra=about("described", reason=f"hash {identity}"))
+        _log.info(text, name, extra=about("runtime_definition", reason=f"hash {identity}"))
         return True
 
     def _make_room(self, size: int) -> bool:
@@ -195,7 +195,7 @@ class LayoutLookup:
             return False
         self._newer[name] = {**newer, number: tuple(fields)}
         ignored = ", ".join(field for field in fields if field not in definition.types)[:_MAX_TEXT] or "nothing"
-        extra = about("newer-layout")
+        extra = about("newer_layout")
         _log.warning("layout %d of %s is newer than this reader; not read: %s", number, name, ignored, extra=extra)
         return True
 
@@ -224,8 +224,8 @@ def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -
     keys = {
         schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
     }
-    queries = [ask(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
-    replies = islice(wait_for_answers(queries), MAX_ANSWERS)
+    queries = [send_query(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
+    replies = islice(wait_for_replies(queries), MAX_REPLIES)
     for key, content in parse_replies(reply.ok for reply in replies if reply.ok is not None):
         name = key.rpartition("/")[2]
         layouts = content.get("layouts") if isinstance(content, dict) else None

@@ -18,7 +18,7 @@ from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import AliveTokens, RawSample, Session, ask
+from nedbus.transport import AliveTokens, RawSample, Session, send_query
 from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
 
 from .decoder import Arrival, Decoder, detach
@@ -86,7 +86,7 @@ class MaxRateReceiver(Receiver):
         self._prefix, self._rate_queue, selection = queue.decoder.prefix, queue, queue.selection
         self._awaiting: dict[Address, float] = {}  # appearance of tokens without a downsampled message yet [s]
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=self._prefix))
-        self._last = ask(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
+        self._last = send_query(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
         super().__init__(session, queue, history=False)
         self._undeclares.append(self._tokens.undeclare)
         self.pump()  # last messages bypass the ring, so no reader may block on it

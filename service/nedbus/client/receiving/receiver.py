@@ -19,7 +19,7 @@ from nedbus.client.closing import join_thread
 from nedbus.client.io_thread import TICK, Job
 from nedbus.client.protocol import CLOSED
 from nedbus.log_event import about
-from nedbus.transport import Session, while_open
+from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ack_key
 
 from .decoder import WAKE_UP
@@ -59,7 +59,7 @@ class Receiver:
         self._pump: threading.Thread | None = None
         # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
-        with while_open():
+        with translate_zenoh_errors():
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 session, key_expr, zenoh.handlers.RingChannel(RING_CAPACITY), history=last
             )
@@ -71,7 +71,7 @@ class Receiver:
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
         if not pending_queue.newest_only:
-            with while_open():
+            with translate_zenoh_errors():
                 queryable = session.declare_queryable(ack_key(key_expr), zenoh.handlers.RingChannel(MAX_ACK_REQUESTS))
                 links = session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(1), history=False)
             self._undeclares += [queryable.undeclare, links.undeclare]
@@ -173,7 +173,7 @@ class Receiver:
         try:
             self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
         except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
-            extra = about("bug")
+            extra = about("internal_error")
             _log.exception("%s: unexpected error, %d samples discarded", self._queue.name, len(batch), extra=extra)
             self._queue.decoder.count_invalid(len(batch))
 

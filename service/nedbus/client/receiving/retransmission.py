@@ -84,7 +84,7 @@ class Retransmission:
         try:
             recovered = self._queue.on_retransmission(writer, found, ended=ended, now=now)
         except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
-            _log.exception("%s: unexpected error, recovered messages discarded", key, extra=about("bug"))
+            _log.exception("%s: unexpected error, recovered messages discarded", key, extra=about("internal_error"))
             self._open.pop(writer, None)
             recovered = self._queue.on_retransmission(writer, {}, ended=True, now=float("inf"))
         return key if recovered else ""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from nedbus.timings import TIMINGS
-from nedbus.transport import MAX_ANSWERS
+from nedbus.transport import MAX_REPLIES
 
 from .decoder import Arrival, KeyState, detach
 
@@ -110,7 +110,7 @@ class WriterProxy:
             request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
         request.attempts += 1
         self.account.requesting[self] = self.account.requesting.pop(self)
-        request.requested = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
+        request.requested = range(max(self.expected, last - MAX_REPLIES + 1), last + 1)
         return request.requested
 
     def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> None:

@@ -128,9 +128,9 @@ class LogStream:
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
             text = f"streaming; the header took {header:.1f} s, a gap in the vehicle's own log"
-            _log.info("%s: ULog stream: %s", address, text, extra=about("log-stream", address))
+            _log.info("%s: ULog stream: %s", address, text, extra=about("log_stream", address))
         elif status.reason is not None:
-            extra = about("log-stream", address, reason=status.text)
+            extra = about("log_stream", address, reason=status.text)
             _log.warning("%s: no ULog stream: %s", address, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
@@ -196,14 +196,14 @@ class LogStream:
         try:
             if piece.begins and self._folder is not None:
                 self._file = LogFile(self._folder, self._name)
-                _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log-stream"))
+                _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log_stream"))
             if self._file is not None:
                 if piece.lost:
                     self._file.mark_gap(now - (self._last_piece or now))
                 self._file.write(piece.data)
         except OutputError as exc:
             self.close()
-            _log.error("%s: the ULog stream is no longer saved: %s", self._name, exc, extra=about("log-stream"))
+            _log.error("%s: the ULog stream is no longer saved: %s", self._name, exc, extra=about("log_stream"))
 
 
 class LogFile:

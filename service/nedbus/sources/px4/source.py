@@ -32,7 +32,7 @@ from nedbus.transport import (
     node_token,
     open_client,
     px4_publishers_key_expr,
-    while_open,
+    translate_zenoh_errors,
 )
 from nedbus_msgs import Address, Definition, bases_of_msg, dds_type, decode_with, define_msg, hash_of_msg, ros2_type
 
@@ -104,7 +104,7 @@ class Px4ZenohNode:
         self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
         self._reported = Counter[tuple[str, str]]()
         key_expr = f"{'*' if domain is None else domain}/**/{PX4_TYPES}/*"
-        with while_open():
+        with translate_zenoh_errors():
             self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
         handler = self._subscriber.handler
         self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
@@ -155,14 +155,14 @@ class Px4ZenohNode:
             if (form := stream.form) is None:
                 form = self._streams.form_of(stream)
                 if form.unknown:
-                    extra = about("newer-layout", stream.address, source="px4-zenoh")
+                    extra = about("newer_layout", stream.address, source="px4-zenoh")
                     _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
             definition, layout, unknown = form
             address = stream.address
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
                 if not stream.is_bridged:
-                    extra = about("looped", source="px4-zenoh")
+                    extra = about("bridge_loop", source="px4-zenoh")
                     _log.info("%s comes from nedbus ros2: ignored to avoid a loop", key, extra=extra)
                 stream.is_bridged = True
                 return None
@@ -199,7 +199,7 @@ class Px4ZenohNode:
                 self._subscriptions.pop(token.key).undeclare()
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
-        with while_open():
+        with translate_zenoh_errors():
             return self._session.liveliness().declare_token(text)
 
     def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:

@@ -20,7 +20,7 @@ from nedbus.settings import Settings
 from nedbus.timings import Timings
 from nedbus.transport import alive_tokens, open_router
 from nedbus_msgs import ANY
-from tests.flights.first_message import LAYOUTS, json_schema
+from tests.flights.local_position import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import fork_command, run_command
 from tests.peers.ports import free_endpoint
@@ -91,7 +91,7 @@ def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
 
 def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """If replies are missing, the list shows the others with a warning and exits with 1."""
-    monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 1)
+    monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1
@@ -239,19 +239,19 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
             ["echo", "vehicle_local_positon"],
             "topic 'vehicle_local_positon' is not valid: expected vehicle_local_position or ",
         ),
-        (["echo", "--field", "xy_vallid"], "--field: there is no field 'xy_vallid': did you mean xy_valid"),
-        (["echo", "--field", "qqq"], "--field: there is no field 'qqq': 'nedbus schema' lists them"),
-        (["echo", "vehicle_attitude", "--field", "x"], "'nedbus schema VehicleAttitude' lists them"),
-        (["echo", "vehicle_attitude", "--field", "q[1]"], "there is no field 'q[1]': did you mean q?"),
+        (["echo", "--field", "xy_vallid"], "--field: unknown field 'xy_vallid': did you mean xy_valid"),
+        (["echo", "--field", "qqq"], "--field: unknown field 'qqq': 'nedbus schema' lists the fields"),
+        (["echo", "vehicle_attitude", "--field", "x"], "'nedbus schema VehicleAttitude' lists the fields"),
+        (["echo", "vehicle_attitude", "--field", "q[1]"], "unknown field 'q[1]': did you mean q?"),
         (["echo", "VehicleAttitude"], "expected one of vehicle_attitude, vehicle_attitude_groundtruth"),
-        (["get", "--topic", "sensor_gps/0"], "expected sensor_gps, and 0 as its instance"),
+        (["get", "--topic", "sensor_gps/0"], "expected sensor_gps with instance 0"),
         (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude (looks like a mis"),
         (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink has none of these topics"),
         (["schema", "vehicle_attitud"], "did you mean vehicle_attitude or VehicleAttitude?"),
         (["echo", "vehicle_attitude", "-t", VLP], "--topic: the argument already names the topic 'vehicle_attitude'"),
         (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),
         (["echo", "--once", "-n", "3"], "--count: cannot be combined with --once"),
-        (["get", "--field", "xx"], "--field: there is no field 'xx'"),
+        (["get", "--field", "xx"], "--field: unknown field 'xx'"),
         (["list", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["get", "-t", VLP, "-i", "0"], "instance 0 is not valid: expected none"),
         (["list", "--connect", "nonsense"], "connect: 'nonsense' is not an endpoint"),

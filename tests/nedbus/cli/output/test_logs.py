@@ -23,7 +23,7 @@ from nedbus.log_event import EVENTS, about
 from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import Address
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.command_line import run_command
@@ -90,15 +90,15 @@ def test_log_calls_use_exactly_the_documented_events() -> None:
             events = events_of(call, tree)
             assert events <= EVENTS.keys(), f"{path}, line {call.lineno}"
             used |= events
-    assert used == EVENTS.keys() - {"left-out"}
+    assert used == EVENTS.keys() - {"suppressed"}
 
 
 def test_documented_log_limits_match_the_code() -> None:
     """docs/operate.md has the rate limits of the code, and names existing events."""
     section = (ROOT / "docs" / "operate.md").read_text().partition("\n## Logs\n")[2]
-    named = re.findall(r"^\| ((?:`[a-z-]+`(?:, )?)+) \| [a-z ]", section, re.MULTILINE)
-    events = {each for names in named for each in re.findall(r"`([a-z-]+)`", names)} & EVENTS.keys()
-    assert {"error", "rejected", "client-refused"} <= events
+    named = re.findall(r"^\| ((?:`[a-z_]+`(?:, )?)+) \| [a-z ]", section, re.MULTILINE)
+    events = {each for names in named for each in re.findall(r"`([a-z_]+)`", names)} & EVENTS.keys()
+    assert {"error", "rejected", "client_refused"} <= events
     assert f"{BURST} lines" in section
     assert f"{PER_MINUTE} a minute" in section
 
@@ -163,8 +163,8 @@ def test_service_logs_json(start: Start) -> None:
     lines = [json.loads(line) for line in service.err.splitlines()]
     events = [line["event"] for line in lines]
     assert set(events) <= EVENTS.keys() - {"notice"}
-    assert (events[0], events.count("opened"), events[-1]) == ("router", 2, "ending")
-    assert {line["source"] for line in lines if line["event"] == "opened"} == {REPLAY, "sim:?vehicle=2"}
+    assert (events[0], events.count("replay_opened"), events[-1]) == ("router", 2, "shutdown")
+    assert {line["source"] for line in lines if line["event"] == "replay_opened"} == {REPLAY, "sim:?vehicle=2"}
 
 
 @pytest.mark.parametrize("level", ["info", "debug"])
@@ -251,10 +251,10 @@ def test_each_kind_of_line_has_its_own_limit() -> None:
     """A flood does not suppress lines of other events and texts; lifecycle events are never limited."""
     limited = Limited()
     limited.flood(1000)
-    assert limited.flood(3, "%s is back", event="back") == 3
-    assert limited.flood(3, event="back") == 3
+    assert limited.flood(3, "%s is back", event="stream_resumed") == 3
+    assert limited.flood(3, event="stream_resumed") == 3
     unlimited = [name for name, event in EVENTS.items() if not event.limited]
-    assert {"retrying", "failed", "done", "router", "ending", "error"} <= set(unlimited)
+    assert {"retrying", "failed", "done", "router", "shutdown", "error"} <= set(unlimited)
     for name in unlimited:
         assert limited.flood(2 * BURST, event=name) == 2 * BURST
 
@@ -268,7 +268,7 @@ def test_suppressed_lines_are_reported_after_a_flood() -> None:
     assert limited.flood(1, "%s", event="done") == 2
     assert limited.lines[-2].startswith("suppressed 5 more lines")
     limited.limit.report()
-    limited.flood(BURST + 5, "%s is back", event="back")
+    limited.flood(BURST + 5, "%s is back", event="stream_resumed")
     limited.limit.report()
     assert limited.lines[-1].startswith("suppressed 5 more lines")
 
@@ -289,7 +289,7 @@ def test_report_of_suppressed_lines_is_an_event() -> None:
     limit.report()
     (report,) = reports
     fields = json.loads(JsonFormatter().format(report))
-    assert (fields["event"], fields["of"], fields["count"], fields["level"]) == ("left-out", "stale", 3, "warning")
+    assert (fields["event"], fields["of"], fields["count"], fields["level"]) == ("suppressed", "stale", 3, "warning")
     assert fields["message"].isprintable()
 
 
@@ -301,11 +301,11 @@ def count_lines(text: str, elapsed: float) -> Counter[str]:
         fields = json.loads(line)
         event = str(fields["event"])
         total[fields.get("of", event)] += fields.get("count", 1)
-        logged[f"left-out {fields['of']}" if event == "left-out" else event] += 1
+        logged[f"suppressed {fields['of']}" if event == "suppressed" else event] += 1
     due = elapsed / 60 * PER_MINUTE + 1
     for event, count in logged.items():
         # One more report is logged at exit.
-        assert count <= (due + 1 if event.startswith("left-out") else BURST + due), event
+        assert count <= (due + 1 if event.startswith("suppressed") else BURST + due), event
     return total
 
 
@@ -353,4 +353,4 @@ def test_log_of_flapping_vehicles_is_rate_limited(
     total = count_lines(service.err, time.monotonic() - began)
     assert total["published"] == total["rebooted"] == VEHICLES
     assert total["stale"] >= VEHICLES
-    assert total["ending"] == 1
+    assert total["shutdown"] == 1

@@ -20,7 +20,7 @@ from nedbus.client.receiving import Receiver
 from nedbus.transport import open_client
 from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, define, field_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import MS, Clock, clock, wait_for_demand
 from tests.nedbus.client.lossy import LossyQueue
@@ -202,7 +202,7 @@ def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: 
         publisher.publish({"timestamp": 1})
         wait_for(lambda: bus.latest("wheel_encoders"), what="the message")
         shown = json.loads(run_command("schema", "wheel_encoders", "-c", endpoint).out)
-        assert shown["description"] == "A message of PX4 that has no file in nedbus."
+        assert shown["description"] == "A message defined at run time."
         assert list(shown["properties"]) == ["timestamp", "wheel_speed"]
     for wrong in ("wheel_encoders_b", "WheelEncoders", "*"):
         ended = run_command("schema", wrong, "-c", endpoint)

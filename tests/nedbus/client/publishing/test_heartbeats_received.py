@@ -9,7 +9,7 @@ import zenoh
 import nedbus
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
-from tests.flights.first_message import decode
+from tests.flights.local_position import decode
 from tests.flights.messages import VLP
 from tests.nedbus.client.downsampling import Link, wait_for_demand
 from tests.nedbus.client.numbered import publish, wait_for_subscriber

@@ -14,7 +14,7 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
 from nedbus.transport import RawSample
-from tests.flights.first_message import encode, encoding_of
+from tests.flights.local_position import encode, encoding_of
 from tests.flights.messages import message
 
 KEY = "nedbus/1/vehicle_local_position"

@@ -22,7 +22,7 @@ from nedbus.client.protocol import LIVE
 from nedbus.client.receiving import PendingQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
 from tests.nedbus.client.test_bus import BOTH, SCHEMA

@@ -17,7 +17,7 @@ from nedbus.client.publishing.flow_control import CACHE, WINDOW
 from nedbus.transport import Session, open_router
 from nedbus_msgs import Address, Row, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
-from tests.flights.first_message import LAYOUTS, downgrade, encode
+from tests.flights.local_position import LAYOUTS, downgrade, encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
 from tests.peers.ports import free_endpoint

@@ -20,7 +20,7 @@ from nedbus.client.rate_gate import rate_step
 from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import RATE, Address, AddressError, Selection
-from tests.flights.first_message import encode
+from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 from tests.nedbus.client.numbered import is_read, take, wait_for_subscriber

@@ -27,7 +27,7 @@ from nedbus.timings import Timings
 from nedbus.transport import RawSample
 from nedbus_msgs import DEFAULT, codec_of
 from nedbus_msgs.messages import VehicleAttitude
-from tests.flights.first_message import encode, encoding_of
+from tests.flights.local_position import encode, encoding_of
 from tests.waits import DEADLINE, wait_for
 
 from .raw_samples import (

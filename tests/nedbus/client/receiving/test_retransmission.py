@@ -21,7 +21,7 @@ from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.timings import Timings
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router
-from tests.flights.first_message import encode, encoding_of
+from tests.flights.local_position import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.lossy import Lossy, LossyQueue
 from tests.nedbus.client.numbered import publish, wait_for_subscriber

@@ -26,7 +26,7 @@ from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings
 from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
-from tests.flights.ulogs import said_in, write_raw_log
+from tests.flights.ulogs import log_messages_in, write_raw_log
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
 from tests.waits import DEADLINE
@@ -168,7 +168,7 @@ def test_px4s_words_in_a_stream_are_those_of_its_own_log() -> None:
     received = Received("log=1&topics=log_message", FLIGHT)
     words = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
     assert {each.source for each in words} == {"mavlink-ulog"}
-    logged = said_in(STREAMS / "ulog_stream_flight1.ulg")
+    logged = log_messages_in(STREAMS / "ulog_stream_flight1.ulg")
     assert [tuple(each.fields.values()) for each in words] == [
         each for each in logged if 7_000_000 < each[0] <= cast("int", words[-1].fields["timestamp"])
     ]

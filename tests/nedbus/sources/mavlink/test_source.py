@@ -26,7 +26,7 @@ from nedbus.sources import parse_source
 from nedbus.sources.mavlink.link import open_link
 from nedbus.sources.mavlink.vehicle import ORIGIN
 from nedbus.timings import Timings
-from tests.flights.first_message import upgrade
+from tests.flights.local_position import upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.nedbus.sources.mavlink import mavlink_peer

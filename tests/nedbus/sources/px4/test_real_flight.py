@@ -28,7 +28,7 @@ from nedbus.sources.mavlink.vehicle import Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus.transport import Attachment, Session
 from nedbus_msgs import ANY, TOPICS, Address, VehicleLocalPosition, get_topic, split_ros2_topic
-from tests.flights.first_message import decode_cdr, encode_cdr, upgrade
+from tests.flights.local_position import decode_cdr, encode_cdr, upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS

@@ -20,7 +20,7 @@ from nedbus.errors import ConfigError
 from nedbus.sources import SourceMessage, parse_source
 from nedbus.transport import NO_HASH, Attachment, Session, TopicKey
 from nedbus_msgs import ANY, VehicleLocalPosition, dds_type, define_msg, encode_with, hash_of, ros2_type
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     LAYOUTS,
     ROS2_TYPE,
     downgrade,
@@ -373,7 +373,7 @@ def test_invalid_messages_are_reported(
     px4.raw(payload_of(1, xy_valid=True))
     px4.raw(payload_of(1, eph=-1.0) + b"too long")
     assert "must be finite while xy_valid is true" in reports.handler.recv().payload.to_string()
-    assert "228 bytes, where layout 1.16 has 220" in reports.handler.recv().payload.to_string()
+    assert "228 bytes, expected 220 for layout 1.16" in reports.handler.recv().payload.to_string()
     px4.put(2)
     assert every.receive(DEADLINE).message.timestamp == 2
 

@@ -8,7 +8,7 @@ from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import NotAcceptedError, StreamRegistry
 from nedbus.transport import Attachment, TopicKey
 from nedbus_msgs import DecodeError, dds_type
-from tests.flights.first_message import ROS2_TYPE, type_hash
+from tests.flights.local_position import ROS2_TYPE, type_hash
 from tests.flights.messages import VLP
 
 GID = bytes(range(16))

@@ -1,6 +1,6 @@
-"""VehicleLocalPosition as it was before there were others: its schema, types, hashes and error texts, to the byte.
+"""Snapshot of VehicleLocalPosition: payloads, hashes, dtype, schema and error texts.
 
-The table was written by the version that knew this message alone; a difference is a break of the contract.
+A changed payload, hash or dtype breaks compatibility; a changed text needs a new snapshot.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs import NedbusError, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     LAYOUTS,
     decode_row,
     describe,
@@ -26,29 +26,29 @@ from tests.flights.first_message import (
     message_definition,
     type_hash,
 )
-from tests.flights.first_message import decode as decode_payload
+from tests.flights.local_position import decode as decode_payload
 from tests.nedbus_msgs.strategies import DATA, FLIGHTS, REAL
 
-KEPT: Final = DATA / "vehicle_local_position.json"
+SNAPSHOT: Final = DATA / "vehicle_local_position.json"
 VALID: Final[dict[str, Any]] = {"timestamp": 5, "timestamp_sample": 4, "xy_valid": True, "x": 1.0, "y": 2.0}
-BAD: Final[Mapping[str, Mapping[str, object]]] = {
+INVALID: Final[Mapping[str, Mapping[str, object]]] = {
     "no timestamp": {"x": 1.0},
     "text": {**VALID, "x": "north"},
-    "int beyond its width": {**VALID, "xy_reset_counter": 256},
+    "int out of range": {**VALID, "xy_reset_counter": 256},
     "negative": {**VALID, "timestamp": -1, "timestamp_sample": 0},
-    "bool of an int": {**VALID, "z_valid": 1},
-    "a short pair": {**VALID, "delta_xy": (1.0,)},
-    "text in a pair": {**VALID, "delta_vxy": (1.0, "2")},
+    "int for a bool": {**VALID, "z_valid": 1},
+    "array too short": {**VALID, "delta_xy": (1.0,)},
+    "text in an array": {**VALID, "delta_vxy": (1.0, "2")},
     "beyond float32": {**VALID, "vx": 1e39, "delta_xy": (1e39, 0.0)},
     "not finite while valid": {**VALID, "x": math.nan, "y": math.inf},
     "several rules": {**VALID, "timestamp_sample": 6, "eph": -1.0, "heading": 4.0, "ref_lat": -91.0},
-    "an unknown field": {**VALID, "hight": 1.0},
-    "nothing like it": {**VALID, "qqqq": 1.0},
+    "unknown field": {**VALID, "hight": 1.0},
+    "unknown field without a suggestion": {**VALID, "qqqq": 1.0},
 }
 PAYLOADS: Final[Mapping[str, Callable[[bytes], bytes]]] = {
     "empty": lambda whole: b"",
-    "cut": lambda whole: whole[:-1],
-    "one byte more": lambda whole: whole + b"\x00",
+    "truncated": lambda whole: whole[:-1],
+    "trailing byte": lambda whole: whole + b"\x00",
     "too large": lambda whole: whole * 20,
     "a map": lambda whole: b"\x80",
     "another layout": lambda whole: b"\xdc\x00\x02\x07\x01",
@@ -60,27 +60,27 @@ PAYLOADS: Final[Mapping[str, Callable[[bytes], bytes]]] = {
 
 
 def reasons() -> dict[str, str]:
-    """Return what each form of each bad message says."""
-    said = {}
-    for name, fields in BAD.items():
+    """Return the error text of each invalid message and payload."""
+    texts = {}
+    for name, fields in INVALID.items():
         for form in (lambda fields: VehicleLocalPosition(**fields), encode_fields):
             try:
                 form(fields)
             except ValidationError as exc:
-                said[f"model: {name}"] = describe(exc)
+                texts[f"model: {name}"] = describe(exc)
             except NedbusError as exc:
-                said[f"{type(exc).__name__}: {name}"] = str(exc)
+                texts[f"{type(exc).__name__}: {name}"] = str(exc)
     for name, change in PAYLOADS.items():
         for decode in (decode_payload, decode_row):
             try:
                 decode(change(REAL[0]))
             except NedbusError as exc:
-                said[f"{type(exc).__name__} of {decode.__name__}: {name}"] = str(exc)
-    return said
+                texts[f"{type(exc).__name__} of {decode.__name__}: {name}"] = str(exc)
+    return texts
 
 
-def contract() -> dict[str, object]:
-    """Return everything that other programs rely on."""
+def snapshot() -> dict[str, object]:
+    """Return everything that other programs may depend on."""
     texts = {f".msg {name}": message_definition(name) for name in LAYOUTS}
     texts |= {"json_schema": json.dumps(json_schema()), "layouts": json.dumps(layout_table())}
     texts |= {f"json {index}": each.model_dump_json() for index, each in enumerate(FLIGHTS)}
@@ -94,6 +94,6 @@ def contract() -> dict[str, object]:
 
 
 @pytest.mark.parametrize("part", ["reasons", "payloads", "hashes", "dtype", "texts"])
-def test_nothing_of_the_first_message_changed(part: str) -> None:
-    """Payloads, hashes, dtype, JSON Schema, definitions and the words of every error are what they were."""
-    assert contract()[part] == json.loads(KEPT.read_text())[part]
+def test_message_equals_its_snapshot(part: str) -> None:
+    """Payloads, hashes, dtype, JSON Schema, definitions and error texts are unchanged."""
+    assert snapshot()[part] == json.loads(SNAPSHOT.read_text())[part]

@@ -1,4 +1,4 @@
-"""A night of six vehicles, scripted: each event is told once, in order, by `nedbus events`, the page, and `health`."""
+"""Events end to end: `nedbus events`, the page and `health` report each event of six vehicles once and in order."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ VEHICLES: Final = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot")
 SECONDS: Final = 150
 RATE: Final = 10  # Hz
 
-# What the recording has: seconds after its begin, and what is told of whom.
-TOLD: Final = [
+# Expected events of the recording: vehicle, kind and change.
+EXPECTED: Final = [
     ("alpha", "gps_fix_lost", "begin"), ("alpha", "few_satellites", "begin"), ("alpha", "dead_reckoning", "begin"),
     ("alpha", "xy_invalid", "begin"), ("alpha", "v_xy_invalid", "begin"), ("alpha", "gps_fix_lost", "end"),
     ("alpha", "few_satellites", "end"), ("alpha", "xy_invalid", "end"), ("alpha", "v_xy_invalid", "end"),
@@ -39,12 +39,12 @@ TOLD: Final = [
     ("charlie", "silent", "end"), ("delta", "reboot", "once"), ("echo", "rejected", "begin"),
     ("echo", "rejected", "end"),
 ]  # fmt: skip
-CUT: Final = [("*", "link_down", "begin"), ("*", "link_down", "end")]
-HELD_UP: Final = [("*", "overload", "begin"), ("*", "overload", "end")]
+LINK_LOSS: Final = [("*", "link_down", "begin"), ("*", "link_down", "end")]
+OVERLOAD: Final = [("*", "overload", "begin"), ("*", "overload", "end")]
 
 
-def fields_of(vehicle: str, second: float) -> dict[str, object] | None:
-    """Return a position of the script, None while the vehicle is silent."""
+def fields_at(vehicle: str, second: float) -> dict[str, object] | None:
+    """Return the fields of a position message, None while the vehicle is silent."""
     fields: dict[str, object] = {**VALID, "x": 0.0, "y": 0.0}
     if vehicle == "alpha" and 4.0 <= second < 9.0:
         fields["dead_reckoning"] = True
@@ -56,8 +56,8 @@ def fields_of(vehicle: str, second: float) -> dict[str, object] | None:
     return fields
 
 
-def write_night(path: Path) -> None:
-    """Record the script: positions of all, and the GNSS receiver of one."""
+def write_recording(path: Path) -> None:
+    """Write a recording with positions of all vehicles and GNSS messages of one, with scripted faults."""
     position, gps = BY_TOPIC[VLP], BY_TOPIC[GPS]
     start = 1_700_000_000_000_000_000
     with RecordingWriter(path) as writer:
@@ -65,7 +65,7 @@ def write_night(path: Path) -> None:
             second = number / RATE
             logged = [start + round(second * 1e9)]
             for vehicle in VEHICLES:
-                booted = 17.0 if vehicle == "delta" and second >= 17.0 else -100.0  # s of the script
+                booted = 17.0 if vehicle == "delta" and second >= 17.0 else -100.0  # s after the start of the recording
                 stamp = round((second - booted) * 1e6) + 1_000_000
                 if vehicle == "alpha":
                     has_fix = not 3.0 <= second < 8.0
@@ -78,30 +78,30 @@ def write_night(path: Path) -> None:
                         logged=logged,
                         published=logged,
                     )
-                fields = fields_of(vehicle, second)
+                fields = fields_at(vehicle, second)
                 if fields is None:
                     continue
                 array = arrays_of(position).of([position.model(timestamp=stamp, **fields)])
                 if vehicle == "echo" and 19.0 <= second < 19.3:
-                    array["x"] = float("nan")  # while xy is valid: no service publishes that
+                    array["x"] = float("nan")  # invalid, as xy_valid is true
                 writer.write(
                     array, position, [(Address(vehicle, VLP), Provenance("sim"))], logged=logged, published=logged
                 )
 
 
-def told_by(process: Process) -> list[tuple[str, str, str]]:
+def events_of(process: Process) -> list[tuple[str, str, str]]:
     events = [json.loads(line) for line in process.out.splitlines()]
     return [(event["vehicle"], event["kind"], event["change"]) for event in events]
 
 
 def wait_for_event(process: Process, vehicle: str, kind: str, change: str) -> None:
     wait_for(
-        lambda: (vehicle, kind, change) in told_by(process), what=f"{vehicle} {kind} {change}", seconds=PAGE_TIMEOUT
+        lambda: (vehicle, kind, change) in events_of(process), what=f"{vehicle} {kind} {change}", seconds=PAGE_TIMEOUT
     )
 
 
 def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: int) -> None:
-    """Stop a process for as long as a vehicle sends this many messages."""
+    """Stop a process while a vehicle sends this number of messages."""
     process.signal(signal.SIGSTOP)
     try:
         for _ in range(messages):
@@ -110,14 +110,14 @@ def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: i
         process.signal(signal.SIGCONT)
 
 
-def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browser, tmp_path: Path) -> None:
-    """Six vehicles of a recording that a service replays to readers of other processes: a command, a page, a test.
+def test_each_event_is_reported_once_and_in_order(run_nedbus: Start, browser: Browser, tmp_path: Path) -> None:
+    """A service replays a recording to `nedbus events` and the page, each in a subprocess with a router between them.
 
-    A service, two readers and a router, each a process. GPS is lost, an estimate is reset, a vehicle is silent, one
-    reboots, one sends what is rejected; then the router is stopped and started again, and both readers are held up.
+    GPS is lost, an estimate is reset, one vehicle is silent, one reboots, one sends rejected messages; then the router
+    is restarted, and both readers are frozen for a while.
     """
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
-    write_night(tmp_path / "night.mcap")
+    write_recording(tmp_path / "fleet.mcap")
     router = run_nedbus("router", "--listen", endpoint)
     wait_for(lambda: "router on" in router.err, what="the router")
     events = run_nedbus("events", "--connect", endpoint, "--json")
@@ -126,21 +126,21 @@ def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browse
     with open_tabs(browser, allow_console_errors=True) as make:
         page = make(width=1280, height=800)
         page.open(f"http://127.0.0.1:{port}")
-        run_nedbus("serve", "--connect", endpoint, "-s", f"mcap:{tmp_path / 'night.mcap'}")
-        wait_for_event(events, *TOLD[-1])
-        assert told_by(events) == TOLD
-        told = json.loads(run_command("why", "-c", endpoint, "--vehicle", "alpha", "--json").out)
-        assert told["faults"][0]["what"] == "xy and vxy not valid"
-        assert [each["kind"] for each in told["verdict"]["cause"]] == [
+        run_nedbus("serve", "--connect", endpoint, "-s", f"mcap:{tmp_path / 'fleet.mcap'}")
+        wait_for_event(events, *EXPECTED[-1])
+        assert events_of(events) == EXPECTED
+        story = json.loads(run_command("why", "-c", endpoint, "--vehicle", "alpha", "--json").out)
+        assert story["faults"][0]["what"] == "xy and vxy not valid"
+        assert [each["kind"] for each in story["verdict"]["cause"]] == [
             "gps_fix_lost",
             "few_satellites",
             "dead_reckoning",
         ]
         router.signal(signal.SIGTERM)
         router.wait()
-        wait_for_event(events, *CUT[0])
+        wait_for_event(events, *LINK_LOSS[0])
         router = run_nedbus("router", "--listen", endpoint)
-        wait_for_event(events, *CUT[1])
+        wait_for_event(events, *LINK_LOSS[1])
         with (
             nedbus.connect(endpoint, timeout=PAGE_TIMEOUT) as bus,
             bus.subscribe(vehicle="foxtrot", mode="every") as follow,
@@ -148,16 +148,16 @@ def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browse
             follow.receive(timeout=PAGE_TIMEOUT)
             freeze(events, follow, 4 * RATE)
             freeze(web, follow, 4 * RATE)
-            wait_for_event(events, *HELD_UP[1])
-        assert told_by(events) == [*TOLD, *CUT, *HELD_UP]
-        shown = [each for each in (*TOLD, *CUT, *HELD_UP) if each[2] != "end"]
+            wait_for_event(events, *OVERLOAD[1])
+        assert events_of(events) == [*EXPECTED, *LINK_LOSS, *OVERLOAD]
+        shown = [each for each in (*EXPECTED, *LINK_LOSS, *OVERLOAD) if each[2] != "end"]
         wait_for(lambda: len(page.rows("vehicle")) >= len(shown), what="all events on the page", seconds=PAGE_TIMEOUT)
         marks = sorted(page.rows("vehicle"), key=lambda mark: mark["time"])
         assert [mark["vehicle"] for mark in marks] == [vehicle for vehicle, *_ in shown]
-    shown_health = run_command("health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES))
-    assert shown_health.exit_code == 1
-    faults = [line.partition(": ")[2] for line in shown_health.err.splitlines()]
+    health = run_command("health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES))
+    assert health.exit_code == 1
+    faults = [line.partition(": ")[2] for line in health.err.splitlines()]
     assert [fault.partition(":")[0].removeprefix("vehicle ") for fault in faults[:-1]] == [
-        vehicle for vehicle, _, change in TOLD if change != "end"
+        vehicle for vehicle, _, change in EXPECTED if change != "end"
     ]
     assert "no link to" in faults[-1]

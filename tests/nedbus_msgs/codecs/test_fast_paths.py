@@ -1,4 +1,4 @@
-"""Models, rows, fields and arrays: each form accepts and rejects exactly what the model does."""
+"""Fast paths for fields, rows and arrays, which accept and reject exactly what the model does."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pydantic import ValidationError, field_validator
 
 from nedbus_msgs import DEFAULT, DecodeError, EncodeError, InvalidMessageError, Row, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
-from tests.flights.first_message import (
+from tests.flights.local_position import (
     CURRENT,
     FIELD_TYPES,
     decode,
@@ -38,7 +38,7 @@ from tests.flights.first_message import (
 from tests.nedbus_msgs.strategies import BROKEN, bits, messages, pack_full_width
 
 GOOD = VehicleLocalPosition(timestamp=5, vxy_max=math.inf, eph=math.inf)
-# Values for any field, valid or not, whatever its type.
+# Valid and invalid values, for fields of any type.
 ODD = st.one_of(
     st.integers(-(2**70), 2**70),
     st.floats(allow_subnormal=True),
@@ -54,7 +54,7 @@ CHANGES = st.dictionaries(st.sampled_from(list(FIELD_TYPES)), ODD, max_size=3)
 
 
 def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
-    """Return the payload of the message with these fields, None if the model rejects them."""
+    """Return the payload of the message with these fields; None if the model rejects them."""
     try:
         return encode(VehicleLocalPosition.model_validate(fields))
     except ValidationError:
@@ -62,7 +62,7 @@ def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
 
 
 def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
-    """Return the reasons for which these values are rejected, by the model or by what encodes them."""
+    """Return the reasons for which the model or the encoder rejects these values."""
     with pytest.raises((ValidationError, InvalidMessageError)) as info:
         encode_values(values)
     if isinstance(info.value, InvalidMessageError):
@@ -75,10 +75,10 @@ def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
 @example(GOOD, {"x": 1e39})
 @example(GOOD, {"delta_xy": (0.0, -1e39)})
 @example(GOOD, {"x": "1"})
-def test_fields_and_rows_are_validated_as_by_the_model(
+def test_fields_and_rows_are_validated_like_the_model(
     message: VehicleLocalPosition, changes: dict[str, object]
 ) -> None:
-    """As keywords, as fields or as a row: the same bytes, or the same rejection, with the same reasons."""
+    """Keywords, fields and rows give the same bytes, or the same rejection with the same reasons."""
     fields = {**message.model_dump(), **changes}
     expected = payload_by_model(fields)
     if expected is not None:
@@ -91,8 +91,8 @@ def test_fields_and_rows_are_validated_as_by_the_model(
     assert reasons(encode_fields, fields) == reasons(encode_row, list(fields.values())) == expected_reasons
 
 
-def test_misspelled_field_among_all_others_is_rejected() -> None:
-    """The number of fields is right, and yet the model decides, with its reasons."""
+def test_misspelled_field_with_right_field_count_is_rejected() -> None:
+    """With the right number of fields, the fast path still leaves the error to the model."""
     fields = {("hagl" if name == "hagl_min" else name): value for name, value in GOOD.model_dump().items()}
     expected = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
     assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected
@@ -100,31 +100,33 @@ def test_misspelled_field_among_all_others_is_rejected() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "text"),
     [
         ({"eph": -1.0}, "eph: must not be negative (is -1.0)"),
         ({"x": "1", "xy_reset_counter": 300}, "x: Input should be a valid number (is '1'); xy_reset_counter: "),
         ({"delta_xy": (0.0, None)}, "delta_xy.1: Input should be a valid number (is None)"),
-        ({"z_dervi": 1.0}, "there is no field 'z_dervi': did you mean z_deriv or "),
-        ({"Heading": 1.0}, "there is no field 'Heading': did you mean heading or "),
-        ({"temperature": 20.0}, "there is no field 'temperature': 'nedbus schema' lists them (is 20.0)"),
+        ({"z_dervi": 1.0}, "unknown field 'z_dervi': did you mean z_deriv or "),
+        ({"Heading": 1.0}, "unknown field 'Heading': did you mean heading or "),
+        ({"temperature": 20.0}, "unknown field 'temperature': 'nedbus schema' lists the fields (is 20.0)"),
         ({"timestamp": None}, "timestamp: Field required"),
     ],
 )
-def test_invalid_message_is_explained(changes: dict[str, object], told: str) -> None:
-    """An error of ours, and a ValueError, names each field, its rule and value, and the field that was meant."""
+def test_invalid_message_error_names_field_rule_and_value(changes: dict[str, object], text: str) -> None:
+    """InvalidMessageError is a ValueError that names each field, its rule and value, and suggests a field."""
     fields = {name: value for name, value in {"timestamp": 1, **changes}.items() if name != "timestamp" or value}
     with pytest.raises(InvalidMessageError) as info:
         encode_fields(MappingProxyType(fields))
-    assert str(info.value).startswith(f"not a valid VehicleLocalPosition: {told}")
+    assert str(info.value).startswith(f"not a valid VehicleLocalPosition: {text}")
     assert isinstance(info.value, ValueError)
     assert [field for field, _ in info.value.violations] == list(changes)
     assert str(pickle.loads(pickle.dumps(info.value))) == str(info.value)
 
 
 @given(st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=3)), min_size=1, max_size=5))
-def test_payloads_are_valid_as_by_the_model(cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]]) -> None:
-    """Decoded one by one, as rows, or as an array: the same values to the bit, or the same rejection."""
+def test_payloads_are_validated_like_the_model(
+    cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]],
+) -> None:
+    """Models, rows and arrays decode to bit-identical values, or are all rejected."""
     payloads = [pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases]
     array, valid = decode_array(b"".join(payloads))
     for index, payload in enumerate(payloads):
@@ -149,8 +151,8 @@ def test_payloads_are_valid_as_by_the_model(cases: list[tuple[VehicleLocalPositi
 
 
 @given(st.lists(messages(), max_size=4))
-def test_arrays_are_messages(many: list[VehicleLocalPosition]) -> None:
-    """Messages survive the round trip through an array and its payloads, msgpack or CDR, with exact types."""
+def test_array_round_trip(many: list[VehicleLocalPosition]) -> None:
+    """Messages are unchanged by the round trip through an array and its payloads, msgpack or CDR, with exact types."""
     array = to_array(many)
     assert array.dtype == DTYPE
     assert valid_mask(array).all()
@@ -164,8 +166,8 @@ def test_arrays_are_messages(many: list[VehicleLocalPosition]) -> None:
     assert decoded.tobytes() == array.tobytes()
 
 
-def test_dtypes_are_px4s() -> None:
-    """The columns have PX4's types: nothing is widened."""
+def test_columns_have_px4_types() -> None:
+    """No column is wider than PX4's type."""
     kinds = {"uint64": "u8", "uint8": "u1", "bool": "?", "float32": "f4", "float64": "f8"}
     for name, kind in FIELD_TYPES.items():
         expected = np.dtype(("f4", 2)) if kind == "float32[2]" else np.dtype(kinds[kind])
@@ -173,14 +175,14 @@ def test_dtypes_are_px4s() -> None:
 
 
 @pytest.mark.parametrize("values", [[], [1], range(54)])
-def test_row_of_another_length_is_rejected(values: list[object]) -> None:
-    """Too few or too many values are not a message."""
-    with pytest.raises(EncodeError, match="where a row has 53"):
+def test_row_of_wrong_length_raises(values: list[object]) -> None:
+    """Too few or too many values raise EncodeError."""
+    with pytest.raises(EncodeError, match="values, expected 53"):
         encode_row(values)
 
 
 class Low(VehicleLocalPosition):
-    """A user's own model, with a rule more."""
+    """A user's subclass with an additional rule."""
 
     @field_validator("z")
     @classmethod
@@ -190,16 +192,16 @@ class Low(VehicleLocalPosition):
         return z
 
 
-def test_subclass_keeps_its_own_rules() -> None:
-    """The fast path is for the model itself: the validators of a subclass run."""
+def test_subclass_validators_run() -> None:
+    """Only the model itself uses the fast path."""
     fields = {name: value for name, value in GOOD.model_dump().items() if name != "z"}
     assert type(Low(z=-5.0, **fields)) is Low
     with pytest.raises(ValidationError, match="too high"):
         Low(z=-20.0, **fields)
 
 
-def test_dicts_and_json_do_not_call_the_constructor() -> None:
-    """Pydantic treats the constructor as its own: JSON keeps its strings for NaN and infinities."""
+def test_validation_of_dicts_and_json_bypasses_the_constructor() -> None:
+    """Pydantic treats the constructor as its own, so JSON may hold strings for NaN and infinities."""
     assert not VehicleLocalPosition.__pydantic_custom_init__
 
 
@@ -209,12 +211,12 @@ PYTHON_TYPES = {
 
 
 def test_row_has_the_fields_of_the_model() -> None:
-    """Names and order of a row are PX4's, and so the model's and the current layout's."""
+    """Row, model and current layout have PX4's names in PX4's order."""
     assert DEFAULT.row._fields == tuple(FIELD_TYPES) == tuple(VehicleLocalPosition.model_fields) == CURRENT.fields
 
 
-def test_row_is_a_tuple_with_names() -> None:
-    """A row is as light as a tuple: it has the names of the fields, and none of a model's methods."""
+def test_row_is_a_named_tuple() -> None:
+    """A row has named fields, but no Pydantic methods."""
     row = row_of(VehicleLocalPosition(timestamp=5, delta_xy=(1.0, 2.0)))
     assert isinstance(row, Row)
     assert (row.timestamp, row.delta_xy, len(row)) == (5, (1.0, 2.0), 53)
