@@ -180,7 +180,7 @@ def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) 
     writer.add(VLP, message(2, x=2.0), instance=1)
     run = open_log(writer.write(tmp_path / "a.ulg"))
     assert [read.x for _, read in read_all(run)] == [1.0]
-    assert "skipped a second vehicle_local_position [1]" in run.warnings[0]
+    assert "skipped a duplicate vehicle_local_position [1]" in run.warnings[0]
 
 
 @pytest.mark.parametrize(
