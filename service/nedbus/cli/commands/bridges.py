@@ -120,7 +120,7 @@ def ros2(
     try:
         session, observer = bus.open_session(to), bus.open_session(to)
     except ConnectError as exc:
-        raise NedbusError(f"no router answers at {to}: start ROS 2's router there, or correct --to") from exc
+        raise NedbusError(f"no router answers at {to}: start the router of ROS 2 there, or correct --to") from exc
     with closing(session), closing(observer):
         bridge = bridges.Ros2Bridge(
             bus, session, observer=observer, selection=selection, layout=layout, domain=domain, hashed=not humble,
