@@ -223,10 +223,10 @@ def test_echo_csv_has_a_row_per_message(endpoint: str, bus: nedbus.Bus) -> None:
 def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
     """Every row of a position has its state, whatever fields are selected; stderr counts the missing messages."""
     bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
-    shown = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
-    [row] = csv.DictReader(shown.out.splitlines())
+    result = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
+    [row] = csv.DictReader(result.out.splitlines())
     assert row["state"] == "xy invalid"
-    assert shown.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
+    assert result.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
 
 
 def test_echo_field_selects_fields(simulation: str) -> None:

@@ -80,18 +80,18 @@ def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(target, lambda path: (account_of if path == REAL else read_account)(path))
 
 
-def lines_of(shown: CommandResult) -> list[tuple[str, str, str]]:
+def lines_of(result: CommandResult) -> list[tuple[str, str, str]]:
     """Return time, severity and text of each line."""
-    found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in shown.out.splitlines()]
+    found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in result.out.splitlines()]
     return [(match[1], match[2] or "", match[3]) for match in found if match]
 
 
 def test_events_of_a_file_have_evidence(log: Path) -> None:
     """One line per event with its evidence; stderr names the clock of the times."""
-    shown = run_command("events", str(log))
-    assert (shown.exit_code, shown.err) == (0, "times: seconds since boot, no message contains UTC\n")
-    assert lines_of(shown) == EXPECTED_EVENTS
-    assert len(shown.out.splitlines()) == len(EXPECTED_EVENTS)
+    result = run_command("events", str(log))
+    assert (result.exit_code, result.err) == (0, "times: seconds since boot, no message contains UTC\n")
+    assert lines_of(result) == EXPECTED_EVENTS
+    assert len(result.out.splitlines()) == len(EXPECTED_EVENTS)
 
 
 @pytest.mark.parametrize(("severity", "count"), [("bad", 2), ("watch", 3), ("info", 6)])
@@ -165,10 +165,10 @@ def test_real_flight_has_expected_events() -> None:
 
 def test_why_prints_verdict_and_faults(log: Path) -> None:
     """`why` prints the verdict; --all also each fault with the preceding events and the topics missing in the log."""
-    shown = run_command("why", str(log))
-    assert (shown.exit_code, shown.out, shown.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
-    shown = run_command("why", str(log), "--all")
-    assert (shown.exit_code, shown.out, shown.err) == (0, WHY, "")
+    result = run_command("why", str(log))
+    assert (result.exit_code, result.out, result.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
+    result = run_command("why", str(log), "--all")
+    assert (result.exit_code, result.out, result.err) == (0, WHY, "")
     report = json.loads(run_command("why", str(log), "--json").out)
     verdict, (story,) = report["verdict"], report["faults"]
     assert (verdict["text"], verdict["usable"]) == (VERDICT[3:-1], False)
@@ -183,12 +183,12 @@ def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
     """Without UTC in the log, --at takes seconds since boot or since the start of the recording."""
     for moment in ("10", "+9"):
         assert run_command("why", str(log), "--at", moment, "--all").out == WHY
-    shown = run_command("why", str(log), "--at", "6.5").out
-    assert shown.startswith(
+    result = run_command("why", str(log), "--at", "6.5").out
+    assert result.startswith(
         "1: position valid throughout, but dead reckoning from 5.000 to 12.000 s since boot (7.0 s)."
     )
-    shown = run_command("why", str(log), "--at", "19").out
-    assert shown.startswith("1: no fault then; the nearest: xy and vxy not valid from 8.000 to 12.000 s")
+    result = run_command("why", str(log), "--at", "19").out
+    assert result.startswith("1: no fault then; the nearest: xy and vxy not valid from 8.000 to 12.000 s")
 
 
 @pytest.mark.logs
@@ -205,12 +205,12 @@ def test_why_at_accepts_utc_and_seconds() -> None:
 def test_flight_without_faults_reports_its_duration(tmp_path: Path) -> None:
     """Without faults both commands report the duration of the flight."""
     log = str(write_flight(tmp_path / "good.ulg", fault=False))
-    shown = run_command("events", log)
-    assert (shown.exit_code, shown.out) == (0, "")
-    assert shown.err == f"{log}: no events in 20 s\n"
+    result = run_command("events", log)
+    assert (result.exit_code, result.out) == (0, "")
+    assert result.err == f"{log}: no events in 20 s\n"
     assert run_command("events", log, "--severity", "bad").err == f"{log}: no events of severity bad in 20 s\n"
-    shown = run_command("why", log)
-    assert (shown.exit_code, shown.out, shown.err) == (0, "1: no faults in 20 s\n", "")
+    result = run_command("why", log)
+    assert (result.exit_code, result.out, result.err) == (0, "1: no faults in 20 s\n", "")
 
 
 def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
@@ -233,9 +233,9 @@ def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.Monkey
     for second in range(2200):
         writer.add(VLP, message((second + 1) * 1_000_000, **VALID | {"xy_reset_counter": second % 256}))
     log = str(writer.write(tmp_path / "long.ulg"))
-    shown = run_command("events", log)
-    assert len(shown.out.splitlines()) == 2000
-    assert f"{log}: showing the last 2000 of 2199 events\n" in shown.err
+    result = run_command("events", log)
+    assert len(result.out.splitlines()) == 2000
+    assert f"{log}: showing the last 2000 of 2199 events\n" in result.err
 
 
 @pytest.mark.parametrize(
@@ -262,21 +262,21 @@ def test_error_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ...]
     """An error is one line with a remedy; the exit code is 2 for wrong usage and 1 for a failure."""
     (tmp_path / "note.txt").write_text("no log")
     (tmp_path / "not.ulg").write_text("no log")
-    shown = run_command(*(str(log) if each == "LOG" else each for each in arguments))
+    result = run_command(*(str(log) if each == "LOG" else each for each in arguments))
     text = text.replace("LOG", str(log)).replace("EXPECTED", f"expected {AT}")
-    assert shown.err.startswith(text)
-    assert (shown.exit_code, shown.out) == (code, "")
-    assert len(shown.err.splitlines()) == 1
+    assert result.err.startswith(text)
+    assert (result.exit_code, result.out) == (code, "")
+    assert len(result.err.splitlines()) == 1
 
 
 def test_why_without_router_or_service_fails(endpoint: str) -> None:
     """Without a router, or without a service with a history, `why` names what is missing."""
     closed = free_endpoint()
-    shown = run_command("why", "-c", closed)
-    assert shown.exit_code == 1
-    assert len(shown.err.splitlines()) == 1
-    shown = run_command("why", "-c", endpoint)
-    assert (shown.exit_code, shown.err) == (
+    result = run_command("why", "-c", closed)
+    assert result.exit_code == 1
+    assert len(result.err.splitlines()) == 1
+    result = run_command("why", "-c", endpoint)
+    assert (result.exit_code, result.err) == (
         1, f"nedbus: no nedbus service at {endpoint} has data of a vehicle: start one with 'nedbus serve'\n"
     )  # fmt: skip
 
@@ -300,31 +300,31 @@ def test_why_live_uses_service_history(
     """`why` uses the history of a service for all or one vehicle; a vehicle of a script has no history."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
-    shown = run_command("why", "-c", endpoint)
-    assert (shown.exit_code, shown.err) == (0, "--all shows 1 fault in detail\n")
-    assert shown.out.startswith("1: not usable: xy and vxy not valid from ")
-    assert shown.out.endswith("\n2: no faults in the history of the services\n")
+    result = run_command("why", "-c", endpoint)
+    assert (result.exit_code, result.err) == (0, "--all shows 1 fault in detail\n")
+    assert result.out.startswith("1: not usable: xy and vxy not valid from ")
+    assert result.out.endswith("\n2: no faults in the history of the services\n")
     bus.publisher(VLP, vehicle="mocap1").publish(message(1))
-    shown = run_command("why", "-c", endpoint, "-v", "mocap1")
+    result = run_command("why", "-c", endpoint, "-v", "mocap1")
     reason = "vehicle mocap1 is published, but no nedbus service keeps its history"
     hint = "follow it with 'nedbus events --vehicle mocap1'"
-    assert (shown.exit_code, shown.err) == (1, f"nedbus: {reason}: {hint}\n")
+    assert (result.exit_code, result.err) == (1, f"nedbus: {reason}: {hint}\n")
     assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the history of the services\n"
-    shown = run_command("why", "-c", endpoint, "-v", "1", "--all")
+    result = run_command("why", "-c", endpoint, "-v", "1", "--all")
     clock = r"\d\d:\d\d:\d\d\.\d"
     fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
     begin = rf"1: not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
-    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", shown.out)
-    assert "to publish them, add them to PX4's dds_topics.yaml" in shown.out
+    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", result.out)
+    assert "to publish them, add them to PX4's dds_topics.yaml" in result.out
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
-    assert set(shown.out.splitlines()) <= set(since_boot.out.splitlines())
+    assert set(result.out.splitlines()) <= set(since_boot.out.splitlines())
     refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")
     assert (refused.exit_code, "--at: '+3': live data has no start to count from" in refused.err) == (2, True)
-    at = re.search(r"\d\d:\d\d:\d\d\.\d", shown.out)
+    at = re.search(r"\d\d:\d\d:\d\d\.\d", result.out)
     assert at
     assert run_command("why", "-c", endpoint, "-v", "1", "--at", at[0]).out.startswith("1: ")
-    shown = run_command("why", "-c", endpoint, "-v", "7")
-    assert (shown.exit_code, shown.err) == (
+    result = run_command("why", "-c", endpoint, "-v", "7")
+    assert (result.exit_code, result.err) == (
         2,
         "nedbus: --vehicle: no vehicle 7 in the network: choose one of 1, 2\n",
     )
@@ -368,12 +368,12 @@ def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
     follower = run_nedbus("events", "-c", endpoint, "--within", "600", "--origin", "px4")
     wait_for(lambda: len(follower.out.splitlines()) == 2, what="the texts")
-    for shown in (follower.out, run_command("events", str(log), "--origin", "px4").out):
-        first, second = shown.splitlines()
+    for result in (follower.out, run_command("events", str(log), "--origin", "px4").out):
+        first, second = result.splitlines()
         assert first.endswith('1        WATCH  PX4: "[ekf2] reset"')
         assert second.endswith('PX4: "[failsafe] Failsafe activated"')
-    for shown in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
-        assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in shown
+    for result in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
+        assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in result
 
 
 def test_events_live_are_printed_as_they_happen(
@@ -440,20 +440,23 @@ def test_documented_command_works(command: str, run_nedbus: Start, bus: nedbus.B
     assert log.name == "flight.ulg"
     arguments = [str(log) if part == log.name else part for part in command.split()]
     if "flight.ulg" in command:
-        shown = run_command(*arguments)
-        assert shown.exit_code == 0
-        assert "xy" in shown.out or "--at" in command
+        result = run_command(*arguments)
+        assert result.exit_code == 0
+        assert "xy" in result.out or "--at" in command
         return
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=7")
     wait_for(lambda: [each for each in bus.accounts() if "7" in each.vehicles], what="the vehicle")
     if "health" in command:
-        shown = run_command(*arguments, "-c", endpoint)
-        assert (shown.exit_code, shown.err) == (
+        result = run_command(*arguments, "-c", endpoint)
+        assert (result.exit_code, result.err) == (
             1, "nedbus: vehicle 1 is missing: it has no publisher\nnedbus: vehicle 2 is missing: it has no publisher\n"
         )  # fmt: skip
     else:
-        shown = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
-        assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n" * ("events" in command))
+        result = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
+        assert (result.exit_code, result.err) == (
+            0,
+            "times: UTC, from the clocks of the hosts\n" * ("events" in command),
+        )
 
 
 def test_every_event_kind_is_documented() -> None:
@@ -468,8 +471,8 @@ def test_file_suffix_is_case_insensitive(log: Path, tmp_path: Path) -> None:
     flight, converted = tmp_path / "FLIGHT.ULG", tmp_path / "FLIGHT.MCAP"
     flight.write_bytes(log.read_bytes())
     for arguments in (["convert", flight, converted], ["plot", flight, "-o", tmp_path / "A.PNG"], ["plot", converted]):
-        shown = run_command(*map(str, arguments))
-        assert shown.exit_code == 0, shown.err
+        result = run_command(*map(str, arguments))
+        assert result.exit_code == 0, result.err
     for path in (flight, converted):
         assert run_command("events", str(path)).out == run_command("events", str(log)).out
         assert run_command("why", str(path)).exit_code == 0

@@ -59,8 +59,8 @@ def test_service_without_vehicles_is_not_healthy(endpoint: str, health: Health) 
     source = f"mavlink:udpin:127.0.0.1:{free_port()}"
     with serving(endpoint, source) as daemon:
         wait_for_state(daemon, "waiting")
-        shown = health()
-    assert (shown.exit_code, shown.err) == (1, f"nedbus: no vehicle is published: {source} is waiting\n")
+        result = health()
+    assert (result.exit_code, result.err) == (1, f"nedbus: no vehicle is published: {source} is waiting\n")
 
 
 def test_finished_replay_is_not_healthy(endpoint: str, health: Health, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,9 +70,9 @@ def test_finished_replay_is_not_healthy(endpoint: str, health: Health, monkeypat
     with serving(endpoint, "sim:?duration=0.1") as daemon:
         wait_for_state(daemon, "done")
         offset[0] = 100.0
-        shown = health()
-        assert shown.exit_code == 1
-        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", shown.err)
+        result = health()
+        assert result.exit_code == 1
+        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", result.err)
         assert health("--max-age", "3600").exit_code == 0
 
 
@@ -84,11 +84,11 @@ def test_frozen_service_is_not_healthy(run_nedbus: Start, endpoint: str, bus: ne
         wait_for(lambda: health("--services", "2").exit_code == 0, what="health")
         other.signal(signal.SIGSTOP)
         try:
-            shown = health("--services", "2")
+            result = health("--services", "2")
         finally:
             other.signal(signal.SIGCONT)
-    assert shown.exit_code == 1
-    assert "1 of 2 services answer" in shown.err
+    assert result.exit_code == 1
+    assert "1 of 2 services answer" in result.err
 
 
 def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
@@ -120,9 +120,9 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
     """--expect requires vehicles by id and --vehicles by number, on any host, including those of scripts."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
         wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
-        shown = health("--expect", "1,7, 8", "--vehicles", "3")
-        assert (shown.exit_code, shown.out) == (1, "")
-        assert shown.err.splitlines() == [
+        result = health("--expect", "1,7, 8", "--vehicles", "3")
+        assert (result.exit_code, result.out) == (1, "")
+        assert result.err.splitlines() == [
             "nedbus: vehicle 7 is missing: it has no publisher",
             "nedbus: vehicle 8 is missing: it has no publisher",
             "nedbus: 1 of 3 vehicles are heard: 1",
@@ -130,8 +130,8 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
         publisher.publish(message(1, xy_valid=False))
         options = "--expect", "1,script", "--vehicles", "2", "--max-age", "60"
         wait_for(lambda: health(*options).exit_code == 0, what="both vehicles")
-        shown = health(*options, "--valid", "xy,z")
-        assert shown.err.splitlines() == [
+        result = health(*options, "--valid", "xy,z")
+        assert result.err.splitlines() == [
             "nedbus: vehicle script: xy not valid",
             "nedbus: vehicle script: the validity of z is unknown, as the vehicle does not send it",
         ]
@@ -149,19 +149,19 @@ def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: H
         wait_for_state(daemon, "done")
         assert health("--max-age", "600").exit_code == 0
         assert health("--max-age", "600", "--valid", "z,vz").exit_code == 0
-        shown = health("--max-age", "600", "--valid", "xy,z")
-        assert shown.exit_code == 1
-        assert re.fullmatch(r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", shown.err)
-        shown = health("--max-age", "600", "--valid", "xy", "--within", "600", "--json")
-        report = json.loads(shown.out)
-        assert (shown.exit_code, report["healthy"], report["reason"]) == (1, False, report["faults"][0])
+        result = health("--max-age", "600", "--valid", "xy,z")
+        assert result.exit_code == 1
+        assert re.fullmatch(r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", result.err)
+        result = health("--max-age", "600", "--valid", "xy", "--within", "600", "--json")
+        report = json.loads(result.out)
+        assert (result.exit_code, report["healthy"], report["reason"]) == (1, False, report["faults"][0])
         texts = [re.sub(r"\d\d:\d\d:\d\d\.\d UTC|[\d.]+ m?s", "T", fault) for fault in report["faults"]]
         assert texts == [
             "vehicle 1: xy not valid, since T (T)",
             "vehicle 1: dead reckoning, at T, T ago",
             "vehicle 1: xy not valid, at T, T ago",
         ]
-        assert len(shown.err.splitlines()) == 3
+        assert len(result.err.splitlines()) == 3
         assert health("--max-age", "600", "--expect", "1", "--within", "0").exit_code == 0
 
 
@@ -171,10 +171,10 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
         wait_for(lambda: health().exit_code == 0, what="health")
         daemon.account.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
         wait_for(lambda: daemon.account.state("2", time.time()).severity == "bad", what="silence")
-        shown = health()
-        assert shown.exit_code == 1
+        result = health()
+        assert result.exit_code == 1
         assert re.fullmatch(
-            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n", shown.err
+            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n", result.err
         )
         assert health("--expect", "1").exit_code == 0
         assert health("--vehicle", "1").exit_code == 0
@@ -191,10 +191,10 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
 )
 def test_invalid_option_value_exits_with_2(health: Health, arguments: tuple[str, ...], text: str) -> None:
     """An invalid value is reported in one line before any query, with exit code 2."""
-    shown = health(*arguments)
-    assert shown.exit_code == 2
-    assert shown.err.startswith(text)
-    assert len(shown.err.splitlines()) == 1
+    result = health(*arguments)
+    assert result.exit_code == 2
+    assert result.err.startswith(text)
+    assert len(result.err.splitlines()) == 1
 
 
 def test_ended_replay_causes_no_silence_event(endpoint: str, bus: nedbus.Bus) -> None:
@@ -205,8 +205,8 @@ def test_ended_replay_causes_no_silence_event(endpoint: str, bus: nedbus.Bus) ->
             return any(sample.latency is not None and sample.latency > 3.5 for sample in bus.latest("*"))
 
         wait_for(is_old, what="the last message to be old")
-        shown = run_command("events", "-c", endpoint, "--duration", "4")
-        assert shown.out == ""
+        result = run_command("events", "-c", endpoint, "--duration", "4")
+        assert result.out == ""
 
 
 def test_service_without_history_is_a_fault(endpoint: str, zenoh_session: Session, health: Health) -> None:
@@ -216,6 +216,6 @@ def test_service_without_history_is_a_fault(endpoint: str, zenoh_session: Sessio
         zenoh_session, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")
     ):
         for option in ("--valid", "xy"), ("--within", "60"):
-            shown = health("--services", "1", *option)
-            assert shown.exit_code == 1
-            assert "service old keeps no history of its vehicles: update nedbus there" in shown.err
+            result = health("--services", "1", *option)
+            assert result.exit_code == 1
+            assert "service old keeps no history of its vehicles: update nedbus there" in result.err

@@ -50,9 +50,9 @@ def simulation(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_starts(run_nedbus: Start, command: str, *, fresh: bool) -> None:
     """Each command starts in a separate process and imports all it needs; most other tests run in-process."""
-    shown = run_nedbus(*command.split(), "--help", fresh=fresh)
-    assert shown.wait() == 0, shown.err
-    assert f" nedbus {command} [OPTIONS]" in shown.out
+    result = run_nedbus(*command.split(), "--help", fresh=fresh)
+    assert result.wait() == 0, result.err
+    assert f" nedbus {command} [OPTIONS]" in result.out
 
 
 @pytest.mark.process
@@ -119,9 +119,9 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -
 
     def is_near() -> bool:
         """Measure; return whether a rate is near 100 Hz, which takes several attempts on a busy machine."""
-        shown = run_command("hz", "-c", simulation, "-d", "2.1", "--json", "-t", VLP)
-        assert shown.exit_code == 0, shown.err
-        measured[:] = [json.loads(line) for line in shown.out.splitlines()]
+        result = run_command("hz", "-c", simulation, "-d", "2.1", "--json", "-t", VLP)
+        assert result.exit_code == 0, result.err
+        measured[:] = [json.loads(line) for line in result.out.splitlines()]
         return any(row["rate"] is not None and 20 < row["rate"] < 500 for row in measured)
 
     wait_for(is_near, what="a rate near 100 Hz")

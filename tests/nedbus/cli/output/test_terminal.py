@@ -140,7 +140,7 @@ class Terminal:
 
     def __init__(self, fork_server: ForkServer, *arguments: str, **environment: str) -> None:
         self._main, terminal = pty.openpty()
-        self._output = bytearray()
+        self._bytes = bytearray()
         environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
         self.popen = fork_command(fork_server, *arguments, out=terminal, err=terminal, **environment)
         os.close(terminal)
@@ -155,8 +155,8 @@ class Terminal:
         self.wait()
 
     @property
-    def shown(self) -> str:
-        return self._output.decode(errors="replace")
+    def output(self) -> str:
+        return self._bytes.decode(errors="replace")
 
     def wait(self) -> int:
         """Return the exit code after all output has been read."""
@@ -167,7 +167,7 @@ class Terminal:
     def _read(self) -> None:
         with suppress(OSError):  # the terminal was closed
             while data := os.read(self._main, 4096):
-                self._output.extend(data)
+                self._bytes.extend(data)
         os.close(self._main)
 
 
@@ -198,7 +198,7 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
     """At 80 columns a message is one line below a heading, with complete addresses in one column."""
     with publishing(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
         assert terminal.wait() == 0
-    shown = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
+    shown = [line for line in terminal.output.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
     assert len([line for line in shown if VLP in line]) == 40
     assert max(map(len, shown)) <= 80
     state = -1
@@ -221,7 +221,7 @@ def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_s
     assert f"\ngone: {', '.join(gone)}\n" in info.out
     with on_terminal("info", "-c", endpoint) as terminal:
         assert terminal.wait() == 0
-    lines = terminal.shown.splitlines()
+    lines = terminal.output.splitlines()
     assert max(map(len, lines)) <= 80
     assert all(any(address in line for line in lines) for address in gone)
     del service
@@ -238,14 +238,14 @@ def test_hz_redraws_in_place(
     """
     vehicles = [str(vehicle) for vehicle in range(12)]
     with publishing(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
-        wait_for(lambda: terminal.shown.count("VEHICLE/TOPIC") >= 2, what="a second table")
+        wait_for(lambda: terminal.output.count("VEHICLE/TOPIC") >= 2, what="a second table")
         terminal.popen.send_signal(number)
         assert terminal.wait() == exit_code
-    assert "\x1b[1A\x1b[2K" in terminal.shown
-    assert " more" in terminal.shown
-    assert all(drawing.count("\n") <= 10 for drawing in terminal.shown.split("VEHICLE/TOPIC")[1:])
-    assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
-    assert "Traceback" not in terminal.shown
+    assert "\x1b[1A\x1b[2K" in terminal.output
+    assert " more" in terminal.output
+    assert all(drawing.count("\n") <= 10 for drawing in terminal.output.split("VEHICLE/TOPIC")[1:])
+    assert terminal.output.rindex("\x1b[?25h") > terminal.output.rindex("\x1b[?25l")
+    assert "Traceback" not in terminal.output
 
 
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
@@ -339,11 +339,11 @@ def test_malicious_status_is_escaped(endpoint: str, zenoh_session: Session) -> N
     status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
     hostile = answer(zenoh_session, "nedbus/@service/hostile/status", status)
     for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
-        shown = run_command(*arguments, "-c", endpoint)
-        assert shown.exit_code == (arguments[0] == "health"), shown.err
-        assert not has_control(shown.out + shown.err)
-        assert "\nforged line" not in shown.out + shown.err
-        assert len(shown.out + shown.err) < 5000
+        result = run_command(*arguments, "-c", endpoint)
+        assert result.exit_code == (arguments[0] == "health"), result.err
+        assert not has_control(result.out + result.err)
+        assert "\nforged line" not in result.out + result.err
+        assert len(result.out + result.err) < 5000
     del hostile
 
 
@@ -360,11 +360,11 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
 
     with repeating(put):
         for arguments, exit_code in ((["list"], 0), (["echo", "*", "-d", "0.5"], 1), (["hz", "-d", "0.5"], 1)):
-            shown = run_command(*arguments, "-c", endpoint)
-            assert shown.exit_code == exit_code, shown.err
-            assert not has_control(shown.out + shown.err)
-            assert len(shown.out + shown.err) < 5000
-            assert exit_code == 0 or "not a VehicleLocalPosition" in shown.err
+            result = run_command(*arguments, "-c", endpoint)
+            assert result.exit_code == exit_code, result.err
+            assert not has_control(result.out + result.err)
+            assert len(result.out + result.err) < 5000
+            assert exit_code == 0 or "not a VehicleLocalPosition" in result.err
     assert len(tokens) == 3
 
 
