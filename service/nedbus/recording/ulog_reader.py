@@ -31,7 +31,7 @@ class UlogReader:
     ) -> None:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
-        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.Texts()
+        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.LogMessageBuilder()
         self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, ulog.LoggedStream | None] = {}
@@ -50,7 +50,7 @@ class UlogReader:
         ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
         ends |= {f"left out: {self._texts.limit.omitted} texts above 100 per second": self._texts.limit.omitted > 0}
         ends |= {self._texts.problem: bool(self._texts.problem)}
-        reasons = [reason for stream in self.streams.values() for reason in stream.unfit.values()]
+        reasons = [reason for stream in self.streams.values() for reason in stream.omitted.values()]
         return self._warnings + reasons + [text for text, holds in ends.items() if holds]
 
     def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:

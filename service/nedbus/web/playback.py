@@ -16,7 +16,7 @@ from nedbus.errors import NedbusError
 from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.sources import KEPT_OF_FILE, Flights, follow
+from nedbus.sources import MAX_FILE_EVENTS, Flights, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .event_timeline import EventTimeline
@@ -45,7 +45,7 @@ class Recording:
     def __init__(self, *paths: Path) -> None:
         self.name = ", ".join(path.name for path in paths)
         self.overview = Fleet(long=_OVERVIEW)
-        self.timeline = EventTimeline(Account(KEPT_OF_FILE), times=Times())
+        self.timeline = EventTimeline(Account(MAX_FILE_EVENTS), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False

@@ -10,7 +10,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import FileAccount, parse_source, read_account
+from nedbus.sources import FileEvents, parse_source, read_file_events
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
@@ -43,8 +43,8 @@ def events(name: str) -> set[tuple[str, str]]:
     return {(each.kind, each.severity) for each in account(name).account.events}
 
 
-def account(name: str) -> FileAccount:
-    return read_account(CASES / name)
+def account(name: str) -> FileEvents:
+    return read_file_events(CASES / name)
 
 
 EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [

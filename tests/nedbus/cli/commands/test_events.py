@@ -19,7 +19,7 @@ import pytest
 import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
-from nedbus.sources import read_account, source_text_of_file
+from nedbus.sources import read_file_events, source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, account_of
@@ -76,8 +76,8 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cache the parsed real log for all tests: only the output of the commands is tested."""
-    target = "nedbus.cli.commands.events.read_account"
-    monkeypatch.setattr(target, lambda path: (account_of if path == REAL else read_account)(path))
+    target = "nedbus.cli.commands.events.read_file_events"
+    monkeypatch.setattr(target, lambda path: (account_of if path == REAL else read_file_events)(path))
 
 
 def lines_of(result: CommandResult) -> list[tuple[str, str, str]]:
@@ -227,7 +227,7 @@ def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
 
 def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of more events than the limit, the last ones are shown, and stderr has the total."""
-    monkeypatch.setattr("nedbus.sources.account.KEPT_OF_FILE", 2000)
+    monkeypatch.setattr("nedbus.sources.file_events.MAX_FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
     for second in range(2200):
