@@ -32,7 +32,7 @@ from nedbus_msgs import dds_type, status_key
 from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
-from tests.peers.certificates import files_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_settings, write_config
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
@@ -153,9 +153,9 @@ def test_server_that_is_not_a_router_is_wrong(timings: Timings) -> None:
             find(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
 
 
-def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
+def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
     """With a publishing vehicle nothing is wrong, and each check has an ok finding."""
-    with publishing(bus), service_status(raw, sources=[source(addresses=[f"1/{VLP}"])]):
+    with publishing(bus), service_status(zenoh_session, sources=[source(addresses=[f"1/{VLP}"])]):
         findings = diagnose(endpoint, vehicle="1", listen=1.0)
     assert has_no_faults(findings), findings
     for check in ("settings", "endpoint", "router", "read", "write", "service", "vehicle", "clock"):
@@ -182,12 +182,12 @@ def test_two_publishers_of_one_address_are_wrong(bus: nedbus.Bus, endpoint: str)
         find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
 
 
-def test_undecodable_payload_is_wrong(raw: Session, endpoint: str) -> None:
+def test_undecodable_payload_is_wrong(zenoh_session: Session, endpoint: str) -> None:
     """A payload that cannot be decoded is reported with the decoder's reason, such as an unknown layout."""
 
     def publish() -> None:
-        raw.put(f"nedbus/1/{VLP}", b"junk")
-        raw.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
+        zenoh_session.put(f"nedbus/1/{VLP}", b"junk")
+        zenoh_session.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
 
     with repeating(publish):
         findings = diagnose_until(endpoint, "1/.*: cannot decode", "2/.*: cannot decode")
@@ -205,43 +205,43 @@ def test_undecodable_payload_is_wrong(raw: Session, endpoint: str) -> None:
     ids=["service", "one of two services", "this host"],
 )
 def test_clock_offset_is_wrong(
-    raw: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str
+    zenoh_session: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str
 ) -> None:
     """With two clocks either may be off; with three the one that disagrees is off, which may be this host's."""
     with ExitStack() as services:
         for name, offset in clocks.items():
-            services.enter_context(service_status(raw, name, offset=offset))
+            services.enter_context(service_status(zenoh_session, name, offset=offset))
         assert advice in find(diagnose(endpoint), "clock", "wrong", text).advice
 
 
-def test_clock_offset_of_publisher_is_wrong(raw: Session, endpoint: str) -> None:
+def test_clock_offset_of_publisher_is_wrong(zenoh_session: Session, endpoint: str) -> None:
     """Message timestamps reveal the offset of a publisher's clock without a service."""
     payload = encode(message(1))
 
     def publish() -> None:
         later = dt.datetime.now(dt.UTC) + dt.timedelta(seconds=HOUR)
-        raw.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
+        zenoh_session.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
 
     with repeating(publish):
         findings = diagnose_until(endpoint, "publisher of 1/")
     find(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
 
 
-def test_service_status_gives_findings(raw: Session, endpoint: str) -> None:
+def test_service_status_gives_findings(zenoh_session: Session, endpoint: str) -> None:
     """Failed, waiting and stale sources, rejections and another version are found; of many findings the worst ones."""
     sources = [
         source(state="failed", error="the disk is gone"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
         source(source="px4-zenoh:", state="waiting"),
     ]
-    with service_status(raw, version="99.1.0", sources=sources):
+    with service_status(zenoh_session, version="99.1.0", sources=sources):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
     find(findings, "source", "warning", "px4-zenoh:: waiting")
     find(findings, "source", "warning", "no more messages of 9/x")
     find(findings, "source", "warning", "7 messages rejected: xy_valid")
     find(findings, "version", "warning", r"the service runs nedbus 99\.1\.0")
-    with service_status(raw, sources=[*sources, *50 * [source(state="waiting")]]):
+    with service_status(zenoh_session, sources=[*sources, *50 * [source(state="waiting")]]):
         findings = diagnose(endpoint)
     find(findings, "source", "warning", "more findings of this check")
     find(findings, "source", "wrong", "the disk is gone")
@@ -257,7 +257,7 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
         yield
 
 
-def test_vehicle_states_in_service_reports_are_findings(raw: Session, endpoint: str) -> None:
+def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, endpoint: str) -> None:
     """A bad vehicle is wrong, one to watch a warning; a healthy vehicle, or one silent for an hour, has no finding.
 
     If two services report a vehicle, the one that receives its messages counts.
@@ -265,7 +265,7 @@ def test_vehicle_states_in_service_reports_are_findings(raw: Session, endpoint: 
     silent = {"severity": "bad", "text": "no position", "kinds": ["silent"]}
     with (
         service_report(
-            raw,
+            zenoh_session,
             "first",
             sick={"severity": "bad", "text": "failsafe", "since": 9990.0, "kinds": ["failsafe"]},
             doubtful={"severity": "watch", "text": "dead reckoning", "since": 9880.0, "kinds": ["dead_reckoning"]},
@@ -274,7 +274,7 @@ def test_vehicle_states_in_service_reports_are_findings(raw: Session, endpoint: 
             gone={**silent, "since": 9999.0},
             moved={**silent, "since": 9999.0},
         ),
-        service_report(raw, "second", moved={"severity": "info", "text": "ok"}),
+        service_report(zenoh_session, "second", moved={"severity": "info", "text": "ok"}),
     ):
         findings = diagnose(endpoint)
         of_one = diagnose(endpoint, vehicle="doubtful")
@@ -298,12 +298,12 @@ def test_vehicle_states_in_service_reports_are_findings(raw: Session, endpoint: 
     ],
     ids=["name", "nan", "inf", "now", "severity", "list"],
 )
-def test_invalid_event_report_is_ignored(raw: Session, endpoint: str, invalid: Mapping[str, object]) -> None:
+def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, invalid: Mapping[str, object]) -> None:
     """An invalid event report from a peer has no findings and breaks no check."""
-    server = QueryServer(raw)
+    server = QueryServer(zenoh_session)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **invalid}
     server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
-    with closing(server), service_status(raw, sources=[source(state="failed", error="the disk is gone")]):
+    with closing(server), service_status(zenoh_session, sources=[source(state="failed", error="the disk is gone")]):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "the disk is gone")
     assert not [each for each in findings if "evil" in each.seen or "check failed" in each.seen]
@@ -320,30 +320,30 @@ def test_bad_vehicle_in_report_of_real_service_is_wrong(run_nedbus: Start, tmp_p
 
 
 @pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
-def test_invalid_service_status_breaks_no_check(raw: Session, endpoint: str, now: object) -> None:
+def test_invalid_service_status_breaks_no_check(zenoh_session: Session, endpoint: str, now: object) -> None:
     """The valid parts of a peer's invalid status have findings, and no check fails."""
     states: list[object] = [[], {}, 7, None]
     strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
     with service_status(
-        raw, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]
+        zenoh_session, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]
     ):
         findings = diagnose(endpoint)
     find(findings, "source", "wrong", "mavlink:x: failed: unknown reason")
     assert not [each for each in findings if "check failed" in each.seen]
 
 
-def test_other_prefixes_and_ros2_topics_are_warnings(raw: Session, endpoint: str) -> None:
+def test_other_prefixes_and_ros2_topics_are_warnings(zenoh_session: Session, endpoint: str) -> None:
     """Other prefixes are found by tokens or messages, topics of ROS 2 or PX4 by their tokens unless bridged."""
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), NO_HASH)
-    token = raw.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
+    token = zenoh_session.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
     with nedbus.connect(endpoint, prefix="other/fleet") as other, publishing(other):
         payload = encode(message(1))
-        with repeating(lambda: raw.put(f"third/1/{VLP}", payload)):
+        with repeating(lambda: zenoh_session.put(f"third/1/{VLP}", payload)):
             findings = diagnose_until(endpoint, "other/fleet", "third")
         find(findings, "prefix", "warning", "other/fleet: .*the prefix here is nedbus/")
         find(findings, "prefix", "warning", "third: .*the prefix here is nedbus/")
         find(findings, "ros2", "warning", f"publishes /fmu/out/{VLP}, but no service bridges it")
-        with service_status(raw, sources=[source(source="px4-zenoh:")]):
+        with service_status(zenoh_session, sources=[source(source="px4-zenoh:")]):
             assert not [each for each in diagnose(endpoint) if each.check == "ros2"]
     token.undeclare()
 
@@ -366,10 +366,10 @@ def test_failing_source_of_real_service_is_wrong(run_nedbus: Start) -> None:
 
 
 def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
-    bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: Start
+    bus: nedbus.Bus, endpoint: str, zenoh_session: Session, run_nedbus: Start
 ) -> None:
     """The exit code is 0 if nothing is wrong, even with warnings, and 2 for usage errors."""
-    with publishing(bus), service_status(raw, sources=[source(state="waiting")]):
+    with publishing(bus), service_status(zenoh_session, sources=[source(state="waiting")]):
         doctor = run_command("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)
     assert (doctor.exit_code, doctor.out.splitlines()[-1].rpartition(", ")[2]) == (0, "1 warning"), doctor.out
     assert "set by NEDBUS_CONNECT" in " ".join(doctor.out.split())
@@ -380,10 +380,12 @@ def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
     assert (process.wait(), process.err.count("\n")) == (2, 1), process.err
 
 
-def test_text_from_peers_is_escaped_and_truncated(raw: Session, endpoint: str) -> None:
+def test_text_from_peers_is_escaped_and_truncated(zenoh_session: Session, endpoint: str) -> None:
     """Text from peers cannot control the terminal, add lines or flood the output."""
     evil = "\x1b[2J\nok all is well " + 1_000 * "x"
-    with service_status(raw, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil):
+    with service_status(
+        zenoh_session, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil
+    ):
         doctor = run_command("doctor", "-c", endpoint)
     assert doctor.exit_code == 1
     assert "\x1b" not in doctor.out
@@ -411,7 +413,7 @@ def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
 
 def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
     """Subject, hosts, issuer and expiry of the certificates of router, client and authority are reported."""
-    findings = diagnose(run_router(), run_router("router-soon"), tls=files_of(pki, "reader"))
+    findings = diagnose(run_router(), run_router("router-soon"), tls=tls_settings(pki, "reader"))
     assert has_no_faults(findings), findings
     router = r"the router presents router for 127\.0\.0\.1, localhost, issued by nedbus CA, valid until 20\d\d-"
     find(findings, "tls", "ok", router)
@@ -444,7 +446,7 @@ def test_invalid_certificate_is_wrong(
     router, name, ca = case
     if name != "reader":  # the alert that rejects it may be slow
         timings.tls_alert = DEADLINE
-    findings = diagnose(run_router(router), tls=files_of(pki, name, ca))
+    findings = diagnose(run_router(router), tls=tls_settings(pki, name, ca))
     for check, text in expected.items():
         find(findings, check, "wrong", text)
     assert any("the router presents" in each.seen for each in findings)
@@ -461,7 +463,7 @@ def test_wrong_protocol_and_wrong_tls_files_are_found(
     find(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
     find(findings, "tls", "wrong", f"{secure}: .*no authority is given")
     for files, reason in (
-        ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
+        ({**tls_settings(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
         ({"tls_certificate": pki / "reader.crt"}, "not the CA to trust"),
     ):
@@ -493,14 +495,14 @@ def test_read_and_write_permissions_are_reported(
 ) -> None:
     """A vehicle's certificate may write it but not read; a reader's may not write, and reveals dropped messages."""
     older = {"@doctor": "@probe"} if client == "older" else {}  # access rules without the probe key
-    endpoint, own = run_router(**older), tls_of(pki, "vehicle-1")
+    endpoint, own = run_router(**older), client_tls(pki, "vehicle-1")
     with (
         nedbus.connect(endpoint, tls=own, timeout=DEADLINE) as bus,
         open_client([endpoint], tls=own, timeout=DEADLINE) as session,
         publishing(bus, *published or "2"),
         service_status(session, sources=[source(addresses=[f"{each}/{VLP}" for each in published])]),
     ):
-        files = files_of(pki, "vehicle-1" if older else client)
+        files = tls_settings(pki, "vehicle-1" if older else client)
         findings = diagnose(endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1)
     assert any(
         (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen} {each.advice}")
@@ -513,7 +515,7 @@ def test_read_and_write_permissions_are_reported(
 def test_without_cryptography_certificates_are_verified_but_not_read(run_router: Run, pki: Path, start: Start) -> None:
     """Without the package names and dates are unknown, and the advice names the extra; trust is still verified."""
     endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
-    settings = {name: str(path) for name, path in files_of(pki, "reader").items()}
+    settings = {name: str(path) for name, path in tls_settings(pki, "reader").items()}
     program = f"""
 import sys
 sys.modules["cryptography"] = None

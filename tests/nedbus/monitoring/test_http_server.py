@@ -15,7 +15,7 @@ import pytest
 
 from nedbus.monitoring import HttpServer, Page, http_server
 from nedbus.timings import Timings
-from tests.peers.http_pages import Pages
+from tests.peers.http_client import HttpClient
 from tests.waits import DEADLINE, repeating
 
 GO, BUSY = threading.Event(), threading.Semaphore(0)
@@ -23,7 +23,7 @@ PATHS = ("/metrics", "/healthz", "/readyz", "/vehicles", "/status")
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Pages]:
+def server() -> Iterator[HttpClient]:
     """Serve a page, one that raises, and one that blocks until GO is set."""
 
     def fail() -> Page:
@@ -35,31 +35,31 @@ def server() -> Iterator[Pages]:
 
     pages = {"/page": lambda: Page.text("a page"), "/fails": fail, "/waits": wait}
     with closing(HttpServer("127.0.0.1:0", pages)) as server:
-        yield Pages(server.port)
+        yield HttpClient(server.port)
 
 
 @pytest.fixture(scope="module")
-def others() -> Iterator[tuple[Pages, Pages]]:
+def others() -> Iterator[tuple[HttpClient, HttpClient]]:
     """Serve the pages of a service on loopback and on all interfaces."""
     content = {path: lambda: Page.text("content") for path in PATHS}
     with closing(HttpServer("127.0.0.1:0", content)) as local, closing(HttpServer("0.0.0.0:0", content)) as public:
-        yield Pages(local.port), Pages(public.port)
+        yield HttpClient(local.port), HttpClient(public.port)
 
 
-def test_unknown_path_is_404_and_failing_page_500(server: Pages, caplog: pytest.LogCaptureFixture) -> None:
+def test_unknown_path_is_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
     """404 and / list the available pages; a page that raises is 500, is logged, and does not stop the server."""
-    assert server.ask("/other") == (404, "available pages: /page, /fails, /waits\n")
-    assert server.ask("/")[0] == 200
-    assert server.ask("/fails") == (500, "unexpected error: see the log\n")
+    assert server.request("/other") == (404, "available pages: /page, /fails, /waits\n")
+    assert server.request("/")[0] == 200
+    assert server.request("/fails") == (500, "unexpected error: see the log\n")
     assert "broken page" in caplog.text
-    assert server.ask("/page") == (200, "a page\n")
+    assert server.request("/page") == (200, "a page\n")
 
 
-def test_only_get_and_head_are_allowed(server: Pages) -> None:
+def test_only_get_and_head_are_allowed(server: HttpClient) -> None:
     """Other methods than GET and HEAD are 501; HEAD returns the headers of GET without content."""
     for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"):
-        assert server.ask("/page", method)[0] == 501, method
-    assert server.ask("/page", "HEAD") == (200, "")
+        assert server.request("/page", method)[0] == 501, method
+    assert server.request("/page", "HEAD") == (200, "")
     with closing(http.client.HTTPConnection(server.where, timeout=DEADLINE)) as connection:
         connection.request("HEAD", "/page")
         headers = connection.getresponse().headers
@@ -85,17 +85,19 @@ def test_only_get_and_head_are_allowed(server: Pages) -> None:
         ("[evil.example]", 403, 403),
     ],
 )
-def test_foreign_host_header_is_forbidden(others: tuple[Pages, Pages], host: str, status: int, elsewhere: int) -> None:
+def test_foreign_host_header_is_forbidden(
+    others: tuple[HttpClient, HttpClient], host: str, status: int, elsewhere: int
+) -> None:
     """A page whose host name is rebound to this server cannot read the status, and on loopback nothing at all.
 
     On other interfaces, metrics, health, readiness and vehicles are served under any name.
     """
     local, public = others
     for path in PATHS:
-        assert local.ask(path, Host=host)[0] == status, path
-        assert public.ask(path, Host=host)[0] == (elsewhere if path == "/status" else 200), path
+        assert local.request(path, Host=host)[0] == status, path
+        assert public.request(path, Host=host)[0] == (elsewhere if path == "/status" else 200), path
     refused = "/status is only served under an IP address or a name of this host\n"
-    assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
+    assert local.request("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 
 @pytest.mark.parametrize(
@@ -111,13 +113,13 @@ def test_foreign_host_header_is_forbidden(others: tuple[Pages, Pages], host: str
     ],
 )
 def test_malformed_requests_are_rejected(
-    server: Pages, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes
+    server: HttpClient, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes
 ) -> None:
     """A malformed request gets an HTTP error and no log line; the next client is served."""
     with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as client:
         client.sendall(sent)
         assert answer in client.recv(10_000)
-    assert server.ask("/page") == (200, "a page\n")
+    assert server.request("/page") == (200, "a page\n")
     assert not caplog.records
 
 
@@ -145,7 +147,7 @@ def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes
 
         with repeating(drip) if each_second else nullcontext():
             for _ in range(20):
-                assert Pages(server.port).ask("/page") == (200, "a page\n")
+                assert HttpClient(server.port).request("/page") == (200, "a page\n")
 
 
 def test_close_does_not_wait_for_clients(timings: Timings) -> None:
@@ -167,14 +169,14 @@ def test_close_does_not_wait_for_clients(timings: Timings) -> None:
         server.close()
 
 
-def test_client_beyond_thread_limit_waits(server: Pages) -> None:
+def test_client_beyond_thread_limit_waits(server: HttpClient) -> None:
     """While 16 clients are served, another one waits; all get their responses."""
     with ThreadPoolExecutor(17) as pool:
         answers = []
         for _ in range(16):  # sequential: a client that has not yet sent its request may be disconnected
-            answers.append(pool.submit(server.ask, "/waits"))
+            answers.append(pool.submit(server.request, "/waits"))
             assert BUSY.acquire(timeout=DEADLINE)
-        answers.append(pool.submit(server.ask, "/waits"))
+        answers.append(pool.submit(server.request, "/waits"))
         assert not BUSY.acquire(timeout=0.2)
         GO.set()
         assert {answer.result(DEADLINE) for answer in answers} == {(200, "True\n")}
@@ -199,5 +201,5 @@ def test_server_pauses_without_free_file_descriptor(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(http_server, "time", SimpleNamespace(sleep=sleep))
     is_full.set()
     with closing(HttpServer("127.0.0.1:0", {"/page": lambda: Page.text("a page")})) as server:
-        assert Pages(server.port).ask("/page") == (200, "a page\n")
+        assert HttpClient(server.port).request("/page") == (200, "a page\n")
     assert pauses == [http_server._ACCEPT_PAUSE]

@@ -37,11 +37,11 @@ from tests.flights.local_position import encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
-from tests.peers.http_pages import Pages, read_families
+from tests.peers.http_client import HttpClient, read_families
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
 from tests.peers.prometheus import start_promtool
-from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 # nedbus without the extra `metrics`.
 WITHOUT_CLIENT = "import sys; sys.modules['prometheus_client'] = None; from nedbus.cli import main; main()"
@@ -50,43 +50,43 @@ Serve = Callable[..., Process]
 
 
 @pytest.fixture
-def pages() -> Pages:
-    return Pages(free_port())
+def pages() -> HttpClient:
+    return HttpClient(free_port())
 
 
 @pytest.fixture
-def serve(run_nedbus: Start, pages: Pages, endpoint: str) -> Serve:
+def serve(run_nedbus: Start, pages: HttpClient, endpoint: str) -> Serve:
     """Start services with HTTP pages at this test's router, and wait until they serve them."""
 
     def serve(*sources: str, connect: str = endpoint) -> Process:
         service = run_nedbus("serve", "-c", connect, "--http", pages.where, *[f"--source={text}" for text in sources])
-        wait_for(lambda: pages.ask("/healthz")[0] == 200, what=f"the pages: {service.err}")
+        wait_for(lambda: pages.request("/healthz")[0] == 200, what=f"the pages: {service.err}")
         return service
 
     return serve
 
 
 @contextmanager
-def exporting(bus: nedbus.Bus) -> Iterator[Pages]:
+def exporting(bus: nedbus.Bus) -> Iterator[HttpClient]:
     """Run an exporter as `nedbus export` does, and serve its pages."""
     exporter, stop = Exporter(bus, nedbus.Selection(), version="0"), threading.Event()
     with ThreadPoolExecutor(1) as pool, closing(HttpServer("127.0.0.1:0", exporter.pages)) as server:
         reading = pool.submit(exporter.run, stop)
         try:
-            yield Pages(server.port)
+            yield HttpClient(server.port)
         finally:
             stop.set()
         reading.result(DEADLINE)
 
 
-def test_service_serves_metrics_health_and_status(serve: Serve, pages: Pages) -> None:
+def test_service_serves_metrics_health_and_status(serve: Serve, pages: HttpClient) -> None:
     """/metrics has series by vehicle, topic and source; /status is JSON; /readyz and /healthz are one line."""
     serve("sim:?vehicle=7")
     of_stream = {"vehicle": "7", "topic": VLP, "source": "sim:?vehicle=7"}
     wait_for(lambda: pages.values("nedbus_stream_rate_hertz", **of_stream), what="a rate")
-    assert pages.ask("/readyz") == (200, "ready\n")
-    assert pages.ask("/healthz") == (200, "ok\n")
-    status = json.loads(pages.ask("/status?any=query")[1])
+    assert pages.request("/readyz") == (200, "ready\n")
+    assert pages.request("/healthz") == (200, "ok\n")
+    status = json.loads(pages.request("/status?any=query")[1])
     assert [source["source"] for source in status["sources"]] == ["sim:?vehicle=7"]
     (published,) = pages.values("nedbus_messages_published_total", **of_stream)
     assert published >= status["sources"][0]["streams"][0]["health"]["messages"] > 0
@@ -102,19 +102,19 @@ def test_service_serves_metrics_health_and_status(serve: Serve, pages: Pages) ->
 
 
 def test_exporter_measures_loss_latency_and_invalid_payloads(
-    bus: nedbus.Bus, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus, zenoh_session: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An exporter counts received, lost and invalid messages, and measures latency."""
     timings.retransmit_timeout = 0.1  # no publisher can retransmit
-    publisher = raw.declare_publisher(f"nedbus/7/{VLP}")
+    publisher = zenoh_session.declare_publisher(f"nedbus/7/{VLP}")
     numbers = [1, 2, 3, 6, 7]  # 4 and 5 are lost before the router
     of_stream = {"vehicle": "7", "topic": VLP}
     with exporting(bus) as pages:
-        wait_for_reader(raw, f"nedbus/7/{VLP}")
+        wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
         for number in numbers:
             info, content = zenoh.SourceInfo(publisher.id, number), encode(message(10_000 * number, **VALID))
-            publisher.put(content, source_info=info, timestamp=raw.new_timestamp())
-        raw.put(f"nedbus/8/{VLP}", b"junk")
+            publisher.put(content, source_info=info, timestamp=zenoh_session.new_timestamp())
+        zenoh_session.put(f"nedbus/8/{VLP}", b"junk")
         received = "nedbus_messages_received_total"
         wait_for(lambda: pages.values(received, **of_stream) == [len(numbers)], what="all messages")
         assert pages.values("nedbus_messages_lost_total", **of_stream) == [2]
@@ -127,25 +127,25 @@ def test_exporter_measures_loss_latency_and_invalid_payloads(
             == [0]
         )
         assert pages.values("nedbus_connected") == [1]
-        assert pages.ask("/healthz") == (200, "ok\n")
-        status = json.loads(pages.ask("/status")[1])
+        assert pages.request("/healthz") == (200, "ok\n")
+        status = json.loads(pages.request("/status")[1])
     assert (status["connected"], status["invalid"]) == (True, 1)
     assert status["streams"][f"7/{VLP}"]["lost"] == 2
     assert "Traceback" not in caplog.text
 
 
-def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """/vehicles is 200 with a line for each healthy vehicle, and no condition is exported."""
     times = range(100_000, 300_000_000, 100_000)
     well = write_log(tmp_path / "well.ulg", times, **VALID)
     serve(f"ulog:{well}?vehicle=7")
     wait_for(lambda: pages.values("nedbus_vehicle_state", vehicle="7", state="ok") == [1], what="the vehicle")
-    assert pages.ask("/vehicles") == (200, "7 ok\n")
+    assert pages.request("/vehicles") == (200, "7 ok\n")
     assert pages.values("nedbus_vehicle_condition") == []
     assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
 
 
-def test_bad_vehicle_is_503_on_vehicles_page_only(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_bad_vehicle_is_503_on_vehicles_page_only(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """A bad vehicle makes /vehicles 503 and is in the metrics; /healthz and /readyz of the service stay 200."""
     times = range(100_000, 300_000_000, 100_000)
     logs = {
@@ -161,16 +161,16 @@ def test_bad_vehicle_is_503_on_vehicles_page_only(serve: Serve, pages: Pages, tm
     assert found == {("lost", "xy_invalid"), ("lost", "dead_reckoning"), ("doubtful", "dead_reckoning")}
     assert pages.values("nedbus_vehicle_state", vehicle="lost", state="bad") == [1]
     assert pages.values("nedbus_vehicle_state", vehicle="doubtful", state="watch") == [1]
-    status, text = pages.ask("/vehicles")
+    status, text = pages.request("/vehicles")
     assert status == 503
     assert re.fullmatch(r"vehicle lost: xy not valid, since [\d:.]+ UTC \(.*\)\n", text)
-    assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
 
 
-def test_exporter_reports_vehicle_states(bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+def test_exporter_reports_vehicle_states(bus: nedbus.Bus, zenoh_session: Session, endpoint: str) -> None:
     """An exporter derives vehicle states and event counts from the messages that it receives."""
     with nedbus.connect(endpoint) as reader, exporting(reader) as pages, ExitStack() as closing:
-        wait_for_reader(raw, f"nedbus/7/{VLP}")
+        wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
         position, state = bus.publisher(VLP, vehicle="7"), bus.publisher("vehicle_status", vehicle="7")
         numbers, failsafe = itertools.count(1), threading.Event()
 
@@ -180,14 +180,14 @@ def test_exporter_reports_vehicle_states(bus: nedbus.Bus, raw: Session, endpoint
             state.publish(VehicleStatus.model_validate({"timestamp": number, "failsafe": failsafe.is_set()}))
 
         closing.enter_context(repeating(publish))
-        wait_for(lambda: pages.ask("/vehicles") == (200, "7 ok\n"), what="the vehicle")
+        wait_for(lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="the vehicle")
         (before,) = pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")
         failsafe.set()
-        wait_for(lambda: pages.ask("/vehicles")[1].startswith("vehicle 7: failsafe, since "), what="failsafe")
+        wait_for(lambda: pages.request("/vehicles")[1].startswith("vehicle 7: failsafe, since "), what="failsafe")
         assert pages.values("nedbus_vehicle_condition", vehicle="7", condition="failsafe") == [1]
         assert pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")[0] > before
         failsafe.clear()
-        wait_for(lambda: pages.ask("/vehicles") == (200, "7 ok\n"), what="the end of the failsafe")
+        wait_for(lambda: pages.request("/vehicles") == (200, "7 ok\n"), what="the end of the failsafe")
 
 
 def test_text_from_peers_is_one_line_on_vehicles_page() -> None:
@@ -214,16 +214,16 @@ def test_flapping_flag_stays_a_condition(every: int) -> None:
     assert event_log.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
-def test_metrics_pass_promtool(serve: Serve, pages: Pages, start: Start, tmp_path: Path) -> None:
+def test_metrics_pass_promtool(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
     """`promtool check metrics` accepts all names, units, types and help texts."""
     serve("sim:", f"mavlink:udpin:127.0.0.1:{free_port()}")
     text = tmp_path / "metrics"
-    text.write_text(pages.ask("/metrics")[1])
+    text.write_text(pages.request("/metrics")[1])
     promtool = start_promtool(start, "check", "metrics", stdin=text)
     assert (promtool.wait(), promtool.out, promtool.err) == (0, "", "")
 
 
-def test_rejections_are_counted_by_rule(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_rejections_are_counted_by_rule(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """Rejections are counted by violated rule; the sum is the count of the source."""
     log = tmp_path / "flight.ulg"
     writer = UlogWriter()
@@ -241,7 +241,7 @@ def test_rejections_are_counted_by_rule(serve: Serve, pages: Pages, tmp_path: Pa
     assert pages.values("nedbus_messages_published_total") == [1]
 
 
-def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: Pages) -> None:
+def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: HttpClient) -> None:
     """A source configured twice does not duplicate series, which Prometheus would reject."""
     serve("sim:", "sim:")
     wait_for(lambda: len(pages.values("nedbus_source_rejected_total")) == 2, what="both sources")
@@ -251,7 +251,7 @@ def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: Pages) 
     assert len(pages.values("nedbus_source_state", source="sim: (2)")) == 6
 
 
-def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """/readyz is 503 with a line for each failed source and each silent live source; /healthz stays 200.
 
     A replay that waits for a reader is ready.
@@ -259,34 +259,34 @@ def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: Pages, tmp_pa
     missing, silent = f"ulog:{tmp_path / 'missing.ulg'}", f"mavlink:udpin:127.0.0.1:{free_port()}"
     serve(missing, silent, "sim:?wait=1")
     failed = f"{missing}: retrying: {tmp_path / 'missing.ulg'}: no such file or directory\n"
-    wait_for(lambda: pages.ask("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"), what="both sources")
-    assert pages.ask("/healthz")[0] == 200
+    wait_for(lambda: pages.request("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"), what="both sources")
+    assert pages.request("/healthz")[0] == 200
     assert sorted(pages.values("nedbus_source_addresses")) == [0, 0, 12]
     assert pages.values("nedbus_source_state", state="waiting") == [0, 1, 1]
 
 
-def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_nedbus: Start, pages: Pages) -> None:
+def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_nedbus: Start, pages: HttpClient) -> None:
     """/readyz is 503 before the router starts, 200 while it runs, and 503 after it has ended."""
-    where, exported = free_endpoint(), Pages(free_port())
+    where, exported = free_endpoint(), HttpClient(free_port())
     serve("sim:", connect=where)
-    assert pages.ask("/readyz") == (503, f"the service is starting: {where}\n")
+    assert pages.request("/readyz") == (503, f"the service is starting: {where}\n")
     assert pages.values("nedbus_sessions", role="client") == [0]
     router = run_nedbus("router", "-l", where)
     run_nedbus("export", "--wait", "-c", where, "--http", exported.where)
     both = (pages, exported)
-    wait_for(lambda: {each.ask("/readyz") for each in both} == {(200, "ready\n")}, what="the router")
+    wait_for(lambda: {each.request("/readyz") for each in both} == {(200, "ready\n")}, what="the router")
     router.kill()
     no_router = (503, f"no router answers at {where}\n")
-    wait_for(lambda: {each.ask("/readyz") for each in both} == {no_router}, what="the end of the router")
-    assert exported.ask("/vehicles") == no_router
+    wait_for(lambda: {each.request("/readyz") for each in both} == {no_router}, what="the end of the router")
+    assert exported.request("/vehicles") == no_router
     assert pages.values("nedbus_sessions", role="client") == exported.values("nedbus_connected") == [0]
 
 
-def test_missing_prometheus_client_is_501_with_install_hint(start: Start, pages: Pages, endpoint: str) -> None:
+def test_missing_prometheus_client_is_501_with_install_hint(start: Start, pages: HttpClient, endpoint: str) -> None:
     """Without prometheus-client, /metrics is 501 with the extra to install; the other pages work."""
     start("-c", WITHOUT_CLIENT, "serve", "-c", endpoint, "-s", "sim:", "--http", pages.where)
-    wait_for(lambda: pages.ask("/readyz")[0] == 200, what="the service")
-    status, text = pages.ask("/metrics")
+    wait_for(lambda: pages.request("/readyz")[0] == 200, what="the service")
+    status, text = pages.request("/metrics")
     assert status == 501
     assert re.fullmatch(r"prometheus_client: not installed: .*pip install .*\[metrics\]'\n", text)
     exporter = start("-c", WITHOUT_CLIENT, "export", "-c", endpoint, "--http", f"127.0.0.1:{free_port()}")

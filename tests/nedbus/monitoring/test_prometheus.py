@@ -47,7 +47,7 @@ main()
 
 
 @contextmanager
-def traffic(bus: nedbus.Bus, raw: Session, udp_port: int) -> Iterator[threading.Event]:
+def traffic(bus: nedbus.Bus, zenoh_session: Session, udp_port: int) -> Iterator[threading.Event]:
     """Publish at 50 Hz; yield an event that makes everything fail while it is set.
 
     Then vehicle "gone" is silent, "lost" skips every other sequence number, "doubtful" is invalid, dead reckoning and
@@ -56,7 +56,7 @@ def traffic(bus: nedbus.Bus, raw: Session, udp_port: int) -> Iterator[threading.
     bad = threading.Event()
     gone, doubtful, many = (bus.publisher(VLP, vehicle=name) for name in ("gone", "doubtful", "many"))
     status = bus.publisher("vehicle_status", vehicle="doubtful")
-    junk, numbered = (raw.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost"))
+    junk, numbered = (zenoh_session.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost"))
     burst = to_array([message(number, **VALID) for number in range(1, 401)])
     numbers = count(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -96,7 +96,7 @@ def shorten(rules: str) -> str:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_every_alert_fires_and_clears(
-    start: Start, run_nedbus: Start, bus: nedbus.Bus, raw: Session, tmp_path: Path
+    start: Start, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
     """Each alert fires for its cause, has labels that name it, and clears when the cause ends.
 
@@ -159,7 +159,7 @@ def test_every_alert_fires_and_clears(
     }
     assert expected.keys() == set(re.findall(r"alert: (\w+)", rules))
 
-    with traffic(bus, raw, silent) as bad, ExitStack() as crowd:
+    with traffic(bus, zenoh_session, silent) as bad, ExitStack() as crowd:
         of_gone = f'nedbus_messages_received_total{{instance="{exporter}", vehicle="gone"}} > 10'
         wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=TIMEOUT)
         bad.set()

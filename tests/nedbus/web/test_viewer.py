@@ -824,7 +824,7 @@ def open_page(endpoint: str) -> Iterator[tuple[RenderedPage, Callable[[Callable[
         reading.result()
 
 
-def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """Published vehicles are in the list and on the map, and stay there when invalid or gone."""
     fields = {**VALID, "x": 5.0}
     wing, quad = (bus.publisher(VLP, vehicle=name) for name in ("wing", "quad"))
@@ -839,7 +839,7 @@ def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, raw: Se
             quad.close()
             until(lambda: page.states == {"quad": "gone", "wing": "xy not valid"}, "the end of the other")
         assert page.marks["quad"]["shape"] == "square"
-        raw.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
+        zenoh_session.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
         page.send("streams")
         until(lambda: "<td>a rule</td>" in page.part("more"), "the report")
         until(lambda: any("rejected: a rule" in event.text for event in page.viewer._timeline.events), "its event")

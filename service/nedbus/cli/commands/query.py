@@ -36,15 +36,15 @@ _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
 _SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
-_MAX_ROWS: Final = 200  # of a table, and services shown: any peer may claim to be a service
+_MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 
 @command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
-    """List published streams, the age of their last message and state.
+    """List the published streams with state and age of their last message.
 
-    Exits with 1 if the list is incomplete, as the router is too slow or refuses.
+    Exits with 1 if the list is incomplete because the router is too slow or refuses the query.
     """
     selection = Selection(ANY, vehicle)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
@@ -84,7 +84,7 @@ def get(
 ) -> None:
     """Show the last message of each stream with all its fields.
 
-    Messages from a storage without a publisher are marked. Exits with 1 if no publisher answers.
+    Messages that only a storage still has are marked. Exits with 1 if no publisher answers.
     """
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
@@ -99,7 +99,7 @@ def get(
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services of the network, their sources and streams."""
+    """Show the services of the network with their sources and streams."""
     services, vehicles = bus.services(), bus.vehicles()
     if json_output:
         for service in services:
