@@ -66,7 +66,7 @@ def encoding_of(definition: Definition[Any], source: str | None, provided: froze
 
 
 def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
-    """Return the first 32 hex digits of the RIHS01 hash of a message with these fields: 128 bits in each encoding."""
+    """Return the first 32 hex digits (128 bits) of the RIHS01 hash of a message with these fields."""
     return hash_of(Layout("", "", types=types), f"{PACKAGE}/{name}").removeprefix("RIHS01_")[:32]
 
 
