@@ -12,7 +12,7 @@ from functools import cached_property
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
-from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, cached_on_owner
+from .declaration import ALL, RELEASES, Layout, Topic, cached_on_owner
 from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values
 
@@ -198,8 +198,7 @@ class Definition(Generic[M_co]):
         """Return the error text for an unknown field, with suggestions."""
         base, bracket, _ = name.partition("[")
         near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
-        schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
-        hint = f"did you mean {' or '.join(near)}?" if near else f"'{schema}' lists the fields"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"'nedbus schema {self.name}' lists the fields"
         return f"unknown field {name!r}: {hint}"
 
     def __repr__(self) -> str:
