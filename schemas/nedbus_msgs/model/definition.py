@@ -148,7 +148,8 @@ class Definition(Generic[M_co]):
         for old in (self.older[name] for name in names if name in self.older):
             for base, index in old.targets:
                 if index is not None and base not in direct:
-                    converted.setdefault(base, ([None] * self.types[base].values, _elements))[0][index] = old.name
+                    sources, _ = converted.setdefault(base, ([None] * self.types[base].values, lambda *values: values))
+                    sources[index] = old.name
                 elif old.up and base not in direct:
                     converted.setdefault(base, ([old.name], old.up))
                 elif base not in converted:
@@ -256,10 +257,6 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
         except (TypeError, OverflowError):  # not a number, which the model rejects
             (upgraded[name],) = values
     return upgraded
-
-
-def _elements(*values: object) -> tuple[object, ...]:
-    return values
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:
