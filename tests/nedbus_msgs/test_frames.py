@@ -47,7 +47,7 @@ def with_origin(**fields: object) -> VehicleLocalPosition:
 
 
 def test_projection_of_one_degree_of_latitude() -> None:
-    """The distance is that on PX4's sphere."""
+    """One degree of latitude is 111,194.93 m on PX4's sphere."""
     north, east = MapProjection(0.0, 0.0).project(1.0, 0.0)
     assert north == pytest.approx(111194.9266, abs=0.01)
     assert east == pytest.approx(0.0, abs=0.01)

@@ -1,4 +1,4 @@
-"""The layout table, compared with PX4's message pages, and conversion between layouts."""
+"""The layout table, compared with PX4's message reference, and conversion between layouts."""
 
 from __future__ import annotations
 
