@@ -124,7 +124,7 @@ class Arrays(Generic[M]):
         return self.definition.validation.unpack(element.tobytes())
 
     def to_element(self, row: Values) -> Values:
-        """Convert a row for assignment to an array: text becomes UTF-8, as NumPy rejects non-ASCII strings."""
+        """Convert a row for assignment to an array: text becomes UTF-8, because NumPy rejects non-ASCII strings."""
         if not self._has_text:
             return row
         return tuple(encode_text(value) if isinstance(value, str) else value for value in row)

@@ -17,7 +17,7 @@ _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
 class Message(BaseModel):
-    """One message of one vehicle; each subclass declares the fields of one PX4 message.
+    """A message of a vehicle; each subclass declares the fields of one PX4 message.
 
     Numbers in float32 fields are rounded to the nearest float32, like a C float, so a message is received bit for bit
     as it was created; numbers beyond the range of float32, such as 1e39, are rejected.
@@ -159,7 +159,7 @@ def fill(message: _M, values: dict[str, object], given: Set[str]) -> _M:
     return message
 
 
-# The slots that Pydantic's own validator sets (2.12 to 2.x); set directly, as the models are frozen.
+# The slots that Pydantic's own validator sets (2.12 to 2.x); set directly because models are frozen.
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
     for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")

@@ -1,6 +1,6 @@
 """Validation rules between fields, as Python expressions on values and on NumPy columns.
 
-Every rule holds on all real flights examined; docs/messages.md has the counts.
+Every rule holds in all examined real flights; docs/messages.md has the counts.
 """
 
 import math

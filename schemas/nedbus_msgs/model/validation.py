@@ -41,7 +41,7 @@ class Validation:
         self.template: dict[str, object] = dict.fromkeys(names)
         self._types = types
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
-        # Not the model's schema: Pydantic needs 20 ms to build it for all messages, and swallows Ctrl-C meanwhile.
+        # Not the model's schema: Pydantic takes 20 ms to build it for all messages, during which it swallows Ctrl-C.
         tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
         self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
         self._struct = struct.Struct("=" + "".join(kind.form for kind in kinds))
