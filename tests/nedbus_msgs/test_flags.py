@@ -59,7 +59,7 @@ def test_doubt_flags_are_validity_and_dead_reckoning() -> None:
         (GOOD | {"v_z_valid": 0.0001}, "vz invalid 99 %"),
     ],
 )  # fmt: skip
-def test_shares_are_described(shares: dict[str, float], text: str) -> None:
+def test_flag_shares_are_described_in_words(shares: dict[str, float], text: str) -> None:
     """Flags that are bad in all messages are grouped; others have a percentage, which is never 0 or 100 %."""
     assert describe_flags(shares) == text
 
@@ -120,7 +120,7 @@ def test_properties_return_the_fields(message: VehicleLocalPosition, as_row: boo
     assert either.global_position == (to_global(message) if has_position and has_origin else None)
 
 
-def test_properties_of_global_and_home_position() -> None:
+def test_global_and_home_position_properties_follow_their_flags() -> None:
     """A property whose flags are not all true is None; the others return the fields."""
     estimate = VehicleGlobalPosition(timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True)
     assert (estimate.global_position, estimate.ground_altitude) == (GlobalPosition(47.0, 8.0, 400.0), None)

@@ -60,7 +60,7 @@ def test_ros_2_payload_round_trip(layout: str, vector: Mapping[str, Any]) -> Non
 
 
 @given(messages())
-def test_payload_equals_that_of_rosbags(message: VehicleLocalPosition) -> None:
+def test_payload_matches_rosbags(message: VehicleLocalPosition) -> None:
     """Any message in any layout encodes to the same bytes as with rosbags, and decodes to the same fields."""
     for layout in LAYOUTS:
         fields = downgrade(message, layout)
@@ -76,7 +76,7 @@ def as_array(value: object) -> Any:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_payload_size_is_limited_to_px4s_trailer(layout: str) -> None:
+def test_payload_size_is_limited_to_px4_trailer(layout: str) -> None:
     """PX4's struct size plus 28 bytes is accepted; one byte more, or one less than CDR needs, is rejected."""
     payload = encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout)
     longest = {"1.13": 196, "1.14": 196, "1.15": 212, "V0": 220, "1.16": 220}[layout]

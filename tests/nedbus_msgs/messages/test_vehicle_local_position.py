@@ -130,8 +130,8 @@ def test_copy_with_unchanged_value_equals_the_message(message: VehicleLocalPosit
     assert bits(message.model_copy(update={name: getattr(message, name)})) == bits(message)
 
 
-def test_json_schema_describes_the_json() -> None:
-    """Every field has a description and no default; floats may be "NaN", "Infinity" or "-Infinity"."""
+def test_json_schema_matches_the_model() -> None:
+    """In the schema every field has a description and no default; floats may be "NaN", "Infinity" or "-Infinity"."""
     schema = json_schema()
     properties = schema["properties"]
     assert isinstance(properties, dict)
