@@ -240,7 +240,7 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
             "topic 'vehicle_local_positon' is not valid: expected vehicle_local_position or ",
         ),
         (["echo", "--field", "xy_vallid"], "--field: unknown field 'xy_vallid': did you mean xy_valid"),
-        (["echo", "--field", "qqq"], "--field: unknown field 'qqq': 'nedbus schema' lists the fields"),
+        (["echo", "--field", "qqq"], "unknown field 'qqq': 'nedbus schema VehicleLocalPosition' lists the fields"),
         (["echo", "vehicle_attitude", "--field", "x"], "'nedbus schema VehicleAttitude' lists the fields"),
         (["echo", "vehicle_attitude", "--field", "q[1]"], "unknown field 'q[1]': did you mean q?"),
         (["echo", "VehicleAttitude"], "expected one of vehicle_attitude, vehicle_attitude_groundtruth"),
