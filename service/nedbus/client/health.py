@@ -32,7 +32,7 @@ _MIN_STEPS: Final = 5  # steps before gaps are counted
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual step and the usual rate
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
-_SELDOM: Final = 1.0  # Hz; a topic without a file that comes less often may be one of events
+_SELDOM: Final = 1.0  # Hz; below it, a topic without a file may be published on change
 _COUNTER_MODULUS: Final = 256  # modulus of reset counters
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
 _MAX_STREAMS: Final = 4096  # per monitor
@@ -262,13 +262,13 @@ class Monitor:
         stream = self._streams.pop(address, None)
         if stream is None and len(self._streams) >= _MAX_STREAMS:
             if not self.evicted:
-                text = "more than %d streams: the health of those that are silent longest is forgotten"
+                text = "more than %d streams: the health of the least recently updated ones is discarded"
                 _log.warning(text, _MAX_STREAMS, extra=about("incomplete"))
             self.evicted += 1
             del self._streams[next(iter(self._streams))]
         self._streams[address] = stream = StreamHealth(sample.topic) if stream is None else stream
-        lacking = sample.provenance.missing
-        stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=lacking)
+        missing = sample.provenance.missing
+        stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=missing)
         return True
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
@@ -282,7 +282,7 @@ class Monitor:
         return stream.latencies if stream is not None else None
 
     def forget(self, address: Address) -> None:
-        """Remove a stream; it starts over if it comes back."""
+        """Remove a stream; its next sample starts a new measurement."""
         self._streams.pop(address, None)
 
 
@@ -295,7 +295,7 @@ class StreamState:
 
     @property
     def severity(self) -> int:
-        """Index among the states; 0 is the worst."""
+        """Index in the list of states; 0 is the worst."""
         return get_args(StateName).index(self.name)
 
     def __str__(self) -> str:
@@ -335,7 +335,7 @@ def describe_stream(health: Health, state: StreamState) -> str:
 
 
 def health_of_last(sample: Sample[Message]) -> Health:
-    """Return the health of a stream with only its last message known; the age is by the wall clock."""
+    """Return the health of a stream of which only the last message is available; the age is by the wall clock."""
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
     return stream.snapshot(0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent))

@@ -28,7 +28,7 @@ class RateGate:
         if now < due:  # the first message, or the clock was set back, as when a vehicle restarts
             self._due = now + self._period - self._early
         else:
-            # One period after the due time, not after this message: 100 Hz at 30 Hz gives 30 Hz, 30 or 40 ms apart.
+            # One period after the due time, not after this message: 100 Hz limited to 30 Hz stays 30 Hz on average.
             self._due = max(due + self._period, now - self._early)
         return True
 

@@ -124,8 +124,7 @@ class Counts:
     `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
-    `forgotten`: keys forgotten, those silent longest, because there were more than 10,000; their next gap is not in
-    `lost`.
+    `forgotten`: least recently active keys, evicted as there were more than 10,000; their next gap is not in `lost`.
     """
 
     received: int = 0

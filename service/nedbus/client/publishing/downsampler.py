@@ -1,7 +1,7 @@
 """Downsampled copies of a stream, one for each of RATES, published while they have subscribers.
 
 `<key>/@rate/5` carries up to 5 messages per second of `<key>`, with its own sequence numbers and history cache.
-A vehicle without such subscribers costs one declaration; each stream declares more once that one is matched.
+A vehicle without such subscribers costs one declaration; its streams declare more once that one is matched.
 """
 
 import threading
@@ -28,7 +28,7 @@ class MatchingListener:
     def __init__(self, session: Session, key_expr: str) -> None:
         with while_open():
             self._probe = session.declare_publisher(key_expr)
-            # It reports the current status first.
+            # The listener reports the current status first.
             self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
         self._matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
@@ -52,7 +52,7 @@ class MatchingListener:
 
 
 class Downsampler:
-    """Publisher of the downsampled copies of one address, for one thread.
+    """Publisher of the downsampled copies of one address; not thread-safe.
 
     `vehicle`: the listener of all downsampled streams of its vehicle.
     """
@@ -87,7 +87,7 @@ class Downsampler:
 
 
 class _Stream:
-    """The stream of one rate; its writer exists while it is matched, and for another minute."""
+    """The stream of one rate; its writer exists while it is matched and for one minute after."""
 
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, topic: Topic) -> None:
         self.writer: Writer | None = None

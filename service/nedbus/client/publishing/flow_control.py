@@ -22,12 +22,12 @@ _log = logging.getLogger(__name__)
 
 WINDOW: Final = 2000  # unacknowledged messages of a session; this fits into the queues of a link and of a reader
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
-_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages, after which not even one per trickle period is sent
-_MIN_WINDOW: Final = 100  # messages per publisher, whatever their number
+_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; beyond, not even one per trickle period is sent
+_MIN_WINDOW: Final = 100  # messages per publisher, however many there are
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
-_RETRY_PAUSE: Final = 0.5  # s before a request is repeated, as a full queue may have dropped it; then it doubles
-_QUERY_TIMEOUT: Final = 10.0  # s before a request is repeated at most, and timeout of each of its queries
+_RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have dropped, is repeated; doubles each time
+_QUERY_TIMEOUT: Final = 10.0  # s, the longest such pause, and the timeout of each query
 _STALE_POLL: Final = 1.0  # s without a poll after which the replies do not show which readers exist
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
 _POLL_EVERY: Final = 16  # messages between polls
@@ -36,13 +36,13 @@ _UNKNOWN: Final = ""  # a reader that has never replied
 
 
 class SharedWindow:
-    """The window of a session: its lossless publishers share it equally, and may use what the others do not."""
+    """The window of a session, shared equally by its lossless publishers; each may also use what others leave."""
 
     def __init__(self) -> None:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key; replaced as a whole
 
-    def part(self, key: str, unread: int, *, now: float) -> int:
-        """Return the window of a publisher with `unread` messages; it expires without a call for a second."""
+    def share(self, key: str, unread: int, *, now: float) -> int:
+        """Return the share of a publisher with `unread` messages; it expires after a second without a call."""
         recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
         self._unread = unread_by_key = recent | {key: (unread, now)}
         others = sum(number for number, _ in unread_by_key.values()) - unread
@@ -60,7 +60,7 @@ class ReaderProxies:
     def update(self, replies: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Update from all replies to a request; `replies`: by reader, True if it is closed. `now` in seconds.
 
-        `froze`: the request ended long after its last reply, by the end of the lease of a reader without a reply.
+        `froze`: the request ended long after its last reply, when the lease of a silent reader expired.
         """
         if replies.keys() - self._matched - self.away.keys():
             self.away.pop(_UNKNOWN, None)
@@ -127,7 +127,7 @@ class FlowControl:
     def wait_for_credit(self, published: int) -> None:
         """Wait while readers have more than a window of unread messages; raise ClosedError once closed.
 
-        Call it after each message. It returns after a trickle period, until _MAX_UNACKNOWLEDGED messages are unread.
+        Call it after each message. Up to _MAX_UNACKNOWLEDGED unread messages it returns after a trickle period.
         """
         has_credit = published < self._due and published - self._acknowledged[True] < self._window
         if has_credit and published % _POLL_EVERY:
@@ -143,7 +143,7 @@ class FlowControl:
         """Wait until readers have received all messages; return False after `timeout` s. Raises ClosedError."""
         with self._lock:
             if self._request is not None and self._request.read:
-                self._request, self._next_request = None, 0.0  # a request for reception is acknowledged sooner
+                self._request, self._next_request = None, 0.0  # reception is acknowledged sooner
             self._acknowledged[False] = 0  # there may be new readers
         return not published or self._wait(published, 1, read=False, timeout=timeout)
 
@@ -166,7 +166,7 @@ class FlowControl:
     def _send_request(self, published: int, *, read: bool, now: float) -> None:
         """Request an acknowledgement of the first `published` messages, or repeat the open request."""
         if self._request is None:
-            self._window = self._shared.part(self._writer.key, published - self._acknowledged[True], now=now)
+            self._window = self._shared.share(self._writer.key, published - self._acknowledged[True], now=now)
             self._due = published + self._window // _REQUESTS_PER_WINDOW
             self._request = _Request(published, self._routers(), read=read, now=now)
         request, writer = self._request, self._writer

@@ -27,11 +27,11 @@ FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
 class Publisher(AbstractContextManager["Publisher"]):
-    """Publishes the messages of one address; get one from `bus.publisher(...)`.
+    """Publisher of the messages of one address; get one from `bus.publisher(...)`.
 
     A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
-    `publish` never waits for slow readers, unless the publisher is lossless: it then waits while a reader of mode
-    "every" has more than 2,000 unread messages, and sends 10 messages per second meanwhile.
+    `publish` never waits for slow readers, unless the publisher is lossless: it then slows down to 10 messages per
+    second while a reader of mode "every" has more than 2,000 unread messages.
     Not thread-safe. A context manager.
     """
 
@@ -89,7 +89,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Publish a message, or validate a dict of fields and publish them as a message.
 
         A Message was validated when it was created, and is not validated again.
-        A dict without `timestamp` gets the time since this host booted, as PX4's own messages have that of theirs.
+        A dict without `timestamp` gets the time since boot of this host, as PX4 uses the time since its own boot.
         Readers see the fields that were not provided in `sample.missing`.
 
         Raises TypeError for another type of message, InvalidMessageError for invalid fields, EncodeError for a message
@@ -115,7 +115,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def publish_many(self, messages: MessageArray) -> None:
         """Validate a structured array of shape (n,) and dtype DTYPE, then publish its messages in order.
 
-        Nothing is published if any message is invalid. If the bus is closed meanwhile, `published` has the number sent.
+        Publishes nothing if a message is invalid. If the bus closes during the call, `published` has the number sent.
 
         Raises TypeError for another dtype, InvalidMessageError for the first invalid message, with its `index`,
         ClosedError once the publisher or its bus is closed.
@@ -134,7 +134,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers of mode "every" have received all messages; return False on timeout.
 
-        Without it, messages in transit to a slow reader when the process ends are lost, and not counted as lost.
+        If the process ends without a flush, messages in transit to a slow reader are lost and not counted as lost.
         A disconnected reader detects the messages it missed, and recovers those still in the history cache.
 
         Raises ClosedError once the bus is closed.
@@ -145,7 +145,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Withdraw the address and free it for another publisher. Idempotent.
 
         A lossless publisher is flushed first, for at most `timeout` seconds, unless a `with` block ends with an
-        exception. Ctrl-C ends the wait, and closes.
+        exception. Ctrl-C ends the wait and closes the publisher.
         """
         if self._writer.closed:
             return

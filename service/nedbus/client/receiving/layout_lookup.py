@@ -1,4 +1,4 @@
-"""Layout lookup: ask publishers for message definitions and layouts that are not installed here."""
+"""Layout lookup: query publishers for message definitions and layouts that are not installed here."""
 
 import logging
 import threading
@@ -24,16 +24,16 @@ _log = logging.getLogger(__name__)
 
 _MAX_LAYOUTS: Final = 16  # newer layouts per message
 _MAX_FIELDS: Final = 65_536  # of all messages defined by publishers; PX4's have 15 on average
-_IN_USE: Final = 60.0  # s since the last message for which a definition is kept, although there is no room for another
-_BASE: Final = 48  # fields that take as much memory as a message without any
-_MAX_UNKNOWN: Final = 64  # messages and layouts per query, and those that wait for the next one
-_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the first one may be asked for again
-_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s until the same is asked for again, by failed queries
+_IN_USE: Final = 60.0  # s after its last message during which a definition is not evicted
+_BASE: Final = 48  # memory of a definition without fields, in fields
+_MAX_UNKNOWN: Final = 64  # messages and layouts per query, and as many that wait for the next query
+_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the backoff of the oldest is discarded
+_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s, backoff after failed queries for a message or layout
 _PACE: Final = 0.2  # s between a query without a result and the next one
 _MAX_REPLY_FIELDS: Final = 256  # per layout
 _MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_RECOVERY: Final = 0.1  # of the time since then becomes patience again, so that no peer can keep readers waiting
+_RECOVERY: Final = 0.1  # s of patience regained per second, which limits how long peers can make readers wait
 
 # A message, and the number of a newer layout or, for a message without a file, the hash of its definition.
 Wanted = tuple[str, int | str]
@@ -61,7 +61,7 @@ class LayoutLookup:
         self._closed = False
         self._open: dict[Wanted, object] = {}  # with the publisher; those of the current query first
         self._failed: dict[Wanted, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
-        self._patience, self._waited = TIMINGS.definition_timeout, float("-inf")  # of readers; their last wait in vain
+        self._patience, self._waited = TIMINGS.definition_timeout, float("-inf")  # [s]; end of the last futile wait
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
         """Return the newer layouts of a message found so far, in the form that `decode` expects."""
@@ -163,23 +163,23 @@ class LayoutLookup:
         return self._add_layout(name, which, fields) if isinstance(which, int) else self._define(name, which, fields)
 
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
-        if not self._make_room(len(fields) + _BASE):
+        if not self._evict(len(fields) + _BASE):
             if not self._full:
-                _log.warning("%s: too many messages without a file: not read", name, extra=about("invalid"))
+                _log.warning("%s: too many messages without a file, not decoded", name, extra=about("invalid"))
             self._full = True
             return False
         try:
             definition = define(name, ((field, field_type(kind)) for field, kind in fields.items()))
         except ValueError as exc:
-            _log.warning("%s: invalid description by a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
+            _log.warning("%s: invalid definition from a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
         self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
-        text = "%s is not installed here: using the publisher's description"
+        text = "%s is not installed here: using the publisher's definition"
         _log.info(text, name, extra=about("described", reason=f"hash {identity}"))
         return True
 
-    def _make_room(self, size: int) -> bool:
-        """Forget definitions out of use, least recently used first; return False if that makes too little room."""
+    def _evict(self, size: int) -> bool:
+        """Evict unused definitions, least recently used first; return False if that frees too little."""
         known = sorted(self._codecs, key=self._used.__getitem__)
         room = _MAX_FIELDS - sum(len(self._codecs[wanted].definition.types) + _BASE for wanted in known)
         for wanted in known:
@@ -195,8 +195,8 @@ class LayoutLookup:
             return False
         self._newer[name] = {**newer, number: tuple(fields)}
         ignored = ", ".join(field for field in fields if field not in definition.types)[:_MAX_TEXT] or "nothing"
-        extra = about("newer-layout")
-        _log.warning("layout %d of %s is newer than this reader; not read: %s", number, name, ignored, extra=extra)
+        text = "layout %d of %s is newer than this reader; ignored fields: %s"
+        _log.warning(text, number, name, ignored, extra=about("newer-layout"))
         return True
 
 
@@ -218,7 +218,7 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
     """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
 
-    Returns once all are found: a publisher that is stopped, or behind a bad link, does not delay it.
+    Returns once all are found, without waiting for stopped publishers or bad links.
     """
     found: dict[Wanted, dict[str, str]] = {}
     keys = {

@@ -1,4 +1,4 @@
-"""Subscription with a maximum rate: last messages first, then the streams that publishers downsample.
+"""Subscription with a maximum rate: last messages first, then the streams downsampled by publishers.
 
 If a publisher does not downsample, a warning is logged; the full rate is never used, as the link may not carry it.
 """
@@ -51,7 +51,7 @@ class MaxRateQueue(PendingQueue):
                 stream = self._stream(self._rate_key(arrival[0].address))
                 if arrival[1] and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
-                    self.account.delivered.append(detach(arrival, retained=True))
+                    self.counters.delivered.append(detach(arrival, retained=True))
             super()._queue()
         self.wake()
 
@@ -65,7 +65,7 @@ class MaxRateQueue(PendingQueue):
         return address.rate_key(self.rate, prefix=self.decoder.prefix)
 
     def _queue(self) -> int:
-        self.account.delivered = [arrival for arrival in self.account.delivered if self._passes(arrival)]
+        self.counters.delivered = [arrival for arrival in self.counters.delivered if self._passes(arrival)]
         return super()._queue()
 
     def _passes(self, arrival: Arrival) -> bool:
@@ -95,7 +95,7 @@ class MaxRateReceiver(Receiver):
         pause = super()._poll(now)
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
             found = [reply.ok for reply in self._last.take() if reply.ok is not None]
-            # Only live publishers: vehicles with nothing but a stored message are gone.
+            # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
                 self._rate_queue.put_last(live)
             self._check_publishers(now)
@@ -115,7 +115,7 @@ class MaxRateReceiver(Receiver):
             del self._awaiting[address]
         if missing := [address for address in due if not self._rate_queue.has_downsampled(address)]:
             key = missing[0].key(prefix=self._prefix)
-            text = "%d streams are not received, as they are not downsampled (by publisher or access rules), such as %s"
+            text = "%d streams are not downsampled (by publisher or access rules) and not received, such as %s"
             _log.warning(text, len(missing), key, extra=about("unsupported"))
 
 

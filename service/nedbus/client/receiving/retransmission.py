@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 _MAX_OPEN: Final = 64  # requests in flight
 _MAX_OPEN_HISTORY: Final = 16  # of these, requests to publishers that have delivered no message yet
 _MAX_OPEN_OF_KEY: Final = 4  # of these, requests on one key, whose publishers may never answer
-_MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, answers would push out others, and requests pause
+_MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, requests pause, as answers would displace messages
 _TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
@@ -57,7 +57,7 @@ class Retransmission:
         for writer, answers in list(self._open.items()):
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
         if self._queue.waiting <= _MAX_WAITING:
-            for writer in list(self._queue.account.requesting):  # copied: other threads add to it
+            for writer in list(self._queue.counters.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
                 if writer in self._open or not self._has_room(writer):

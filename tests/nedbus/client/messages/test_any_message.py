@@ -131,4 +131,4 @@ def test_message_of_unknown_encoding_says_so(
             return subscription.counts.invalid == 1
 
         wait_for(is_counted, what="it to be counted")
-    assert "the encoding 'text/plain' has no name and hash of a message" in caplog.text
+    assert "the encoding 'text/plain' has no message name and hash" in caplog.text

@@ -74,15 +74,15 @@ def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, con
 def test_window_is_shared_while_it_is_used() -> None:
     """Publishers share the window and use what others do not; one without messages for a second does not count."""
     shared = SharedWindow()
-    assert shared.part("a", 0, now=0.0) == WINDOW
-    assert shared.part("a", 1900, now=0.1) == WINDOW
-    assert shared.part("b", 0, now=0.2) == WINDOW // 2
-    assert shared.part("b", 500, now=0.3) == WINDOW // 2
-    assert shared.part("a", 100, now=0.4) == WINDOW - 500
+    assert shared.share("a", 0, now=0.0) == WINDOW
+    assert shared.share("a", 1900, now=0.1) == WINDOW
+    assert shared.share("b", 0, now=0.2) == WINDOW // 2
+    assert shared.share("b", 500, now=0.3) == WINDOW // 2
+    assert shared.share("a", 100, now=0.4) == WINDOW - 500
     for number in range(8):
-        shared.part(f"other {number}", 1000, now=0.5)
-    assert shared.part("a", 100, now=0.6) == WINDOW // 10
-    assert shared.part("a", 100, now=1.8) == WINDOW
+        shared.share(f"other {number}", 1000, now=0.5)
+    assert shared.share("a", 100, now=0.6) == WINDOW // 10
+    assert shared.share("a", 100, now=1.8) == WINDOW
 
 
 @pytest.mark.parametrize(("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)])

@@ -88,10 +88,10 @@ class QueueAccount(PendingQueue):
         with changing_timings() as timings:
             timings.retransmit_timeout = 1e6
             self._now += 1.0
-            for writer in list(self.account.requesting):
+            for writer in list(self.counters.requesting):
                 self.next_request(writer, self._now)
-        asked = [(writer, writer.request.requested) for writer in self.account.requesting if writer.request is not None]
-        return [Request(writer, writer.name, numbers) for writer, numbers in asked if numbers is not None]
+        opened = [(each, each.request.requested) for each in self.counters.requesting if each.request is not None]
+        return [Request(writer, writer.name, numbers) for writer, numbers in opened if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
         assert isinstance(request.handle, WriterProxy)
@@ -102,7 +102,7 @@ class QueueAccount(PendingQueue):
 
     @property
     def held(self) -> int:
-        return self.account.held
+        return self.counters.held
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:

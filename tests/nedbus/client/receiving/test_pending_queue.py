@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_forgotten_last(monkeypatch: pytest.MonkeyPatch)
         pending_queue.put([raw(number, key=key_of(vehicle), publisher=vehicle) for number in numbers])
     assert pending_queue.counts == Counts(lost=4, forgotten=2)  # b, then a
     assert [sample.vehicle for sample in drain(pending_queue)] == list("abcdae")
-    assert len(pending_queue.account.requesting) == 2
+    assert len(pending_queue.counters.requesting) == 2
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
@@ -259,7 +259,7 @@ def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCap
     known: Schemas = {("VehicleLocalPosition", 1500): {"timestamp": "uint64", 100_000 * "x": "float32"}}
     learn(LayoutLookup(lambda _: known), [msgpack.packb([1500, 1, 2])])
     [line] = caplog.messages
-    assert line.startswith("layout 1500 of VehicleLocalPosition is newer than this reader; not read: xxx")
+    assert line.startswith("layout 1500 of VehicleLocalPosition is newer than this reader; ignored fields: xxx")
     assert len(line) < 1000
 
 

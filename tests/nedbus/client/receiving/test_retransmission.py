@@ -200,7 +200,7 @@ def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> Non
     lossy.publish(3)
     assert lossy.receive(1) == [3]
     assert {key for key, _, _ in lossy.asked} == {KEY}
-    assert not lossy.queue.account.requesting
+    assert not lossy.queue.counters.requesting
 
 
 def test_requests_without_replies_delay_no_others(lossy: Lossy, raw: Session) -> None:
@@ -214,7 +214,7 @@ def test_requests_without_replies_delay_no_others(lossy: Lossy, raw: Session) ->
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
-        assert lossy.queue.account.requesting  # the others still wait
+        assert lossy.queue.counters.requesting  # the others still wait
         taken.clear()
 
 
@@ -257,7 +257,7 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
     lossy.publish(*range(4))
     assert lossy.receive(1) == [0]
-    wait_for(lambda: lossy.queue.account.requesting, what="the hole")
+    wait_for(lambda: lossy.queue.counters.requesting, what="the hole")
     lossy.subscription.close()
     assert lossy.subscription.counts.lost == 2
 
@@ -277,7 +277,7 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
     wait_for(
-        lambda: (lossy.queue.waiting, lossy.queue.account.held) == (10, 9),
+        lambda: (lossy.queue.waiting, lossy.queue.counters.held) == (10, 9),
         what="what comes before the hole and after it",
     )
     asked_before = list(lossy.asked)
