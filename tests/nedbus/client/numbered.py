@@ -1,4 +1,4 @@
-"""Publishers of numbered messages, which start once a reader is subscribed."""
+"""Messages with numbers as timestamps, and waiting for the subscriber of a publisher."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
 
 def is_read(publisher: nedbus.Publisher) -> bool:
     """Return True if a publisher is matched by a subscriber."""
-    probe = publisher._writer.session.declare_publisher(publisher.key)  # no other session knows what this one does
+    probe = publisher._writer.session.declare_publisher(publisher.key)  # other sessions have another matching status
     status = cast("zenoh.MatchingStatus", probe.matching_status)
     probe.undeclare()
     return status.matching
 
 
 def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher is matched by a subscriber; earlier messages would go nowhere."""
+    """Wait until a publisher is matched by a subscriber, which would not receive earlier messages."""
     wait_for(partial(is_read, publisher), what=f"a subscriber of {publisher.key}")
 
 
 def take(subscription: nedbus.Subscription[Any], count: int) -> list[int]:
-    """Wait for `count` messages, and return their timestamps."""
+    """Wait for `count` messages and return their timestamps."""
     return [subscription.receive(DEADLINE).message.timestamp for _ in range(count)]

@@ -29,7 +29,7 @@ from nedbus.transport.queries import Answers
 from nedbus_msgs import DEFAULT, Address
 from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.downsampling import Link, wait_for_demand
+from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
 from tests.peers.answering import answering, reply_with
 from tests.peers.ports import free_endpoint
@@ -63,7 +63,7 @@ def test_retained_sample(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_ra
     publish(publisher, 1)
     subscription = client.subscribe(mode=mode, max_rate=max_rate)
     first = subscription.receive(DEADLINE)
-    wait_for_subscriber(publisher) if max_rate is None else wait_for_demand(publisher)
+    wait_for_subscriber(publisher) if max_rate is None else wait_for_downsampling_reader(publisher)
     publish(publisher, 2)
     second = subscription.receive(DEADLINE)
     assert [(each.message.timestamp, each.retained) for each in (first, second)] == [(1, True), (2, False)]

@@ -26,7 +26,7 @@ from nedbus_msgs.arrays import to_array
 from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import take
-from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_demand
+from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_downsampling_reader
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
 from tests.peers.command_line import run_command
@@ -340,7 +340,7 @@ def test_thinned_stream_flows_as_the_stream_does(
     stranger, reader = open_as("vehicle-2"), join("reader")
     with reader.subscribe(mode="every", max_rate=5) as subscription:
         assert take(subscription, 1) == [1]
-        wait_for_demand(publisher)
+        wait_for_downsampling_reader(publisher)
         stranger.put(Address("1", VLP).rate_key(5), encode(message(666)))
         publish(publisher, clock, 2, 1000)
         assert take(subscription, 50) == list(range(2, 1002, 20))

@@ -22,13 +22,22 @@ from nedbus.transport import Session
 from nedbus_msgs import RATE, Address, AddressError, Selection
 from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
+from tests.nedbus.client.downsampling import (
+    MS,
+    Clock,
+    Link,
+    clock,
+    has_downsampling_reader,
+    publish,
+    take_last,
+    wait_for_downsampling_reader,
+)
 from tests.nedbus.client.numbered import is_read, take, wait_for_subscriber
 from tests.peers.answering import answering, reply_with
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
-__all__ = ["Clock", "clock", "publish", "take", "wait_for_demand"]  # for others that thin
+__all__ = ["Clock", "clock", "publish", "take", "wait_for_downsampling_reader"]  # for others that thin
 
 BOTH: list[Mode] = ["latest", "every"]
 
@@ -80,7 +89,7 @@ def test_messages_arrive_as_they_were(bus: nedbus.Bus, clock: Clock) -> None:
     """Payload, source, missing fields and time of sending are those of the original stream."""
     publisher = bus.publisher(VLP, vehicle="7", source="ins")
     with bus.subscribe(VLP, mode="every") as whole, bus.subscribe(VLP, mode="every", max_rate=5) as downsampled:
-        wait_for_demand(publisher)
+        wait_for_downsampling_reader(publisher)
         wait_for_subscriber(publisher)
         clock.now += 10 * MS
         publisher.publish({"timestamp": 5, "x": 0.1})
@@ -118,11 +127,11 @@ def test_nothing_is_declared_without_readers(bus: nedbus.Bus, raw: Session, cloc
     assert thinned_by(raw) == []
     for _ in range(2):
         with bus.subscribe(VLP, vehicle="7", mode="every", max_rate=5):
-            wait_for_demand(publisher)
+            wait_for_downsampling_reader(publisher)
             publish(publisher, clock, 11, 2)
             publish(other, clock, 11, 2)
             wait_for(lambda: thinned_by(raw) == [f"{publisher.key}/@rate/5"], what="the downsampled stream")
-        wait_for(lambda: not is_wanted(publisher), what="the end of the demand")
+        wait_for(lambda: not has_downsampling_reader(publisher), what="the end of the demand")
         publish(publisher, clock, 13, 3000)
         assert thinned_by(raw)
 
@@ -143,7 +152,7 @@ def test_listener_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clo
         first.close()
         for start in (1000, 1):  # a vehicle that restarts: its timestamps start again
             with bus.publisher(VLP, vehicle="7") as publisher:
-                wait_for_demand(publisher)
+                wait_for_downsampling_reader(publisher)
                 publish(publisher, clock, start, 100)
                 assert take(subscription, 5) == list(range(start, start + 100, 20))
             assert not bus._publishers._matched  # not visible from outside
@@ -157,7 +166,7 @@ def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> N
     publisher.publish(message(1))
     with answering(raw, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
         assert subscription.receive(DEADLINE).vehicle == "7"
-        wait_for_demand(publisher)
+        wait_for_downsampling_reader(publisher)
         publish(publisher, clock, 2, 1)
         assert subscription.receive(DEADLINE).vehicle == "7"
 
@@ -172,11 +181,11 @@ def publish_over_a_break(
         publish(publisher, clock, first, 20)
         taken.append(subscription.receive(DEADLINE))
     link.cut()
-    wait_for(lambda: not is_wanted(publisher), what="the end of the link")
+    wait_for(lambda: not has_downsampling_reader(publisher), what="the end of the link")
     last = 100 + 100 * seconds
     publish(publisher, clock, 101, last - 100)
     link.broken = False
-    wait_for_demand(publisher)
+    wait_for_downsampling_reader(publisher)
     end = last
 
     def publish_one_and_take() -> bool:
@@ -220,7 +229,7 @@ def test_lossless_publisher_does_not_wait(endpoint: str, bus: nedbus.Bus) -> Non
     """A replay at full speed does not wait for a downsampling reader that does not read, nor sends it more."""
     publisher = bus.publisher(VLP, vehicle="7", lossless=True)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=1) as subscription:
-        wait_for_demand(publisher)
+        wait_for_downsampling_reader(publisher)
         start = time.monotonic()
 
         def reads_downsampled() -> bool:
@@ -270,7 +279,7 @@ def test_publisher_that_does_not_downsample_is_named(
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
     cannot.append(publishers[1]._downsampler)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
-        wait_for_demand(publishers[0])
+        wait_for_downsampling_reader(publishers[0])
         for publisher in publishers:
             publish(publisher, clock, 1, 20)
         assert take(subscription, 2) == [1, 11]
@@ -279,7 +288,7 @@ def test_publisher_that_does_not_downsample_is_named(
             subscription.receive(timeout=0.0)
         timings.downsampled_timeout = 0.0
         wait_for(lambda: "not downsampled" in caplog.text, what="the warning")
-        assert caplog.text.count("1 streams are not received") == caplog.text.count(publishers[1].key) == 1
+        assert caplog.text.count("1 streams are not downsampled") == caplog.text.count(publishers[1].key) == 1
         assert subscription.counts == nedbus.Counts(received=2)
 
 
@@ -289,7 +298,7 @@ def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -
     publisher.publish(message(0))
     echo = run_nedbus("echo", "-c", endpoint, "--max-rate", "5", "--every", "--csv", "--field", "timestamp", "-n", "51")
     wait_for(lambda: len(echo.out.splitlines()) > 1, what="the last message")
-    wait_for_demand(publisher)
+    wait_for_downsampling_reader(publisher)
     publish(publisher, clock, 1, 1000)
     assert echo.wait() == 0, echo.err
     head, *rows = echo.out.splitlines()

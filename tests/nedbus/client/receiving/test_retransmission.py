@@ -54,7 +54,7 @@ def test_missing_samples_are_requested_by_the_exact_key(lossy: Lossy, unanswered
     lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
     lossy.publish(*range(7))
     assert lossy.receive(7) == list(range(7))
-    assert lossy.asked == [(KEY, 1, 5)] * (unanswered + 1)
+    assert lossy.requests == [(KEY, 1, 5)] * (unanswered + 1)
     assert lossy.subscription.counts == Counts(received=7)
 
 
@@ -83,12 +83,12 @@ def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, raw: Session, 
     for timestamp in range(3):
         foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
     assert lossy.receive(2) == [0, 2]
-    tries = len(lossy.asked)
+    tries = len(lossy.requests)
     assert tries > 1
     for timestamp in (3, 4):
         foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
     assert lossy.receive(1) == [4]
-    assert len(lossy.asked) == tries + 1
+    assert len(lossy.requests) == tries + 1
     assert lossy.subscription.counts == Counts(received=3, lost=2)
     foreign.undeclare()
 
@@ -103,7 +103,7 @@ def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, timings:
     lossy.unanswered = 0
     lossy.publish(3, 4)
     assert lossy.receive(2) == [3, 4]
-    lossy.unanswered = len(lossy.asked) + 1
+    lossy.unanswered = len(lossy.requests) + 1
     lossy.publish(5, 6)
     assert lossy.receive(2) == [5, 6]
 
@@ -199,7 +199,7 @@ def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> Non
     assert lossy.receive(3) == [0, 1, 2]
     lossy.publish(3)
     assert lossy.receive(1) == [3]
-    assert {key for key, _, _ in lossy.asked} == {KEY}
+    assert {key for key, _, _ in lossy.requests} == {KEY}
     assert not lossy.queue.counters.requesting
 
 
@@ -249,7 +249,7 @@ def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monke
         publish(publisher, 0, 1, 2)
     assert sorted(lossy.receive(180)) == [0] * 60 + [1] * 60 + [2] * 60
     assert lossy.subscription.counts == Counts(received=180)
-    assert 1 < lossy.most <= 4
+    assert 1 < lossy.max_open <= 4
 
 
 def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
@@ -280,9 +280,9 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
         lambda: (lossy.queue.waiting, lossy.queue.counters.held) == (10, 9),
         what="what comes before the hole and after it",
     )
-    asked_before = list(lossy.asked)
+    requests_before = list(lossy.requests)
     assert lossy.receive(20) == list(range(20))
-    assert (asked_before, lossy.asked) == ([], [(KEY, 10, 11)])
+    assert (requests_before, lossy.requests) == ([], [(KEY, 10, 11)])
 
 
 def test_unexpected_error_costs_what_caused_it(

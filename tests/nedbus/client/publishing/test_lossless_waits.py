@@ -1,4 +1,4 @@
-"""Lossless publishers of asyncio whose reader never reads: their waits end when cancelled, and delay nothing else."""
+"""Lossless publishers that wait for a reader that never reads: waits can be cancelled, and delay nothing else."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.peers.answering import answering
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_router
 
-COUNT = 5000  # messages, more than are sent without a reader that reads
+COUNT = 5000  # messages, more than are published to a reader that reads nothing
 
 SCRIPT = """
 import asyncio
@@ -38,7 +38,7 @@ asyncio.run(main())
 
 
 async def until_waiting(publisher: nedbus.AsyncPublisher) -> None:
-    """Return once a publisher has sent something and waits for its reader, if another has taken most of the window."""
+    """Wait until a publisher has published at least its minimum share of the window."""
     async with asyncio.timeout(DEADLINE):
         while publisher.published < 100:
             await asyncio.sleep(0.01)
@@ -46,14 +46,14 @@ async def until_waiting(publisher: nedbus.AsyncPublisher) -> None:
 
 @pytest.fixture
 def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe without reading."""
+    """Return a subscription whose messages stay unread unless the test reads them."""
     with bus.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
 
 @asynccontextmanager
 async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator[list[nedbus.AsyncPublisher]]:
-    """Let publishers wait for a reader, and cancel their waits."""
+    """Yield publishers that wait for a reader; cancel their waits at the end."""
     publishers = [await bus.publisher(VLP, vehicle=each, lossless=True) for each in range(number)]
     waiting = [asyncio.create_task(each.publish_many(numbered(COUNT))) for each in publishers]
     for publisher in publishers:
@@ -70,7 +70,7 @@ async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator
 def test_waiting_publishers_delay_no_query(endpoint: str) -> None:
     """`latest` and a subscription work while 40 publishers wait for a reader, more than there are threads for queries.
 
-    Once the waits are cancelled, no thread of theirs waits any more, and an error in the block closes without waiting.
+    Cancelling the waits frees their threads, and an error in the block closes the bus without waiting.
     """
 
     async def scenario() -> None:
@@ -88,7 +88,7 @@ def test_waiting_publishers_delay_no_query(endpoint: str) -> None:
 def test_cancelled_publish_many_can_be_continued(
     endpoint: str, stuck: nedbus.Subscription[nedbus.VehicleLocalPosition]
 ) -> None:
-    """After a timeout, `published` has the number of messages sent; after the rest, nothing is lost or doubled."""
+    """After a cancelled call, `published` has the number sent; publishing the rest loses and repeats nothing."""
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as bus:
@@ -107,7 +107,7 @@ def test_cancelled_publish_many_can_be_continued(
 
 def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
     """A reader that acknowledges nothing delays a close until it is cancelled; then everything is closed."""
-    asked: list[zenoh.Query] = []
+    queries: list[zenoh.Query] = []
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as other:
@@ -115,10 +115,10 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus
             await first.publish({"timestamp": 1})
             await second.publish({"timestamp": 1})
             for close, vehicles in ((first.close, ["2"]), (other.close, [])):
-                before = len(asked)
+                before = len(queries)
                 closing = asyncio.create_task(close())
                 async with asyncio.timeout(DEADLINE):
-                    while len(asked) == before:
+                    while len(queries) == before:
                         await asyncio.sleep(0.01)
                 assert not closing.done()
                 closing.cancel()
@@ -129,18 +129,18 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus
             with pytest.raises(nedbus.ClosedError):
                 await second.publish({"timestamp": 2})
 
-    with answering(raw, f"nedbus/*/{VLP}/@ack", asked.append):
+    with answering(raw, f"nedbus/*/{VLP}/@ack", queries.append):
         asyncio.run(scenario())
     wait_for(
         lambda: not any(each.name.startswith("nedbus-close_") for each in threading.enumerate()),
-        what="the end of its thread",
+        what="the closing thread to end",
     )
 
 
-def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(client: nedbus.Bus, raw: Session) -> None:
+def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus, raw: Session) -> None:
     """A `with` block that ends with an exception, as Ctrl-C does, waits for no reader."""
-    asked: list[zenoh.Query] = []
-    silent = answering(raw, f"nedbus/*/{VLP}/@ack", asked.append)
+    queries: list[zenoh.Query] = []
+    silent = answering(raw, f"nedbus/*/{VLP}/@ack", queries.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
         publisher.publish({"timestamp": 1})
         raise RuntimeError("on purpose")
@@ -148,23 +148,23 @@ def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(client: ned
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_close_with_a_timeout_gives_up(client: nedbus.Bus, raw: Session, whole_bus: bool) -> None:
-    """A reader that acknowledges nothing delays a close by its timeout at most, and with 0 not at all."""
-    asked: list[zenoh.Query] = []
-    with answering(raw, f"nedbus/*/{VLP}/@ack", asked.append):
+def test_close_returns_after_its_timeout(client: nedbus.Bus, raw: Session, whole_bus: bool) -> None:
+    """A reader that acknowledges nothing delays a close by its timeout at most, and not at all with timeout 0."""
+    queries: list[zenoh.Query] = []
+    with answering(raw, f"nedbus/*/{VLP}/@ack", queries.append):
         for vehicle, timeout in (("1", 0.0), ("2", 0.05)):
             publisher = client.publisher(VLP, vehicle=vehicle, lossless=True)
             publisher.publish({"timestamp": 1})
-            before = len(asked)
+            before = len(queries)
             (client if whole_bus and timeout else publisher).close(timeout=timeout)
             assert publisher.closed
-            assert (len(asked) > before) == (timeout > 0)
+            assert (len(queries) > before) == (timeout > 0)
     assert client.closed == whole_bus
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
 def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool) -> None:
-    """Ctrl-C ends the wait of a close for readers, and everything is closed."""
+    """Ctrl-C during a close ends the wait for readers and closes everything."""
 
     def interrupt(*_: object) -> bool:
         raise KeyboardInterrupt
@@ -179,7 +179,7 @@ def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.usefixtures("stuck")
 def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """One Ctrl-C ends a script of which six publishers wait for a reader."""
+    """One Ctrl-C ends a script in which six publishers wait for a reader."""
     process = start("-c", SCRIPT, NEDBUS_CONNECT=endpoint, measured=False)
     wait_for(lambda: len(bus.latest()) == 6, what=f"the messages: {process.err}")
     process.signal(signal.SIGINT)
