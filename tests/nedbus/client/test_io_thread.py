@@ -1,4 +1,4 @@
-"""The I/O thread of the process: due times, common ticks, and what is left after a session or a vehicle has gone."""
+"""The I/O thread of the process: due times, common ticks, and cleanup after a session or a publisher is closed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_pauses_end_at_common_ticks() -> None:
 
 
 def test_job_is_called_when_woken() -> None:
-    """A job that waits for an hour is called at once after `wake`, and after a moment that `wake` names."""
+    """A job that waits for an hour is called at once after `wake()`, or at the time passed to `wake`."""
     calls = Calls(3600.0)
     job = Job(calls)
     wait_for(lambda: len(calls.times) == 1, what="the first call")
@@ -52,20 +52,20 @@ def test_job_is_called_when_woken() -> None:
     job.end()
 
 
-def test_ended_job_is_not_running() -> None:
-    """`end` waits for a call in progress; a job may end itself, and delays no other by that."""
-    inside, go_on = threading.Event(), threading.Event()
+def test_end_waits_for_a_running_job() -> None:
+    """`end` waits until a running call has returned, and a job may end itself."""
+    inside, proceed = threading.Event(), threading.Event()
 
     def block(_: float) -> float:
         inside.set()
-        assert go_on.wait(DEADLINE)
+        assert proceed.wait(DEADLINE)
         return 0.0
 
     job = Job(block)
     assert inside.wait(DEADLINE)
     ending = threading.Thread(target=job.end)
     ending.start()
-    go_on.set()
+    proceed.set()
     ending.join(DEADLINE)
     assert not ending.is_alive()
     ends: list[Callable[[], None]] = []
@@ -80,8 +80,8 @@ def test_ended_job_is_not_running() -> None:
     wait_for(lambda: itself not in io_thread._jobs, what="the job to end itself")
 
 
-def test_failing_call_ends_no_others() -> None:
-    """A call that raises is followed by the next one."""
+def test_failed_call_does_not_stop_the_thread() -> None:
+    """After a call that raises, a CallThread runs the next one."""
     thread, done = CallThread("nedbus-test"), threading.Event()
     thread.start()
     thread.put(lambda: 1 // 0)
@@ -89,8 +89,8 @@ def test_failing_call_ends_no_others() -> None:
     assert done.wait(DEADLINE)
 
 
-def test_sessions_share_their_threads(endpoint: str) -> None:
-    """Twenty buses that publish, and are queried, have the Python threads of one."""
+def test_sessions_share_threads(endpoint: str) -> None:
+    """Twenty buses that publish and reply to queries need no more Python threads than one."""
     before = set(threading.enumerate())
     with ExitStack() as opened:
         buses = [opened.enter_context(nedbus.connect(endpoint)) for _ in range(20)]
@@ -103,8 +103,8 @@ def test_sessions_share_their_threads(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("closed", ["publishers", "bus"])
-def test_nothing_is_polled_after_a_close(endpoint: str, closed: str) -> None:
-    """Vehicles that have left, and closed sessions, leave no job behind; the schema stays for messages under way."""
+def test_closed_publishers_and_sessions_leave_no_jobs(endpoint: str, closed: str) -> None:
+    """Closed publishers and sessions leave no jobs; only the schema's stays, for readers of messages in transit."""
     before = len(io_thread._jobs)
     with nedbus.connect(endpoint) as bus:
         for number in range(30):
