@@ -86,8 +86,8 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Subscription[Any]:
         """Return a subscription to iterate over, which starts with the last message of each key.
 
-        `message`: a message class such as VehicleAttitude, which gives type checkers its fields and selects its first
-        topic, or the one in `topic`, such as "estimator_attitude"; or the name of a topic; or "*" for all topics.
+        `message`: a message class such as VehicleAttitude, for its first topic or the one in `topic`, such as
+        "estimator_attitude", with fields that type checkers know. Or the name of a topic, or "*" for all topics.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
         about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
@@ -246,7 +246,7 @@ class Bus(AbstractContextManager["Bus"]):
         else:
             receiver = Receiver(self._session, pending_queue)
         self._receivers.add(receiver)
-        if self.closed:  # meanwhile, by another thread
+        if self.closed:  # by another thread, in the meantime
             receiver.close()
             raise ClosedError
         return receiver

@@ -48,7 +48,7 @@ class Sample(Generic[M_co]):
     `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
     `retained`: True if it was published before the subscription, which begins with the last message of each publisher;
     also from `bus.latest()`.
-    `stored`: True if it came from a storage, as no publisher answered for the address; `bus.latest()` only.
+    `stored`: True if it came from a storage, as no publisher of the address replied; `bus.latest()` only.
     """
 
     message: M_co

@@ -38,7 +38,7 @@ class Lossy:
         self.unanswered = 0
         self.open = self.max_open = 0
 
-    def ask(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
+    def request(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
         self.requests.append((key, numbers.start, numbers.stop))
         if len(self.requests) <= self.unanswered:
             return SimpleNamespace(ended=True, take=dict)

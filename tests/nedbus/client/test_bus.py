@@ -138,7 +138,7 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
 def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Published vehicles appear by their liveliness tokens, and closed ones disappear.
 
-    It sends no query for all tokens, which would load all clients of the router.
+    No query for all tokens is sent: it would load all clients of the router.
     """
     queried: list[str] = []
 
@@ -305,7 +305,7 @@ def test_memory_for_parsed_status_is_bounded(
     assert "ignored 18 oversized replies" in caplog.messages
 
 
-def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) -> None:
+def test_status_of_hostile_or_newer_service_is_sanitized(client: nedbus.Bus, raw: Session) -> None:
     """The id of a status is taken from its key, unknown fields are ignored, and invalid values and rows dropped."""
     sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
     content = {

@@ -245,8 +245,8 @@ def test_closed_publisher_frees_its_address(client: nedbus.Bus, bus: nedbus.Bus)
     wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
     with pytest.raises(nedbus.ClosedError):
         publish(publisher, 2)
-    with client.publisher(VLP, vehicle="1") as again:
-        publish(again, 3)
+    with client.publisher(VLP, vehicle="1") as successor:
+        publish(successor, 3)
 
 
 def test_publishers_closed_before_the_first_listing_are_not_listed(client: nedbus.Bus) -> None:
@@ -321,7 +321,7 @@ def test_ctrl_c_ends_a_query_without_a_reply(start: Start, endpoint: str, raw: S
         assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_ctrl_c_while_a_thread_starts(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_during_thread_start_is_raised(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C during the start of the pump thread is raised, and `close` waits for the thread, which still runs."""
     start, late = threading.Thread.start, list[threading.Thread]()
 

@@ -110,10 +110,10 @@ for sample in subscription:
 def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, timeout: float | None) -> None:
     """Ctrl-C ends the wait for a router that does not answer."""
     code = f"import asyncio, nedbus; T = {timeout}; {how}"
-    with socket.create_server(("127.0.0.1", 0)) as gone:
-        gone.settimeout(DEADLINE)
-        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{gone.getsockname()[1]}", measured=False)
-        gone.accept()[0].close()  # the script is connecting
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(DEADLINE)
+        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{server.getsockname()[1]}", measured=False)
+        server.accept()[0].close()  # the script is connecting
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
 
@@ -122,12 +122,12 @@ def test_signal_missed_by_asyncio_ends_the_wait_for_a_router(start: Start) -> No
     """A signal that does not wake the event loop, such as one delivered to another thread, ends the wait as well."""
     code = """
 import asyncio, nedbus, signal, socket, threading
-gone = socket.create_server(("127.0.0.1", 0))
+server = socket.create_server(("127.0.0.1", 0))
 def interrupt():
-    gone.accept()[0].close()
+    server.accept()[0].close()
     signal.pthread_kill(threading.get_ident(), signal.SIGINT)
 threading.Thread(target=interrupt).start()
-asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{gone.getsockname()[1]}", timeout=None).__aenter__())
+asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{server.getsockname()[1]}", timeout=None).__aenter__())
 """
     process = start("-c", code, measured=False)
     assert process.wait() == -signal.SIGINT, process.err

@@ -159,7 +159,7 @@ def test_missing_flags_do_not_count() -> None:
     assert stream.snapshot(1).flags == {"xy_valid": 0.5, "v_xy_valid": 0.0, "v_z_valid": 0.0}
 
 
-def test_latency_and_loss() -> None:
+def test_latency_covers_the_last_second_and_loss_all_time() -> None:
     """Latency is the median and maximum of the last second; losses are the total since the start."""
     stream = StreamHealth(VLP)
     for index, latency in enumerate((0.1, 0.2, 0.9)):
@@ -222,8 +222,8 @@ def test_monitor_is_bounded() -> None:
     """In a flood of keys the 4096 most recent streams are kept; they never displace one that is still active."""
     monitor, real = Monitor(), sample("real")
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
-    for junk in flood:
-        monitor.add(junk)
+    for each in flood:
+        monitor.add(each)
         monitor.add(real)
     kept = monitor.snapshot()
     assert (len(kept), kept[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
@@ -266,7 +266,7 @@ def test_states_have_reasons() -> None:
     assert stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
 
 
-def test_description_has_state_flags_and_events() -> None:
+def test_description_has_state_flags_and_faults() -> None:
     """The description has the state, flags, gaps, out-of-order messages and reboots; "ok" without any."""
     health = follow(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"

@@ -34,7 +34,7 @@ def test_pauses_end_at_common_ticks() -> None:
     wait_for(lambda: all(len(call.times) > 5 for call in calls), what="a few rounds")
     for job in jobs:
         job.end()
-    rounds = sorted({moment for call in calls for moment in call.times[1:]})
+    rounds = sorted({each for call in calls for each in call.times[1:]})
     assert len(rounds) <= (rounds[-1] - rounds[0]) / TICK + 2
 
 

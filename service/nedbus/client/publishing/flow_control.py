@@ -64,10 +64,8 @@ class ReaderProxies:
         """
         if replies.keys() - self._matched - self.away.keys():
             self.away.pop(_UNKNOWN, None)
-        gone, until = (
-            self._matched - replies.keys(),
-            now + (TIMINGS.frozen_wait if froze else TIMINGS.return_wait),
-        )
+        gone = self._matched - replies.keys()
+        until = now + (TIMINGS.frozen_wait if froze else TIMINGS.return_wait)
         if gone & self._suspects:  # it replied, but froze before Zenoh finalized its reply
             until = self.away.pop(_UNKNOWN, until)
         self._suspects = set()

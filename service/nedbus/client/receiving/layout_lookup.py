@@ -37,7 +37,7 @@ _RECOVERY: Final = 0.1  # s of patience regained per second, which limits how lo
 
 # A message, and the number of a newer layout or, for a message without a file, the hash of its definition.
 Wanted = tuple[str, int | str]
-Schemas = Mapping[Wanted, Mapping[str, str]]  # descriptions by publishers: field name to type
+Schemas = Mapping[Wanted, Mapping[str, str]]  # definitions from publishers: field types by name
 
 
 class LayoutLookup:
@@ -133,22 +133,22 @@ class LayoutLookup:
                 if self._closed or not self._open:
                     self._thread = None
                     return
-                asked = dict(islice(self._open.items(), _MAX_UNKNOWN))
+                queried = dict(islice(self._open.items(), _MAX_UNKNOWN))
             added: list[Wanted] = []
             try:
                 with suppress(NedbusError):  # the session is closed
-                    found = self._find(asked)
-                    added = [wanted for wanted in asked if wanted in found and self._add(wanted, found[wanted])]
+                    found = self._find(queried)
+                    added = [wanted for wanted in queried if wanted in found and self._add(wanted, found[wanted])]
             finally:
-                self._end(asked, added)
+                self._end(queried, added)
 
-    def _end(self, asked: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
+    def _end(self, queried: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
         with self._changed:
-            for wanted, asked_for in asked.items():
+            for wanted, queried_publisher in queried.items():
                 publisher = self._open.pop(wanted)
                 failures = self._failed.pop(wanted, (0,))[0]
-                if wanted not in added and publisher != asked_for:
-                    self._open[wanted] = publisher  # perhaps later than the query
+                if wanted not in added and publisher != queried_publisher:
+                    self._open[wanted] = publisher  # may have appeared after the query
                 elif wanted not in added:
                     pause = _PAUSES[min(failures, len(_PAUSES) - 1)]
                     self._failed[wanted] = failures + 1, self._now() + pause, publisher
@@ -181,13 +181,13 @@ class LayoutLookup:
     def _evict(self, size: int) -> bool:
         """Evict unused definitions, least recently used first; return False if that frees too little."""
         known = sorted(self._codecs, key=self._used.__getitem__)
-        room = _MAX_FIELDS - sum(len(self._codecs[wanted].definition.types) + _BASE for wanted in known)
+        free = _MAX_FIELDS - sum(len(self._codecs[wanted].definition.types) + _BASE for wanted in known)
         for wanted in known:
-            if room >= size or self._now() - self._used[wanted] < _IN_USE:
+            if free >= size or self._now() - self._used[wanted] < _IN_USE:
                 break
-            room += len(self._codecs.pop(wanted).definition.types) + _BASE
+            free += len(self._codecs.pop(wanted).definition.types) + _BASE
             del self._used[wanted]
-        return room >= size
+        return free >= size
 
     def _add_layout(self, name: str, number: int, fields: Mapping[str, str]) -> bool:
         definition, newer = MESSAGES[name], self._newer.get(name, {})

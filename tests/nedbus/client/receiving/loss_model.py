@@ -274,7 +274,7 @@ class Simulation:
         return counts.received + counts.lost + counts.dropped + counts.invalid
 
     def _unknown(self, run: PublisherRun) -> int:
-        """Return how many messages at most were sent before the reader discovered this run."""
+        """Return the maximum number of messages sent before the reader discovered this run."""
         return 0 if run.exact else min(run.read, default=run.known + 1)
 
     def _take(self, position: int, count: int) -> list[tuple[PublisherRun, int]]:

@@ -35,7 +35,7 @@ ADDRESS = Address("7", "estimator_local_position", 1)  # of rejected messages
 
 @pytest.fixture
 def publisher(bus: nedbus.Bus) -> nedbus.Publisher:
-    """Return a publisher of a first message, which a reader receives once it is subscribed."""
+    """Return a publisher that has published one message, which each new reader receives."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     return publisher

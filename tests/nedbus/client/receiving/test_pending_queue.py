@@ -80,7 +80,7 @@ def test_loss_is_reported_by_the_next_sample_read(
 
 
 def test_gap_within_a_batch_is_reported_by_the_sample_after_it() -> None:
-    """A batch takes the fast path for samples in order only if none is missing."""
+    """A gap within a batch is reported by the sample after it, and a gap at its end by the next batch."""
     pending_queue = make_queue("every")
     for start in range(0, 2000, 50):
         put(pending_queue, [raw(number) for number in range(start, start + 50)])

@@ -38,7 +38,7 @@ def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> It
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         lossy = Lossy(session, queue, Receiver(session, queue), publisher)
-        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.ask)
+        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.request)
         with lossy.subscription:
             wait_for_subscriber(publisher)
             yield lossy
@@ -162,11 +162,11 @@ def test_replies_of_other_peers_are_ignored(lossy: Lossy, raw: Session) -> None:
 @pytest.mark.parametrize("when", ["open", "closed"])
 def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, raw: Session, when: str) -> None:
     """A flood of replies to a request does not block the session, not even after its reader has closed."""
-    asked = threading.Event()
+    queried = threading.Event()
 
     def flood(query: zenoh.Query) -> None:
         with query:
-            asked.set()
+            queried.set()
             for _ in range(2000):
                 query.reply(KEY, b"junk")
 
@@ -174,7 +174,7 @@ def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, raw: Session,
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         if when == "closed":
-            assert asked.wait(DEADLINE)
+            assert queried.wait(DEADLINE)
             lossy.subscription.close()
         else:
             assert lossy.receive(3) == [0, 1, 2]
