@@ -24,7 +24,7 @@ from tests.peers.command_line import run_command
 from tests.peers.processes import Start
 from tests.waits import DEADLINE
 
-REJECTED: Final = {  # a bool that PX4 did not set
+REJECTED: Final = {  # bool fields that PX4 left uninitialized
     ("cuav_1.16_gps_interference", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 194)"): 31,
     ("nxp_v0_ekf_failure", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 94)"): 39,
 }
@@ -38,7 +38,7 @@ STREAMS: Final = {  # addresses, messages
     "sitl_1.13_three_topics": (96, 21229),
     "sitl_1.15_events": (69, 29480),
 }
-CONVERTED: Final = {  # of older layouts, by PX4's source
+CONVERTED: Final = {  # fields of older layouts, converted as PX4's source code does
     "lat": ("latitude_deg", 1e7),
     "lon": ("longitude_deg", 1e7),
     "alt": ("altitude_msl_m", 1e3),
@@ -115,7 +115,7 @@ TEXTS = "log_message"
 def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
     """`nedbus.read` returns all topics of a log bit for bit, without the messages that are known to be invalid."""
     raw, arrays = raw_streams(flight), nedbus.read(flight, ["*"])
-    arrays.pop(TEXTS)  # made of the texts and events
+    arrays.pop(TEXTS)  # derived from texts and events
     assert arrays.keys() == raw.keys()
     left_out = {topic: count for (log, topic, _), count in REJECTED.items() if log == flight.stem}
     compared = 0

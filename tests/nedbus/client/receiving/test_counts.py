@@ -95,7 +95,7 @@ def test_unread_subscription_delays_no_other_reader(
             publish(publisher, *numbers)
             assert [take(each, len(numbers)) for each in read] == [list(numbers)] * 2
     wait_for(lambda: stuck.counts.dropped, what="a dropped message")
-    wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000], what="the last value")
+    wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000], what="the last message")
     assert client.subscribe(VLP).receive(DEADLINE).message.timestamp > 0
     start = time.monotonic()
     stuck.close()
@@ -336,7 +336,7 @@ def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, 
             sys.setprofile(None)
     waited = [
         names for names in called if any(name.startswith("Receiver.") for name in names)
-    ]  # others were received along with one
+    ]  # samples received along with an earlier one need no wait
     median = sorted(waited, key=len)[len(waited) // 2]
     assert len(median) <= 22
     classes = {name.partition(".")[0] for name in median if name[0].isupper()}

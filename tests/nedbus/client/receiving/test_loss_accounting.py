@@ -58,9 +58,8 @@ class LossMachine(RuleBasedStateMachine):
 
 
 TestLossAccounting = LossMachine.TestCase
-TestLossAccounting.settings = settings(
-    stateful_step_count=40, phases=set(Phase) - {Phase.explain}
-)  # which takes minutes
+# The phase `explain` takes minutes.
+TestLossAccounting.settings = settings(stateful_step_count=40, phases=set(Phase) - {Phase.explain})
 
 SEEDS = [
     # 0 arrives, and is read, twice.
