@@ -89,7 +89,7 @@ class AsyncBus:
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
-        return Bus.subscribe(cast("Bus", self), *message, **options)  # it calls `subscribe_to`
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # only calls `self.subscribe_to`
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -132,7 +132,7 @@ class AsyncBus:
 
     async def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Close the bus; see `Bus.close`. If cancelled, it closes at once, without waiting for readers."""
-        if (bus := self._bus) is not None:  # in a new thread, as all others may be blocked
+        if (bus := self._bus) is not None:  # in a new thread: those of the pool may be blocked
             thread = ThreadPoolExecutor(1, "nedbus-close")
             await _run(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
 
@@ -190,8 +190,8 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
 
     Attributes and errors are those of Publisher; all methods are coroutines.
     Methods that may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) run in a thread of this
-    publisher and do not block the event loop. Cancelling one, as a timeout does, ends its wait: `published` then has
-    the number of messages sent, and a cancelled `close` closes without waiting. Await each call before the next.
+    publisher and do not block the event loop. Cancelling one, for example by a timeout, ends its wait: `published` then
+    holds the number of messages sent, and a cancelled `close` closes without waiting. Await each call before the next.
     """
 
     def __init__(self, publisher: Publisher) -> None:

@@ -185,8 +185,8 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Publisher:
         """Return a publisher for one address.
 
-        The router has processed its declarations: readers that subscribe after this call get the last message.
-        `lossless`: flow control for replays at the speed of the readers. `publish` slows down to 10 messages per second
+        It returns once the router has processed its declarations: later subscribers receive the last message.
+        `lossless`: flow control for replays as fast as the readers. `publish` slows down to 10 messages per second
         while a reader of mode "every" has more than 2,000 unread messages; `close` waits until the readers have all
         messages.
         `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
@@ -266,7 +266,7 @@ def connect(
     The default is NEDBUS_CONNECT, then `connect` in nedbus.toml, then the router of `nedbus serve` on this host.
     `timeout`: seconds to wait for a router; None waits until Ctrl-C. A broken link is reconnected automatically.
     `tls`: for tls/ endpoints, by default from the settings. `config`: path of a file to read instead of nedbus.toml.
-    With `endpoint`, only `prefix` and the TLS files are read from it, unless they are passed as arguments.
+    With `endpoint`, only `prefix` and the TLS files are read from the file, unless passed as arguments.
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """

@@ -43,7 +43,7 @@ class Publishers(Counter[Address]):
 class Vehicles(dict[str, list[Address]]):
     """The published addresses by vehicle.
 
-    `complete`: False without a router, until it has listed all of them, and if there are more than 10,000.
+    `complete`: False without a router, until the router has listed all addresses, and above 10,000 of them.
     """
 
     complete = True
@@ -123,7 +123,7 @@ class LogStreamStatus(_FromPeer):
     by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
     `header_time`: duration of the header [s]; the vehicle's own log has a gap of this length.
     `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds of the number of
-    ULog messages in them, as MAVLink does not report it. `undecodable`: data without a usable definition.
+    ULog messages in them, which MAVLink does not report. `undecodable`: data without a usable definition.
     `saved`: the path of the saved log.
     """
 
@@ -143,7 +143,7 @@ class LogStreamStatus(_FromPeer):
 
     @property
     def text(self) -> str:
-        """All values but the vehicle, in one line; the reason and the file name are untrusted text."""
+        """All values except the vehicle, in one line; the reason and the file name are untrusted text."""
         lost = f"{self.lost_at_least} to {self.lost_at_most} messages lost"
         parts = (
             self.state,
@@ -252,15 +252,15 @@ def find_accounts(session: Session, *, prefix: str, within: float, timeout: floa
 
 def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
     """Yield a report in JSON parts small enough for readers, which join them; log and omit an oversized part."""
-    text = to_json(report, inf_nan_mode="constants")
-    if len(text) <= MAX_REPLY_BYTES:
-        yield text
-    elif parts := report.split(5 * len(text) // (4 * MAX_REPLY_BYTES) + 1):
+    content = to_json(report, inf_nan_mode="constants")
+    if len(content) <= MAX_REPLY_BYTES:
+        yield content
+    elif parts := report.split(5 * len(content) // (4 * MAX_REPLY_BYTES) + 1):
         for part in parts:
             yield from reply_parts(part)
     else:
-        reason = "omitted %d bytes of a reply, as readers accept at most %d per part: use fewer or shorter names"
-        _log.warning(reason, len(text), MAX_REPLY_BYTES, extra=about("incomplete"))
+        text = "omitted %d bytes of a reply: readers accept at most %d per part; use fewer or shorter names"
+        _log.warning(text, len(content), MAX_REPLY_BYTES, extra=about("incomplete"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +312,7 @@ class Rejections:
 
 
 def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
-    """Yield key and content of JSON replies within the memory limit; log the others, one line per reason."""
+    """Yield key and content of JSON replies within the memory limit; log the discarded ones, one line per reason."""
     free, oversized, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()

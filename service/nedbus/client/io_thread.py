@@ -1,4 +1,4 @@
-"""The I/O thread of the process, which polls the channels of all its sessions, and threads with a queue of calls.
+"""The I/O thread of the process, which polls the channels of all sessions, and worker threads with a call queue.
 
 Idle jobs are due at common ticks: a hundred idle sessions wake the process as often as one.
 """
@@ -26,7 +26,7 @@ _RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
 
 _jobs: dict[Job, None] = {}
 _start = threading.Lock()
-# At most one item. Not an Event, as that is Python code: Ctrl-C inside it can leave its lock held forever.
+# At most one item. Not an Event, which is Python code: Ctrl-C inside it can leave its lock held forever.
 _woken: queue.SimpleQueue[None] = queue.SimpleQueue()
 _sleeps_until = math.inf
 
@@ -114,7 +114,7 @@ class CallThread:
                 call()
             except Exception:  # noqa: BLE001 - one failed call must not stop the others
                 _log.debug("unexpected error in thread %s", self._name, exc_info=True)
-            del call  # frees what it references
+            del call  # release its references before blocking
 
 
 def _run_jobs() -> None:
@@ -124,7 +124,7 @@ def _run_jobs() -> None:
         for job in tuple(_jobs):
             if job.due <= now:
                 job.run(now)
-        _sleeps_until = math.inf  # `wake` puts an item from here on, and from the next line on only if it is earlier
+        _sleeps_until = math.inf  # from here `wake` puts an item; after the next line only for an earlier time
         _sleeps_until = due = min((job.due for job in tuple(_jobs)), default=math.inf)
         with suppress(queue.Empty):
             _woken.get(timeout=None if due == math.inf else max(0.0, due - time.monotonic()))

@@ -156,7 +156,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         if self._opening is not None:
             await asyncio.wait([self._opening])
         if self._finalizer is not None:
-            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new one, as all others may be blocked
+            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new one: those of the pool may be blocked
             await asyncio.get_running_loop().run_in_executor(thread, self._finalizer.close_now)
 
     def __aiter__(self) -> AsyncIterator[Sample[M_co]]:
@@ -219,6 +219,6 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
 
 def _wake(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> None:
-    """Wake the reader from any thread; a function, as a bound method would keep the subscription alive."""
+    """Wake the reader from any thread; a bound method would keep the subscription alive."""
     with suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(arrival.set)

@@ -1,7 +1,7 @@
-"""Downsampled copies of a stream, one for each of RATES, published while they have subscribers.
+"""Downsampled copies of a stream, one per rate in RATES, published while they have subscribers.
 
 `<key>/@rate/5` carries up to 5 messages per second of `<key>`, with its own sequence numbers and history cache.
-A vehicle without such subscribers costs one declaration; its streams declare more once that one is matched.
+Each vehicle declares one matching listener for all rates; its streams declare theirs once that one is matched.
 """
 
 import threading
@@ -32,13 +32,13 @@ class MatchingListener:
             self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
         self._matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
-        self._take = self._listener.handler.try_recv
+        self._try_recv = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
         """Return True if there are subscribers, by the latest report of Zenoh."""
         with self._lock:
             try:
-                if (status := self._take()) is not None:
+                if (status := self._try_recv()) is not None:
                     self._matched = status.matching
             except zenoh.ZError:  # closed
                 self._matched = False

@@ -27,8 +27,8 @@ _MIN_WINDOW: Final = 100  # messages per publisher, however many there are
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
 _RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have dropped, is repeated; doubles each time
-_QUERY_TIMEOUT: Final = 10.0  # s, the longest such pause, and the timeout of each query
-_STALE_POLL: Final = 1.0  # s without a poll after which the replies do not show which readers exist
+_QUERY_TIMEOUT: Final = 10.0  # s, timeout of each query, and the longest pause before a request is repeated
+_STALE_POLL: Final = 1.0  # s without a poll after which replies are too old to tell which readers exist
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
 _POLL_EVERY: Final = 16  # messages between polls
 _DROP: Final = CongestionControl.DROP  # blocking on a full queue could make Zenoh close the link
@@ -36,7 +36,7 @@ _UNKNOWN: Final = ""  # a reader that has never replied
 
 
 class SharedWindow:
-    """The window of a session, shared equally by its lossless publishers; each may also use what others leave."""
+    """The window of a session, shared equally by lossless publishers; each may also use what others leave unused."""
 
     def __init__(self) -> None:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key; replaced as a whole
@@ -55,7 +55,7 @@ class ReaderProxies:
     def __init__(self) -> None:
         self._matched: set[str] = set()
         self.away: dict[str, float] = {}  # deadline of each reader that the publisher waits for
-        self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown one froze
+        self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown reader froze
 
     def update(self, replies: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Update from all replies to a request; `replies`: by reader, True if it is closed. `now` in seconds.
@@ -88,7 +88,7 @@ class _Request:
     def __init__(self, number: int, routers: list[str], *, read: bool, now: float) -> None:
         self.number, self.read, self.routers = number, read, routers
         self.sent = self.last_reply = now
-        self.queries: set[Answers] = set()  # without those that timed out
+        self.queries: set[Answers] = set()  # those that have not timed out
         self.replies: dict[str, bool] = {}  # by reader, True if it is closed
 
     def poll(self, now: float) -> bool:
@@ -108,7 +108,7 @@ class _Request:
 class FlowControl:
     """The credit of one writer, renewed by acknowledgement requests on `<key>/@ack`, one at a time.
 
-    `needs_router`: readers are reached through a router; without one, missing replies do not mean that they left.
+    `needs_router`: readers are reached through a router; without one, missing replies do not mean that readers left.
     """
 
     def __init__(self, writer: Writer, window: SharedWindow, *, needs_router: bool) -> None:

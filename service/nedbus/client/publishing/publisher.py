@@ -89,7 +89,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Publish a message, or validate a dict of fields and publish them as a message.
 
         A Message was validated when it was created, and is not validated again.
-        A dict without `timestamp` gets the time since boot of this host, as PX4 uses the time since its own boot.
+        A dict without `timestamp` gets the time since boot of this host, like PX4's time since boot.
         Readers see the fields that were not provided in `sample.missing`.
 
         Raises TypeError for another type of message, InvalidMessageError for invalid fields, EncodeError for a message
@@ -108,7 +108,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def publish_row(self, values: Sequence[object] | Message) -> None:
         """Validate and publish the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples.
 
-        Equivalent to `publish` with these fields, but faster, as no message object is created. Raises the same errors.
+        Equivalent to `publish` with these fields, but faster: no message object is created. Raises the same errors.
         """
         self._put(self._codec.encode_row(cast("Sequence[object]", values)), self._all)
 

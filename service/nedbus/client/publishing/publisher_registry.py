@@ -29,7 +29,7 @@ from .writer import Heartbeats
 _log = logging.getLogger(__name__)
 
 _TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to reply with its tokens; usually milliseconds
-_MAX_UNUSED: Final = 64  # definitions kept after their publisher closed, for readers that have messages left
+_MAX_UNUSED: Final = 64  # definitions kept after their publisher closed, for readers with unread messages
 _FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
 
 
@@ -43,7 +43,7 @@ class PublisherRegistry:
         self.prefix, self.is_client = prefix, is_client
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
-        self.publishers: dict[Address, Publisher] = {}  # the open ones
+        self.publishers: dict[Address, Publisher] = {}  # open publishers
         self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
         self._schema_key = partial(schema_key, session=str(session.zid()), prefix=prefix)
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
@@ -99,7 +99,7 @@ class PublisherRegistry:
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
     def shared_vehicles(self) -> set[str]:
-        """Return the vehicles that another process publishes, too; log new ones."""
+        """Return the vehicles that another process also publishes; log new ones."""
         with self._lock:
             directories = list(self._directories.items())
         counts = {name: each.publishers(self._session, timeout=0).values() for name, each in directories}
@@ -133,7 +133,7 @@ class PublisherRegistry:
         timeout: float = FLUSH_TIMEOUT,
         stop: threading.Event | None = None,
     ) -> None:
-        """Wait until readers have received all messages of these publishers, up to `timeout` seconds or `stop`."""
+        """Wait until readers have received all messages of these publishers; end after `timeout` s or on `stop`."""
         end = time.monotonic() + timeout
         for publisher in publishers:
             address, logged = publisher.address, False

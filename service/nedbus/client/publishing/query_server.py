@@ -66,7 +66,7 @@ class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
         with while_open():
             self._queryable = session.declare_queryable(key_expr, zenoh.handlers.RingChannel(_MAX_PENDING))
-        self._take, self._reply = self._queryable.handler.try_recv, reply
+        self._try_recv, self._reply = self._queryable.handler.try_recv, reply
         self._query: zenoh.Query | None = None  # the next one to reply to
         self._busy_until = 0.0
         self._replying = threading.Lock()
@@ -83,7 +83,7 @@ class _Queryable:
     def _poll(self, now: float) -> float:
         if self._query is None:
             with suppress(zenoh.ZError):  # the session is closed
-                self._query = self._take()
+                self._query = self._try_recv()
             if self._query is not None:
                 self._busy_until = now + _BUSY
                 _replies.put(self._take_turn)
@@ -101,4 +101,4 @@ class _Queryable:
                     _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
                 except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
                     _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))
-                self._query = self._take() if time.monotonic() < end else None
+                self._query = self._try_recv() if time.monotonic() < end else None

@@ -16,8 +16,8 @@ from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payl
 from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
-_TURN: Final = 256  # heartbeats per call, so that other jobs are not delayed
-HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s from a last message until readers that missed it detect the loss, at most
+_TURN: Final = 256  # heartbeats per call; more would delay other jobs
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s, at most, until readers detect that they missed a last message
 
 
 class Writer:
@@ -96,7 +96,7 @@ class Heartbeats:
     def _run(self, now: float) -> float:
         due = now + self.send_due(now)
         if self._job is not None and due < math.inf:  # without a job yet, `resume` wakes it
-            self._job.wake(due)  # not before, unlike the returned pause
+            self._job.wake(due)  # at the next tick; a returned pause would end at the tick before
         return math.inf
 
     def send_due(self, now: float) -> float:

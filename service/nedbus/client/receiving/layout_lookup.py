@@ -23,19 +23,19 @@ from nedbus_msgs import MESSAGES, Codec, Definition, codec_of, define, field_typ
 _log = logging.getLogger(__name__)
 
 _MAX_LAYOUTS: Final = 16  # newer layouts per message
-_MAX_FIELDS: Final = 65_536  # of all messages defined by publishers; PX4's have 15 on average
+_MAX_FIELDS: Final = 65_536  # of all definitions from publishers; PX4's messages have 15 on average
 _IN_USE: Final = 60.0  # s after its last message during which a definition is not evicted
-_BASE: Final = 48  # memory of a definition without fields, in fields
-_MAX_UNKNOWN: Final = 64  # messages and layouts per query, and as many that wait for the next query
-_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the backoff of the oldest is discarded
+_BASE: Final = 48  # memory of an empty definition, in units of one field
+_MAX_UNKNOWN: Final = 64  # messages and layouts per query; as many more may wait for the next one
+_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond that the oldest backoff is discarded
 _PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s, backoff after failed queries for a message or layout
-_PACE: Final = 0.2  # s between a query without a result and the next one
+_QUERY_PAUSE: Final = 0.2  # s between a query without a result and the next one
 _MAX_REPLY_FIELDS: Final = 256  # per layout
 _MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_RECOVERY: Final = 0.1  # s of patience regained per second, which limits how long peers can make readers wait
+_BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait for longer
 
-# A message, and the number of a newer layout or, for a message without a file, the hash of its definition.
+# Message name, and number of a newer layout or, for a message not installed here, hash of its definition.
 Wanted = tuple[str, int | str]
 Schemas = Mapping[Wanted, Mapping[str, str]]  # definitions from publishers: field types by name
 
@@ -59,18 +59,18 @@ class LayoutLookup:
         self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
-        self._open: dict[Wanted, object] = {}  # with the publisher; those of the current query first
+        self._open: dict[Wanted, object] = {}  # with the publisher; the queried ones first
         self._failed: dict[Wanted, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
-        self._patience, self._waited = TIMINGS.definition_timeout, float("-inf")  # [s]; end of the last futile wait
+        self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last futile wait
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
         """Return the newer layouts of a message found so far, in the form that `decode` expects."""
         return self._newer.get(definition.name, {})
 
     def codec(self, name: str, identity: str, *, publisher: object = None, wait: bool = False) -> Codec[Any] | None:
-        """Return the codec of a message without a file; None while its definition is unknown, and start a lookup.
+        """Return the codec of a message not installed here; None if unknown, which starts a lookup.
 
-        `publisher`: after a failed lookup, that of another publisher starts at once.
+        `publisher`: after a failed lookup, one for another publisher starts at once, without backoff.
         `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
         """
         wanted = name, identity
@@ -99,12 +99,12 @@ class LayoutLookup:
         with self._changed:
             start = time.monotonic()
             longest = TIMINGS.definition_timeout
-            patience = min(longest, self._patience + _RECOVERY * (start - self._waited))
+            budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
             is_pending = self._open.__len__ if wanted is None else partial(self._open.__contains__, wanted)
-            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if wanted is None else patience)
+            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if wanted is None else budget)
             if wanted is not None and wanted not in self._codecs:
-                self._waited = time.monotonic()
-                self._patience = max(0.0, patience - (self._waited - start))
+                self._budget_time = time.monotonic()
+                self._wait_budget = max(0.0, budget - (self._budget_time - start))
 
     def close(self) -> None:
         """Start no more lookups and wait for the one in progress."""
@@ -140,15 +140,15 @@ class LayoutLookup:
                     found = self._find(queried)
                     added = [wanted for wanted in queried if wanted in found and self._add(wanted, found[wanted])]
             finally:
-                self._end(queried, added)
+                self._finish_query(queried, added)
 
-    def _end(self, queried: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
+    def _finish_query(self, queried: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
         with self._changed:
             for wanted, queried_publisher in queried.items():
                 publisher = self._open.pop(wanted)
                 failures = self._failed.pop(wanted, (0,))[0]
                 if wanted not in added and publisher != queried_publisher:
-                    self._open[wanted] = publisher  # may have appeared after the query
+                    self._open[wanted] = publisher  # this publisher may have appeared after the query
                 elif wanted not in added:
                     pause = _PAUSES[min(failures, len(_PAUSES) - 1)]
                     self._failed[wanted] = failures + 1, self._now() + pause, publisher
@@ -156,7 +156,7 @@ class LayoutLookup:
                 del self._failed[next(iter(self._failed))]
             self._changed.notify_all()
             if not added:
-                self._changed.wait_for(lambda: self._closed, _PACE)
+                self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
 
     def _add(self, wanted: Wanted, fields: Mapping[str, str]) -> bool:
         name, which = wanted
@@ -165,7 +165,7 @@ class LayoutLookup:
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
         if not self._evict(len(fields) + _BASE):
             if not self._full:
-                _log.warning("%s: too many messages without a file, not decoded", name, extra=about("invalid"))
+                _log.warning("%s: not decoded: too many messages are not installed here", name, extra=about("invalid"))
             self._full = True
             return False
         try:
@@ -233,7 +233,7 @@ def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -
             with suppress(ValueError):
                 parsed = _LAYOUT.validate_python(layout)
                 fields = {field.name: field.type for field in parsed.fields}
-                # The hash of what the peer describes, not what it claims.
+                # Compute the hash from the fields: the peer's own `hash` is untrusted.
                 types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
                 which = short_hash(name, types) if types else parsed.wire
                 if len(fields) == len(parsed.fields) and (name, which) in wanted:

@@ -1,6 +1,6 @@
 """Subscription with a maximum rate: last messages first, then the streams downsampled by publishers.
 
-If a publisher does not downsample, a warning is logged; the full rate is never used, as the link may not carry it.
+If a publisher does not downsample, a warning is logged; the full rate is never used, because the link may not carry it.
 """
 
 import logging
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 _TIMEOUT: Final = 2.0  # s for the queries of last messages and liveliness tokens
 _LAST_POLL: Final = 0.02  # s between polls for last messages
-_OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
+_MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
 
 
 class MaxRateQueue(PendingQueue):
@@ -71,8 +71,8 @@ class MaxRateQueue(PendingQueue):
     def _passes(self, arrival: Arrival) -> bool:
         stream = arrival[0]
         stream.gate = stream.gate or RateGate(self._max_rate)
-        passes = not 0 <= stream.last_sent - _sent(arrival) <= _OVERTAKEN
-        if self.rate > self._max_rate:  # lower than publishers offer
+        passes = not 0 <= stream.last_sent - _sent(arrival) <= _MAX_OVERTAKE
+        if self.rate > self._max_rate:  # below the lowest rate of publishers
             passes = passes and stream.gate.passes(time.monotonic_ns())
         if not passes:
             stream.unreported += arrival[3]
@@ -84,7 +84,7 @@ class MaxRateReceiver(Receiver):
 
     def __init__(self, session: Session, queue: MaxRateQueue) -> None:
         self._prefix, self._rate_queue, selection = queue.decoder.prefix, queue, queue.selection
-        self._awaiting: dict[Address, float] = {}  # appearance of tokens without a downsampled message yet [s]
+        self._awaiting: dict[Address, float] = {}  # time at which the token of a stream without a message appeared [s]
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=self._prefix))
         self._last = ask(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
         super().__init__(session, queue, history=False)
@@ -108,7 +108,7 @@ class MaxRateReceiver(Receiver):
                 topic = get_topic(address.topic)
                 if not alive:
                     self._awaiting.pop(address, None)
-                elif topic.rate and not topic.on_change:  # others may pause for long
+                elif topic.rate and not topic.on_change:  # other topics may pause for long
                     self._awaiting.setdefault(address, now)
         due = [address for address, since in self._awaiting.items() if now - since >= TIMINGS.downsampled_timeout]
         for address in due:

@@ -52,7 +52,7 @@ MAX_ACK_REQUESTS: Final = 1000
 """Pending acknowledgement requests; a well-behaved publisher has one per key."""
 
 _MAX_BATCH: Final = 4096  # messages per batch
-_MAX_FRESH: Final = 1024  # samples queued with their receive buffer of Zenoh; further ones are detached from it
+_MAX_FRESH: Final = 1024  # samples queued with Zenoh's receive buffer; later ones are detached from it
 _MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
@@ -68,7 +68,7 @@ class AckRequest:
     publisher: str
     number: int
     read: bool
-    reply: Callable[[], object]  # answers it, and is called once
+    reply: Callable[[], object]  # sends the acknowledgement; called once
     read_target: int | None = None  # samples to be read before answering; None until the message has arrived
 
 
@@ -95,7 +95,7 @@ class PendingQueue:
         self._warned: set[str] = set()
         self.decoder = decoder
         self._clock = clock
-        self._lock = threading.RLock()  # reentrant, as log handlers may read the counts
+        self._lock = threading.RLock()  # reentrant, because log handlers may read the counts
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._streams: dict[str, KeyState] = {}
         self._by_activity: list[tuple[float, str]] = []  # heap: each key, with a time at which it was active
@@ -129,7 +129,7 @@ class PendingQueue:
             has_gap = self.counters.opened > opened
         if has_gap and self.on_gap is not None:
             self.on_gap()
-        if self._tokens.empty():  # as `wake` does
+        if self._tokens.empty():  # like `wake`, inlined
             self._tokens.put(None)
         if self.on_wake is not None:
             self.on_wake()
@@ -306,7 +306,7 @@ class PendingQueue:
         return stream
 
     def _evict(self, now: float) -> None:
-        """Evict silent keys above KEPT_KEYS and, at MAX_KEYS, the least recently active; keys with a gap go last."""
+        """Evict silent keys above KEPT_KEYS and, at MAX_KEYS, the least recently active, keys with a gap last."""
         order = self._by_activity
         while len(order) >= MAX_KEYS or (len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE):
             since, key = order[0]
@@ -330,8 +330,8 @@ class PendingQueue:
     def _admit(self, batch: Sequence[RawSample]) -> list[Arrival]:
         """Return the arrivals of a batch, with 0 losses each; rejected ones keep their number but lose the payload.
 
-        A payload of the expected size is decoded when it is read. Any other size is checked here, so that it can
-        neither displace a valid sample nor use much memory.
+        A payload of the expected size is decoded when it is read. Any other size is checked here: an invalid
+        sample must neither displace a valid one nor use much memory.
         """
         admitted: list[Arrival] = []
         known, received = self._streams.get, clock.utc_ns()
@@ -393,7 +393,7 @@ class PendingQueue:
         self._queue()
 
     def _are_in_order(self, arrivals: list[Arrival]) -> bool:
-        """Return whether a batch continues the last publisher of one key without a gap; if so, expect the next one."""
+        """Return whether a batch continues one key's last publisher without a gap; if so, advance its `expected`."""
         stream, info = arrivals[0][0], arrivals[-1][2].source_info
         writer = stream.writer
         if writer is None or info is None or writer.request is not None or stream.gap:

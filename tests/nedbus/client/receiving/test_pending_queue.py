@@ -318,13 +318,13 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
         return {each: {"timestamp": "uint64"} for each in wanted if each[0] == "Honest"}
 
     lookup = LayoutLookup(find)
-    lookup._patience, lookup._waited = 0.0, time.monotonic()  # as after 3 s of futile waits
+    lookup._wait_budget, lookup._budget_time = 0.0, time.monotonic()  # as after 3 s of futile waits
     start = time.monotonic()
     for number in range(5000):
         assert lookup.codec("Evil", str(number), wait=True) is None
     assert len(lookup._open) <= 2 * layout_lookup._MAX_UNKNOWN
     assert len(lookup._failed) <= layout_lookup._MAX_FAILED
-    assert start <= lookup._waited <= time.monotonic()
+    assert start <= lookup._budget_time <= time.monotonic()
     wait_for(lambda: lookup.codec("Honest", "hash"), what="the definition")
     lookup.close()
 
@@ -340,7 +340,7 @@ def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, capl
     known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
     assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
     assert lookup.codec("Honest", "0") is known[0]
-    assert caplog.text.count("too many messages without a file") == 1
+    assert caplog.text.count("too many messages are not installed here") == 1
     now += 3600.0
     assert lookup.codec("Honest", "0") is known[0]
     assert lookup.codec("Honest", "new", wait=True)
