@@ -17,7 +17,7 @@ from tests.waits import DEADLINE, wait_for
 
 
 class Calls:
-    """A job that counts its calls and keeps their times."""
+    """A job that records the times of its calls."""
 
     def __init__(self, pause: float) -> None:
         self.pause, self.times = pause, list[float]()
@@ -80,6 +80,26 @@ def test_end_waits_for_a_running_job() -> None:
     wait_for(lambda: itself not in io_thread._jobs, what="the job to end itself")
 
 
+def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
+    """A job that raises is logged once and called again, and delays no other job."""
+    calls: list[float] = []
+
+    def fail_at_first(now: float) -> float:
+        calls.append(now)
+        return 0.0 if len(calls) > 2 else 1 / 0
+
+    def succeed(now: float) -> float:
+        others.append(now)
+        return 0.01
+
+    others: list[float] = []
+    jobs = [Job(fail_at_first), Job(succeed)]
+    wait_for(lambda: len(calls) > 5 and len(others) > 5, what="calls of both jobs")
+    for job in jobs:
+        job.end()
+    assert sum("unexpected error" in text for text in caplog.messages) == 1
+
+
 def test_failed_call_does_not_stop_the_thread() -> None:
     """After a call that raises, a CallThread runs the next one."""
     thread, done = CallThread("nedbus-test"), threading.Event()
@@ -104,7 +124,7 @@ def test_sessions_share_threads(endpoint: str) -> None:
 
 @pytest.mark.parametrize("closed", ["publishers", "bus"])
 def test_closed_publishers_and_sessions_leave_no_jobs(endpoint: str, closed: str) -> None:
-    """Closed publishers and sessions leave no jobs; only the schema's stays, for readers of messages in transit."""
+    """Closed publishers and sessions leave no jobs; a session keeps that of its schemas, for messages in transit."""
     before = len(io_thread._jobs)
     with nedbus.connect(endpoint) as bus:
         for number in range(30):

@@ -1,23 +1,19 @@
-"""The queue of unread samples, and layout lookups: order, counts and limits, with fake samples."""
+"""The queue of unread samples: order, counts and limits, with fake samples."""
 
 from __future__ import annotations
 
 import gc
 import threading
-import time
 import tracemalloc
 import weakref
 from collections import Counter
-from collections.abc import Collection, Sequence
-from contextlib import suppress
+from collections.abc import Collection
 
-import msgpack
 import pytest
 import zenoh
 
-import nedbus
 from nedbus import Batch, Counts, Mode
-from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, layout_lookup
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
 from nedbus.client.receiving import pending_queue as module
 from nedbus.client.receiving.decoder import KeyState
 from nedbus.client.receiving.layout_lookup import Schemas, Wanted
@@ -25,10 +21,9 @@ from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.timings import Timings
 from nedbus.transport import RawSample
-from nedbus_msgs import DEFAULT, codec_of
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.first_message import encode, encoding_of
-from tests.waits import DEADLINE, wait_for
+from tests.waits import DEADLINE
 
 from .raw_samples import (
     INVALID,
@@ -220,134 +215,6 @@ def test_loss_of_a_long_outage_is_counted() -> None:
     assert pending_queue.counts.lost == 89
 
 
-def look_up(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
-    """Look up the unknown layouts of the payloads, and wait for the replies."""
-    for payload in payloads:
-        with suppress(nedbus.errors.DecodeError):
-            lookup.check(codec_of(DEFAULT), payload)
-    lookup.wait()
-
-
-def test_failed_layout_lookups_back_off() -> None:
-    """A failed lookup of a layout is repeated after growing intervals, as its publisher may start later."""
-    now, queried, payloads = (
-        0.0,
-        list[tuple[float, Wanted]](),
-        [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)],
-    )
-
-    def find(wanted: Collection[Wanted]) -> Schemas:
-        queried.extend((now, each) for each in wanted)
-        return {}
-
-    lookup = LayoutLookup(find, now=lambda: now)
-    while now < 250.0:
-        look_up(lookup, payloads)
-        now += 0.5
-    assert sorted({when for when, _ in queried}) == [0.0, 0.5, 2.5, 7.5, 17.5, 47.5, 107.5, 167.5, 227.5]
-    assert len(queried) == len(set(queried)) == 9 * len(payloads)
-
-
-def test_only_requested_layouts_are_kept() -> None:
-    """Of thousands of layouts in a reply, only those requested are kept, up to a limit."""
-    fields = {"timestamp": "uint64", "x": "float32"}
-    known: Schemas = {("VehicleLocalPosition", number): fields for number in range(9, 2000)}
-    lookup = LayoutLookup(lambda _: known)
-    for layout in range(1500, 1520):
-        look_up(lookup, [msgpack.packb([layout, 1, 2.0])])
-    assert list(lookup.newer(DEFAULT)) == list(range(1500, 1516))
-
-
-def test_long_field_names_are_truncated_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    """A layout with a field name of 100,000 characters is logged as one short line."""
-    known: Schemas = {("VehicleLocalPosition", 1500): {"timestamp": "uint64", 100_000 * "x": "float32"}}
-    look_up(LayoutLookup(lambda _: known), [msgpack.packb([1500, 1, 2])])
-    [line] = caplog.messages
-    assert line.startswith("layout 1500 of VehicleLocalPosition is newer than this reader; ignored fields: xxx")
-    assert len(line) < 1000
-
-
-def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
-    """A check on the receiving thread starts a lookup without waiting for it; closing waits for the open one."""
-    queried, answering = threading.Event(), threading.Event()
-
-    def find(_: Collection[Wanted]) -> Schemas:
-        queried.set()
-        answering.wait(DEADLINE)
-        return {("VehicleLocalPosition", 9): {"timestamp": "uint64", "x": "float32"}}
-
-    lookup = LayoutLookup(find)
-    with pytest.raises(nedbus.errors.UnknownLayoutError):
-        lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
-    assert queried.wait(DEADLINE)
-    assert not lookup.newer(DEFAULT)
-    answering.set()
-    lookup.close()
-    lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
-
-
-def test_requests_during_a_lookup_are_queried_next() -> None:
-    """A definition requested during another lookup is looked up next, and readers wait for both.
-
-    A definition in the first reply is not looked up again, even if more of its messages have arrived.
-    """
-    answering, queried = threading.Event(), list[set[Wanted]]()
-
-    def find(wanted: Collection[Wanted]) -> Schemas:
-        queried.append(set(wanted))
-        answering.wait(DEADLINE)
-        return {each: {"timestamp": "uint64", "x": "float32"} for each in wanted}
-
-    lookup = LayoutLookup(find)
-    for name in ("First", "First", "Second"):
-        assert lookup.codec(name, "hash") is None
-        wait_for(lambda: queried, what="the first lookup")
-    answering.set()
-    found = [lookup.codec(name, "hash", wait=True) for name in ("First", "Second")]
-    assert [codec.definition.name for codec in found if codec] == ["First", "Second"]
-    assert queried == [{("First", "hash")}, {("Second", "hash")}]
-
-
-def test_wait_for_unanswered_lookups_is_bounded() -> None:
-    """A peer that invents definitions makes readers wait for 3 s in total, then for a tenth of the time.
-
-    Definitions of other peers are found, and memory for failed lookups is bounded.
-    """
-
-    def find(wanted: Collection[Wanted]) -> Schemas:
-        return {each: {"timestamp": "uint64"} for each in wanted if each[0] == "Honest"}
-
-    lookup = LayoutLookup(find)
-    lookup._wait_budget, lookup._budget_time = 0.0, time.monotonic()  # as after 3 s of futile waits
-    start = time.monotonic()
-    for number in range(5000):
-        assert lookup.codec("Evil", str(number), wait=True) is None
-    assert len(lookup._open) <= 2 * layout_lookup._MAX_UNKNOWN
-    assert len(lookup._failed) <= layout_lookup._MAX_FAILED
-    assert start <= lookup._budget_time <= time.monotonic()
-    wait_for(lambda: lookup.codec("Honest", "hash"), what="the definition")
-    lookup.close()
-
-
-def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """The fields of all definitions are bounded; those in use are kept, and further ones rejected, logged once.
-
-    Definitions no longer in use are evicted, least recently used first.
-    """
-    now = 0.0
-    monkeypatch.setattr(layout_lookup, "_MAX_FIELDS", 10 * (1 + layout_lookup._BASE))
-    lookup = LayoutLookup(lambda wanted: {each: {"timestamp": "uint64"} for each in wanted}, now=lambda: now)
-    known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
-    assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
-    assert lookup.codec("Honest", "0") is known[0]
-    assert caplog.text.count("too many messages are not installed here") == 1
-    now += 3600.0
-    assert lookup.codec("Honest", "0") is known[0]
-    assert lookup.codec("Honest", "new", wait=True)
-    assert [lookup.codec("Honest", str(number)) is known[number] for number in (0, 2)] == [True, True]
-    assert len(lookup._codecs) == len(lookup._used) == 10
-
-
 def test_wait_ends_with_data_wake_end_or_timeout() -> None:
     """A wait ends with a sample, a call of `wake`, the end of the queue or its timeout."""
     pending_queue = make_queue("every")
@@ -490,7 +357,7 @@ UNDEFINED = f"application/msgpack;px4_msgs/FooBar;hash={'0' * 32}"
 
 
 def undefined(payload: bytes = VALID) -> RawSample:
-    """Return a sample of a message without a file, whose definition no publisher has."""
+    """Return a sample of a message whose definition no publisher has."""
     return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding=UNDEFINED)
 
 

@@ -15,7 +15,6 @@ import zenoh
 
 import nedbus
 from nedbus import Counts
-from nedbus.client.io_thread import Job
 from nedbus.client.receiving import Receiver, pending_queue, retransmission
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
@@ -50,7 +49,7 @@ def fail(*_: object) -> None:
 
 @pytest.mark.parametrize("unanswered", [0, 3])
 def test_lost_samples_are_requested_by_exact_key(lossy: Lossy, unanswered: int) -> None:
-    """Requests have an exact key, as routers match wildcards with all caches, and are repeated until answered."""
+    """Requests have an exact key, because routers match wildcards with all caches; they are repeated until answered."""
     lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
     lossy.publish(*range(7))
     assert lossy.receive(7) == list(range(7))
@@ -220,26 +219,6 @@ def test_unanswered_requests_delay_no_others(lossy: Lossy, raw: Session) -> None
         taken.clear()
 
 
-def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
-    """A job that raises is logged once and called again, and delays no other job."""
-    calls: list[float] = []
-
-    def fail_at_first(now: float) -> float:
-        calls.append(now)
-        return 0.0 if len(calls) > 2 else 1 / 0
-
-    def succeed(now: float) -> float:
-        others.append(now)
-        return 0.01
-
-    others: list[float] = []
-    jobs = [Job(fail_at_first), Job(succeed)]
-    wait_for(lambda: len(calls) > 5 and len(others) > 5, what="calls of both jobs")
-    for job in jobs:
-        job.end()
-    assert sum("unexpected error" in text for text in caplog.messages) == 1
-
-
 def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gaps of 60 vehicles at once are requested a few at a time, and all are filled."""
     monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
@@ -274,7 +253,7 @@ def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytes
 
 
 def test_slow_reader_requests_after_reading(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slow reader requests lost messages only after it has read others, which recovered ones would displace."""
+    """A slow reader requests lost messages only after reading: recovered messages would displace unread ones."""
     monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
