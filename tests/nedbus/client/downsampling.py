@@ -15,13 +15,13 @@ from nedbus.client.publishing import downsampler
 from tests.flights.messages import message
 from tests.waits import wait_for
 
-from .numbered import take
+from .numbered import receive_timestamps
 
 MS = 1_000_000  # ns
 
 
 class Link:
-    """A TCP proxy to a router; `carried` counts its bytes, and it pauses while `flows` is not set."""
+    """A TCP proxy to a router; `carried`: bytes forwarded. It pauses while `flows` is not set."""
 
     def __init__(self, endpoint: str) -> None:
         self.carried = 0
@@ -108,5 +108,5 @@ def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any
 
     The reply with the last message may overtake messages published before it arrives.
     """
-    assert take(subscription, 1) == [0]
+    assert receive_timestamps(subscription, 1) == [0]
     wait_for_downsampling_reader(publisher)

@@ -10,7 +10,7 @@ import nedbus
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
 from nedbus.transport import RawSample, RetransmitRequest, Session
 
-from .numbered import publish, take
+from .numbered import publish, receive_timestamps
 
 
 class LossyQueue(PendingQueue):
@@ -26,14 +26,14 @@ class LossyQueue(PendingQueue):
 
 
 class Lossy:
-    """A subscription with a lossy queue and its retransmission requests; the first `unanswered` get no reply."""
+    """A subscription with a lossy queue; `requests`: its retransmission requests, the first `unanswered` without a reply."""
 
     def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
         self.session = session
         self.publish = partial(publish, publisher)
         self.queue = queue
         self.subscription = nedbus.Subscription(receiver, queue, owner=None)
-        self.receive = partial(take, self.subscription)
+        self.receive = partial(receive_timestamps, self.subscription)
         self.requests: list[tuple[str, int, int]] = []
         self.unanswered = 0
         self.open = self.max_open = 0

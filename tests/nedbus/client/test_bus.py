@@ -30,7 +30,7 @@ from nedbus_msgs import DEFAULT, Address
 from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
-from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
+from tests.nedbus.client.numbered import publish, receive_timestamps, wait_for_subscriber
 from tests.peers.answering import answering, reply_with
 from tests.peers.ports import free_endpoint
 from tests.waits import DEADLINE, wait_for
@@ -80,7 +80,7 @@ def test_latency_does_not_include_the_time_until_reading(
     """`received` is the time at which a sample left Zenoh's ring: a script that reads late does not add latency."""
     subscription, publisher = client.subscribe(mode=mode), bus.publisher(VLP, vehicle="1")
     with suppress(nedbus.NoDataError):
-        subscription.receive(0.01)  # opens it, and starts the thread that drains the ring
+        subscription.receive(0.01)  # opens the subscription, and starts the thread that drains the ring
     wait_for_subscriber(publisher)
     publish(publisher, 1)
     wait_for(lambda: subscription.waiting, what="the message")
@@ -92,11 +92,11 @@ def test_latency_does_not_include_the_time_until_reading(
 
 
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
-    """The router knows a publisher before its first message, which a new reader would otherwise miss once in 300."""
+    """A publisher is declared at the router before its first message; otherwise a new reader misses one in 300."""
     with nedbus.connect(endpoint) as other:
         for vehicle in range(100):
             publish(bus.publisher(VLP, vehicle=vehicle), 1)
-            assert take(other.subscribe(vehicle=vehicle), 1) == [1]
+            assert receive_timestamps(other.subscribe(vehicle=vehicle), 1) == [1]
 
 
 def test_topic_vehicle_and_instance_select_streams(client: nedbus.Bus, bus: nedbus.Bus) -> None:
@@ -155,7 +155,7 @@ def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkey
         other.publisher(VLP, vehicle="7")
         wait_for(lambda: len(client.vehicles()["7"]) == 2, what="another address")
         assert client.vehicles()["7"] == [Address("7", "estimator_local_position", 2), Address("7", VLP)]
-    wait_for(lambda: not client.vehicles(), what="the vehicles to go")
+    wait_for(lambda: not client.vehicles(), what="the vehicles to disappear")
     assert not queried
 
 
@@ -243,7 +243,9 @@ def test_two_processes_of_one_vehicle_both_reply(bus: nedbus.Bus, endpoint: str,
             wait_for(partial(count_replies, raw, f"nedbus/1/{topic}"), what=topic)
 
 
-def test_exception_in_a_reply_affects_no_other(bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_in_a_reply_does_not_end_the_reply_thread(
+    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After an exception in one reply, the reply thread answers the next query."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
@@ -277,7 +279,7 @@ def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, raw: Session
         wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
 
 
-def services_of(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
+def reply_with_statuses(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
     """Reply to each query for services with all these payloads, by service id."""
     return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
 
@@ -285,7 +287,7 @@ def services_of(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
 def test_malformed_status_is_ignored(client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
     """Replies that are not JSON, or too deeply nested, are ignored and logged in one line."""
     junk = {"evil": b"[" * 100_000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
-    with answering(raw, "nedbus/@service/*/status", services_of(junk)):
+    with answering(raw, "nedbus/@service/*/status", reply_with_statuses(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
@@ -294,11 +296,11 @@ def test_malformed_status_is_ignored(client: nedbus.Bus, raw: Session, caplog: p
 def test_memory_for_parsed_status_is_bounded(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Parsed JSON may need 30 times its length: of 480 kB, replies beyond 4 MiB of memory are ignored and logged."""
+    """Parsed JSON may need 30 times its length: replies beyond the memory limit, here 4 MiB, are ignored and logged."""
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
-    with answering(raw, "nedbus/@service/*/status", services_of(many)):
+    with answering(raw, "nedbus/@service/*/status", reply_with_statuses(many)):
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
@@ -316,7 +318,9 @@ def test_status_of_hostile_or_newer_service_is_sanitized(client: nedbus.Bus, raw
         "sources": sources,
         "shape": {"of": "it"},
     }
-    with answering(raw, "nedbus/@service/*/status", services_of({"a": json.dumps(content).encode(), "b": b"[5]"})):
+    with answering(
+        raw, "nedbus/@service/*/status", reply_with_statuses({"a": json.dumps(content).encode(), "b": b"[5]"})
+    ):
         [status] = client.services()
     assert status == nedbus.health.ServiceStatus(
         service="a", host="here", sources=(nedbus.health.SourceStatus(source="sim:", state="new", addresses=("1/x",)),)
@@ -330,7 +334,7 @@ def test_bytes_of_replies_are_bounded(
     monkeypatch.setattr("nedbus.transport.queries.MAX_ANSWER_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
-    with answering(raw, "nedbus/@service/*/status", services_of(many)):
+    with answering(raw, "nedbus/@service/*/status", reply_with_statuses(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
     assert "nedbus/@service/*/status: 40 answers left out, beyond the limits of a query" in caplog.messages
 
@@ -358,7 +362,7 @@ def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbu
 
 
 def test_second_publisher_of_an_address_raises(client: nedbus.Bus) -> None:
-    """A second publisher of an address raises AddressInUseError, as it would mix two flights."""
+    """A second publisher of an address raises AddressInUseError, because it would mix two flights."""
     publisher = client.publisher(VLP, vehicle="1")
     with pytest.raises(nedbus.errors.AddressInUseError, match="this process already publishes 1/"):
         client.publisher(VLP, vehicle="1")
@@ -461,7 +465,7 @@ def test_async_reader_yields_to_other_tasks(endpoint: str, bus: nedbus.Bus) -> N
     assert asyncio.run(scenario()) > 5
 
 
-def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
+def test_async_receive_timeout_loses_no_sample(endpoint: str, bus: nedbus.Bus) -> None:
     """A receive that times out does not lose a sample."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
@@ -480,7 +484,7 @@ def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_several_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> None:
+def test_threads_reading_one_subscription_share_its_messages(bus: nedbus.Bus, mode: Mode) -> None:
     """Each message goes to exactly one of several reading threads, in either mode."""
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(mode=mode)

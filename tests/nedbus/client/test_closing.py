@@ -30,7 +30,7 @@ from tests.waits import DEADLINE, wait_for
 
 from .test_bus import BOTH
 
-_STEPS: Final = 100  # more than a blocking read has
+_STEPS: Final = 100  # more function calls than a blocking read makes
 
 
 def test_connect_without_a_router_raises() -> None:
@@ -130,7 +130,7 @@ def test_endpoint_from_a_list_or_the_environment(endpoint: str, monkeypatch: pyt
 
 
 def test_receive_timeout_includes_opening() -> None:
-    """`receive` with a timeout does not wait longer to open its subscription without a router."""
+    """The timeout of `receive` includes opening the subscription, even without a router."""
     where = free_endpoint()
     router = open_router(listen=(where,))
 
@@ -242,7 +242,7 @@ def test_closed_publisher_frees_its_address(client: nedbus.Bus, bus: nedbus.Bus)
     publisher.close()
     publisher.close()
     assert client.latest("*") == []
-    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to disappear")
     with pytest.raises(nedbus.ClosedError):
         publish(publisher, 2)
     with client.publisher(VLP, vehicle="1") as successor:
@@ -261,7 +261,7 @@ def test_calls_on_a_closed_bus_raise(client: nedbus.Bus) -> None:
     subscription = client.subscribe(VLP)
     publisher = client.publisher(VLP, vehicle="1")
     with suppress(nedbus.NoDataError):
-        subscription.receive(0.0)  # opens it
+        subscription.receive(0.0)  # opens the subscription
     assert not any(each.closed for each in (client, subscription, publisher))
     client.close()
     client.close()
@@ -288,7 +288,7 @@ def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
     del publisher
     gc.collect()
     assert reference() is None
-    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to disappear")
 
 
 def test_garbage_collection_closes_on_the_closer_thread() -> None:

@@ -1,4 +1,4 @@
-"""Deadlocks between Python and Zenoh, in a process whose publishers come and go during queries and subscriptions."""
+"""Deadlocks between Python and Zenoh while a process opens and closes publishers, queries and subscribes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.peers.processes import Start
 
 
 @pytest.mark.slow
-def test_process_has_no_deadlock_while_publishers_come_and_go(start: Start) -> None:
+def test_opening_and_closing_publishers_causes_no_deadlock(start: Start) -> None:
     """No Python code runs on Zenoh's threads, and none holds the GIL while waiting for Zenoh.
 
     A deadlock lasts 10 s or forever; the limit of 5 s tolerates a busy machine.

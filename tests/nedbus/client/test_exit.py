@@ -144,7 +144,7 @@ time.sleep(600)
     process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
     wait_for(lambda: "mine" in bus.vehicles(), what="the vehicle")
     process.kill()
-    wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to go")
+    wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to disappear")
 
 
 def test_close_waits_for_threads_inside_zenoh(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:

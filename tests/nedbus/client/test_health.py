@@ -21,10 +21,10 @@ SECOND = 1_000_000_000
 Fields = Mapping[str, object]
 
 
-def follow(
+def stream_at(
     *times: float, boot: float = 0.0, every: float = 0.01, latency: float | None = None, fields: Fields = VALID
 ) -> StreamHealth:
-    """Return a stream with these arrival times [s]; PX4's times start at `boot` [s]."""
+    """Return a stream with these arrival times [s]; PX4's timestamps start at `boot` [s]."""
     stream = StreamHealth(VLP)
     for index, arrival in enumerate(times):
         seconds = boot + index * every
@@ -32,8 +32,8 @@ def follow(
     return stream
 
 
-def follow_clock(*clock: float) -> Health:
-    """Return the health of a stream whose messages have these PX4 times [s]."""
+def health_at_px4_times(*clock: float) -> Health:
+    """Return the health of a stream whose messages have these PX4 timestamps [s]."""
     stream = StreamHealth(VLP)
     for seconds in clock:
         stream.add(message(round(seconds * 1e6)), received=0)
@@ -45,7 +45,7 @@ def test_rate_and_jitter_cover_the_last_second() -> None:
     times = [0.0]
     for index in range(200):
         times.append(times[-1] + (0.1 if index < 10 else 0.015 if index % 2 else 0.025))
-    health = follow(*times).snapshot(round((times[-1] + 0.5) * SECOND))
+    health = stream_at(*times).snapshot(round((times[-1] + 0.5) * SECOND))
     assert health.rate == pytest.approx(50.0, rel=0.02)
     assert health.jitter == pytest.approx(0.005, rel=0.02)
     assert health.nominal == 100.0
@@ -53,9 +53,9 @@ def test_rate_and_jitter_cover_the_last_second() -> None:
     assert health.messages == 201
 
 
-def test_snapshot_during_add_in_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A message may be added while another thread computes the jitter of the first second."""
-    stream = follow(0.0, 0.01, 0.02)
+def test_concurrent_add_does_not_break_a_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message may be added while another thread computes the jitter."""
+    stream = stream_at(0.0, 0.01, 0.02)
     mean = vars(_Window)["mean"].fget
 
     class Late(float):
@@ -71,7 +71,7 @@ def test_snapshot_during_add_in_another_thread(monkeypatch: pytest.MonkeyPatch) 
 
 def test_silent_stream_has_age_but_no_rate() -> None:
     """A stream that stopped has an age but no rate; before the first message it has neither."""
-    health = follow(1.0, 1.01, 1.02).snapshot(10 * SECOND)
+    health = stream_at(1.0, 1.01, 1.02).snapshot(10 * SECOND)
     assert health.rate is None
     assert health.age == pytest.approx(8.98)
     health = StreamHealth("estimator_local_position").snapshot(SECOND)
@@ -104,14 +104,14 @@ def test_stream_on_change_has_no_usual_rate(topic: str, silence: float, state: s
     assert (health.flags, health.resets) == (None, {})
 
 
-def test_gaps_order_and_reboots_follow_px4s_time() -> None:
-    """Steps of PX4's time of more than three usual steps are gaps, and steps back are disorder or a reboot."""
+def test_gaps_disorder_and_reboots_are_derived_from_px4_time() -> None:
+    """Steps of PX4's time of more than three usual steps are gaps; steps back are disorder or reboots."""
     clock = [index * 0.1 for index in range(20)]
     clock += [clock[-1] + 1.0 + index * 0.1 for index in range(5)]
     clock += [clock[-1] + 0.2, clock[-1] + 2.0]
-    assert follow_clock(*clock).gaps == 2
+    assert health_at_px4_times(*clock).gaps == 2
     # Less than a second back is out of order; more is a reboot.
-    health = follow_clock(10.0, 10.1, 10.05, 10.2, 0.5, 0.6)
+    health = health_at_px4_times(10.0, 10.1, 10.05, 10.2, 0.5, 0.6)
     assert (health.out_of_order, health.reboots) == (1, 1)
 
 
@@ -126,9 +126,9 @@ def test_gaps_order_and_reboots_follow_px4s_time() -> None:
     ids=["rising", "wrapping at 255", "reset before the first message", "reboot"],
 )
 def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, reboots: int) -> None:
-    """Increments of a reset counter are counted, also across 255; those before the first message are unknown.
+    """Increments of a reset counter are counted, including its wrap at 255, from the first message on.
 
-    A reboot clears the counters without a reset; later resets count.
+    A reboot clears the counters, which is not a reset; later resets are counted.
     """
     stream = StreamHealth(VLP)
     for seconds, counter in counters:
@@ -159,7 +159,7 @@ def test_missing_flags_do_not_count() -> None:
     assert stream.snapshot(1).flags == {"xy_valid": 0.5, "v_xy_valid": 0.0, "v_z_valid": 0.0}
 
 
-def test_latency_covers_the_last_second_and_loss_all_time() -> None:
+def test_latency_covers_the_last_second_and_lost_is_a_total() -> None:
     """Latency is the median and maximum of the last second; losses are the total since the start."""
     stream = StreamHealth(VLP)
     for index, latency in enumerate((0.1, 0.2, 0.9)):
@@ -174,7 +174,7 @@ def test_usual_rate_reveals_a_slow_stream() -> None:
     times += [60.0 + index * 0.0001 for index in range(6000)]
     times += [62.0 + index * 0.01 for index in range(200)]
     times += [64.0 + index * 0.2 for index in range(50)]
-    health = follow(*times).snapshot(round((times[-1] + 0.1) * SECOND))
+    health = stream_at(*times).snapshot(round((times[-1] + 0.1) * SECOND))
     assert health.rate == pytest.approx(5.0, rel=0.05)
     assert health.usual_rate is not None
     assert 50 < health.usual_rate < 120
@@ -182,12 +182,12 @@ def test_usual_rate_reveals_a_slow_stream() -> None:
 
 def test_slow_stream_becomes_stale_later() -> None:
     """A stream is stale after 3 s without a message, or after two usual intervals if that is longer."""
-    assert follow(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
-    assert follow(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
+    assert stream_at(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
+    assert stream_at(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
 
 
-def test_rare_topic_without_a_file_is_never_stale() -> None:
-    """A topic without a file has no nominal rate: it becomes stale only if it had at least one message per second."""
+def test_rare_topic_without_nominal_rate_is_never_stale() -> None:
+    """A topic without a nominal rate becomes stale only if it had at least one message per second."""
     for period, expected in ((0.01, 3.0), (5.0, math.inf)):
         stream = StreamHealth("vehicle_command")
         for index in range(300):
@@ -219,7 +219,7 @@ def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_monitor_is_bounded() -> None:
-    """In a flood of keys the 4096 most recent streams are kept; they never displace one that is still active."""
+    """In a flood of keys, the 4096 most recently updated streams are kept, including one that stays active."""
     monitor, real = Monitor(), sample("real")
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
     for each in flood:
@@ -245,8 +245,8 @@ def test_retained_sample_is_not_measured() -> None:
 def test_states_have_reasons() -> None:
     """A stream has the worst state that applies, with a reason unless it is "ok"."""
     second = [index / 100 for index in range(300)]
-    fresh, late = (follow(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
-    stream = follow(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
+    fresh, late = (stream_at(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
+    stream = stream_at(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
     silent, longer = (stream.snapshot(seconds * SECOND) for seconds in (40, 3 * 3600))
     cases: tuple[tuple[Health, dict[str, Any], str], ...] = (
         (fresh, {}, "ok"),
@@ -268,11 +268,11 @@ def test_states_have_reasons() -> None:
 
 def test_description_has_state_flags_and_faults() -> None:
     """The description has the state, flags, gaps, out-of-order messages and reboots; "ok" without any."""
-    health = follow(0.0, 0.01, 0.02).snapshot(SECOND // 10)
+    health = stream_at(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
-    doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
+    doubtful = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
     assert describe_stream(doubtful, stream_state(doubtful)) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"
-    mixed = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0).snapshot(SECOND // 10)
+    mixed = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0).snapshot(SECOND // 10)
     assert "reboots" not in describe_stream(mixed, stream_state(mixed, publishers=2)), (
         "two publishers look like reboots"
     )

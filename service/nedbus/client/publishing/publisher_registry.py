@@ -118,7 +118,7 @@ class PublisherRegistry:
         """
         alive_keys(self._session, f"{self.prefix}/{address.vehicle}/@alive", timeout=_TOKENS_TIMEOUT)
 
-    def is_read(self, addresses: Iterable[Address]) -> bool:
+    def has_subscriber(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""
         with ExitStack() as opened:
             keys = (address.key(prefix=self.prefix) for address in addresses)

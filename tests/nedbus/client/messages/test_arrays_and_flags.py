@@ -24,7 +24,7 @@ from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import MS, Clock, clock, wait_for_downsampling_reader
 from tests.nedbus.client.lossy import LossyQueue
-from tests.nedbus.client.numbered import take, wait_for_subscriber
+from tests.nedbus.client.numbered import receive_timestamps, wait_for_subscriber
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_reader
@@ -74,7 +74,7 @@ def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, address:
     publisher, sent = publisher_of(bus, address, source="ins"), make(address, 5)
     publisher.publish(make(address, 4))
     subscription = client.subscribe(address.topic, mode="every")
-    assert take(subscription, 1) == [4]
+    assert receive_timestamps(subscription, 1) == [4]
     wait_for_subscriber(publisher)
     publisher.publish(sent)
     sample = subscription.receive(DEADLINE)
@@ -147,7 +147,7 @@ def test_max_rate_downsamples(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock,
     publisher = publisher_of(bus, address)
     publisher.publish(make(address, 0))
     subscription = client.subscribe(address.topic, mode="every", max_rate=10)
-    assert take(subscription, 1) == [0]
+    assert receive_timestamps(subscription, 1) == [0]
     wait_for_downsampling_reader(publisher)
     for number in range(1, 101):
         clock.now += 10 * MS
@@ -193,8 +193,8 @@ def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
         assert json.loads(run_command("schema", ATTITUDE.topic).out)["title"] == "VehicleAttitude"
 
 
-def test_schema_of_topic_without_a_file_is_queried(endpoint: str, bus: nedbus.Bus) -> None:
-    """`nedbus schema` queries the publisher of a topic without a file; an unknown name is a usage error."""
+def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bus: nedbus.Bus) -> None:
+    """`nedbus schema` queries publishers for a topic that nedbus does not define; other names are usage errors."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )

@@ -94,7 +94,7 @@ class Reader:
 
 
 class Network:
-    """Three firmware builds with a vehicle each, vehicle 1, which changes its firmware, and three readers."""
+    """Three readers, and four vehicles: one for each firmware build, and vehicle 1, which changes its firmware."""
 
     def __init__(self, endpoint: str) -> None:
         self.endpoint = endpoint
@@ -102,7 +102,7 @@ class Network:
         self.buses: dict[str, nedbus.Bus] = {}
         self.publishers: dict[str, tuple[str, nedbus.Publisher]] = {}
         self.last: dict[str, Sent] = {}  # of each publisher
-        self.slowest = 0.0  # s from the first arrival of a message until all have read it
+        self.slowest = 0.0  # s, the longest time until all readers have read a message
         self.readers = {form: Reader(endpoint, form) for form in FORMS}
         for firmware in FIELDS:
             self.restart(firmware)
@@ -151,7 +151,7 @@ STEPS: Final = st.lists(
 
 @pytest.mark.router
 def test_restart_with_other_firmware_changes_fields(router: str) -> None:
-    """A vehicle that restarts with another firmware before new readers look it up is read with its new fields."""
+    """After a vehicle restarts with another firmware, a new reader reads it with its new fields."""
     before = [(Network.publish, "C"), (Network.restart_reader, "rows")]
     run(router, [*before, (Network.restart, "C"), *before])
 
@@ -159,7 +159,7 @@ def test_restart_with_other_firmware_changes_fields(router: str) -> None:
 @pytest.mark.router
 @pytest.mark.slow
 @hypothesis.given(steps=STEPS)
-def test_restarts_in_any_order_keep_fields_right(router: str, steps: Steps) -> None:
+def test_restarts_in_any_order_do_not_mix_up_fields(router: str, steps: Steps) -> None:
     """While vehicles and readers restart in any order, each message is read once, with the fields of its sender."""
     hypothesis.target(run(router, steps), label="seconds until a message is read")
 
@@ -198,7 +198,7 @@ def test_unread_samples_keep_their_definition(client: nedbus.Bus, bus: nedbus.Bu
 
 
 def test_encoding_has_the_hash_of_the_definition(bus: nedbus.Bus, raw: Session) -> None:
-    """The encoding of a message without a file has the hash of its definition, which can be queried by that hash."""
+    """The encoding has the hash of a definition that nedbus does not include; readers query it by that hash."""
     for firmware in "AB":
         publisher_of(bus, firmware).publish(fields_of(firmware, 1))
     short = {firmware: short_hash(NAME, definition_of(firmware).types) for firmware in "AB"}
@@ -317,7 +317,7 @@ with nedbus.connect(sys.argv[1]) as bus:
 
 
 @pytest.mark.process
-def test_service_with_several_firmwares_replies_with_each_definition(
+def test_service_with_several_firmware_builds_replies_with_each_definition(
     tmp_path: Path, run_nedbus: Start, start: Start, endpoint: str
 ) -> None:
     """If a service replays logs of several firmware builds, a new reader of any of them gets the right fields."""

@@ -1,4 +1,4 @@
-"""Messages without a file in nedbus, read with the definition that readers query from the publisher."""
+"""Messages that nedbus does not define, read with the definition queried from their publisher."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COUNT = 500
 
 @pytest.mark.process
 @pytest.mark.parametrize("form", ["models", "rows", "batches"])
-def test_message_without_a_file_is_read_completely(
+def test_message_with_queried_definition_is_read_completely(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
     """No message is lost during the lookup of its definition, in any form; the values are those of the log."""
@@ -71,7 +71,7 @@ def test_hostile_definition_affects_no_other_stream(
 ) -> None:
     """If a peer replies with an invalid definition, only its own message is invalid."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
-    with suppress(ValueError):  # the right hash if there is one, so the definition itself is rejected
+    with suppress(ValueError):  # the right hash, if the definition has one: it is rejected for another reason
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/peer/Evil"

@@ -59,7 +59,7 @@ UTC: Final = {  # source of UTC, and the date of the boot
     "cubeorange_1.12_small": ("vehicle_gps_position", "2021-04-21T06:30:38"),
     "nxp_v0_ekf_failure": ("sensor_gps/0", "2025-02-10T13:55:42"),
     "sitl_1.13_three_topics": ("sensor_gps/0", "2022-04-29T08:45:26"),
-    "sitl_1.15_events": ("timestamp", "1970-01-01T00:00:00"),  # which is Unix time already
+    "sitl_1.15_events": ("timestamp", "1970-01-01T00:00:00"),  # Unix time already
 }
 
 pytestmark = [
@@ -113,7 +113,7 @@ TEXTS = "log_message"
 
 @each_flight
 def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
-    """`nedbus.read` returns all topics of a log bit for bit, without the messages that are known to be invalid."""
+    """`nedbus.read` returns all topics of a log bit for bit, except the messages known to be invalid."""
     raw, arrays = raw_streams(flight), nedbus.read(flight, ["*"])
     arrays.pop(TEXTS)  # derived from texts and events
     assert arrays.keys() == raw.keys()
@@ -176,7 +176,7 @@ def test_replayed_log_reaches_another_process(flight: Path, run_nedbus: Start, e
 @pytest.mark.slow
 @each_flight
 def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None:
-    """A converted recording has every message and all missing fields of a log, also of topics without a file."""
+    """A converted recording has every message and all missing fields of all topics in a log."""
     path = tmp_path / "flight.mcap"
     convert_replay(f"ulog:{flight}?topics=*", path)
     before, after = nedbus.read(flight, ["*"]), nedbus.read(path, ["*"])

@@ -1,4 +1,4 @@
-"""A simulated session of a lossless publisher and its readers, with a fake clock that only waiting advances."""
+"""A fake session of a lossless publisher and its readers, with a fake clock that advances only in waits."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.nedbus.client.receiving.raw_samples import Payload
 
 KEY: Final = "nedbus/1/vehicle_local_position"
 _TICK: Final = 0.01  # s
-END: Final = 600.0  # s of simulated time after which a wait is stuck
+END: Final = 600.0  # s of simulated time after which a wait counts as stuck
 
 
 class Stuck(Exception):  # noqa: N818 - not an error, but an expected outcome
@@ -69,8 +69,8 @@ class Query:
 
 
 @dataclass(eq=False)
-class World:
-    """The simulated session of a publisher and its clock; all of it runs in the waiting thread."""
+class FakeSession:
+    """The fake session of a publisher, its readers and its clock; all run in the waiting thread."""
 
     readers: list[Reader] = field(default_factory=list)
     now: float = 0.0
@@ -86,7 +86,7 @@ class World:
     def flow_control(
         self, monkeypatch: pytest.MonkeyPatch, timings: Timings, *, needs_router: bool = True
     ) -> FlowControl:
-        """Return a flow control that uses this session and this clock."""
+        """Return a FlowControl on this session and clock."""
         timings.credit_polls = 0.0005, _TICK
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)

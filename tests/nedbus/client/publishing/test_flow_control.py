@@ -14,20 +14,20 @@ from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
 
-from .fake_readers import END, Reader, Stuck, World
+from .fake_readers import END, FakeSession, Reader, Stuck
 
-Interrupt = Callable[..., None]  # a method of World
-LIMIT = 6192  # messages that are published without any acknowledgement
-
-
-@pytest.fixture
-def world() -> World:
-    return World()
+Interrupt = Callable[..., None]  # a method of FakeSession
+LIMIT = 6192  # messages sent without any acknowledgement
 
 
 @pytest.fixture
-def control(world: World, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> FlowControl:
-    return world.flow_control(monkeypatch, timings)
+def session() -> FakeSession:
+    return FakeSession()
+
+
+@pytest.fixture
+def control(session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> FlowControl:
+    return session.flow_control(monkeypatch, timings)
 
 
 def test_unacknowledged_messages_fit_into_cache_and_queues() -> None:
@@ -38,41 +38,41 @@ def test_unacknowledged_messages_fit_into_cache_and_queues() -> None:
 
 @pytest.mark.parametrize("routers", [["r1"], []])
 def test_publisher_without_readers_never_waits(
-    world: World, monkeypatch: pytest.MonkeyPatch, timings: Timings, routers: list[str]
+    session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings, routers: list[str]
 ) -> None:
     """A publisher without readers never waits, whether its session is a client or a router."""
-    world.routers = routers
-    world.publish(world.flow_control(monkeypatch, timings, needs_router=bool(routers)), 10_000)
-    assert world.now == pytest.approx(1.0)
+    session.routers = routers
+    session.publish(session.flow_control(monkeypatch, timings, needs_router=bool(routers)), 10_000)
+    assert session.now == pytest.approx(1.0)
 
 
-def test_fast_reader_causes_no_wait(world: World, control: FlowControl) -> None:
+def test_fast_reader_causes_no_wait(session: FakeSession, control: FlowControl) -> None:
     """An acknowledgement of the last message is requested every 250 messages, one at a time."""
-    world.readers.append(Reader("fast"))
-    world.publish(control, 10_000)
-    assert world.now == pytest.approx(1.0)
-    numbers = [int(each["number"]) for each in world.requests]
+    session.readers.append(Reader("fast"))
+    session.publish(control, 10_000)
+    assert session.now == pytest.approx(1.0)
+    numbers = [int(each["number"]) for each in session.requests]
     assert numbers == list(range(249, 10_000, 250))
-    assert {(each["publisher"], each["read"]) for each in world.requests} == {("p:1", "1")}
+    assert {(each["publisher"], each["read"]) for each in session.requests} == {("p:1", "1")}
 
 
-def test_stuck_reader_gets_a_window_and_a_trickle(world: World, control: FlowControl) -> None:
+def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control: FlowControl) -> None:
     """A stuck reader is sent 2,000 messages at once, then 10 per second until the history cache is full, then none.
 
     A connected reader is never given up: requests are repeated after 0.5, 1, 2, 4 and 8 s, then every 10 s.
     """
-    world.readers.append(Reader("stuck", rate=0.0))
+    session.readers.append(Reader("stuck", rate=0.0))
     with pytest.raises(Stuck):
-        world.publish(control, 10_000)
-    assert world.published == LIMIT
-    assert world.sent[WINDOW - 1] == pytest.approx(0.2)
-    steps = [later - earlier for earlier, later in pairwise(world.sent[WINDOW:])]
+        session.publish(control, 10_000)
+    assert session.published == LIMIT
+    assert session.sent[WINDOW - 1] == pytest.approx(0.2)
+    steps = [later - earlier for earlier, later in pairwise(session.sent[WINDOW:])]
     assert steps == pytest.approx([0.1] * len(steps), abs=0.011)
-    assert len(world.requests) == pytest.approx(5 + END / 10, rel=0.05)
+    assert len(session.requests) == pytest.approx(5 + END / 10, rel=0.05)
 
 
 def test_window_is_shared_by_active_publishers() -> None:
-    """Publishers share the window and use what others leave; one without messages for a second does not count."""
+    """Publishers share the window and what others leave unused; one without messages for a second does not count."""
     shared = SharedWindow()
     assert shared.share("a", 0, now=0.0) == WINDOW
     assert shared.share("a", 1900, now=0.1) == WINDOW
@@ -87,62 +87,62 @@ def test_window_is_shared_by_active_publishers() -> None:
 
 @pytest.mark.parametrize(("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)])
 def test_request_dropped_by_a_full_queue_is_repeated(
-    world: World, control: FlowControl, at: float, rate: float, pause: float
+    session: FakeSession, control: FlowControl, at: float, rate: float, pause: float
 ) -> None:
     """An acknowledgement request that a full queue dropped is repeated after half a second."""
-    world.readers.append(Reader("fast"))
-    world.schedule(at, lambda: setattr(world, "dropping", True))
-    world.schedule(at + 0.2, lambda: setattr(world, "dropping", False))
-    world.publish(control, round(3 * rate), rate=rate)
-    assert world.now < 3.0 + pause
-    assert world.longest_pause() < pause
+    session.readers.append(Reader("fast"))
+    session.schedule(at, lambda: setattr(session, "dropping", True))
+    session.schedule(at + 0.2, lambda: setattr(session, "dropping", False))
+    session.publish(control, round(3 * rate), rate=rate)
+    assert session.now < 3.0 + pause
+    assert session.longest_pause() < pause
 
 
-def test_reader_that_resumes_gets_all_messages(world: World, control: FlowControl) -> None:
+def test_reader_that_resumes_gets_all_messages(session: FakeSession, control: FlowControl) -> None:
     """A reader that resumes after eight minutes gets all messages, and no longer delays the publisher."""
     reader = Reader("stuck", rate=0.0)
-    world.readers.append(reader)
-    world.schedule(480.0, lambda: setattr(reader, "rate", 100_000.0))
-    world.publish(control, 20_000)
-    assert world.now < 480.0 + 2.0
-    assert world.longest_pause(since=480.2) < 0.02
+    session.readers.append(reader)
+    session.schedule(480.0, lambda: setattr(reader, "rate", 100_000.0))
+    session.publish(control, 20_000)
+    assert session.now < 480.0 + 2.0
+    assert session.longest_pause(since=480.2) < 0.02
 
 
 @pytest.mark.parametrize("rate", [100.0, 500.0, 5_000.0])
-def test_slow_reader_sets_the_pace_and_never_starves(world: World, control: FlowControl, rate: float) -> None:
+def test_slow_reader_sets_the_pace_and_never_starves(session: FakeSession, control: FlowControl, rate: float) -> None:
     """The publisher leads by a window and a trickle at most, and a slow reader always has messages to read."""
     reader = Reader("slow", rate=rate)
-    world.readers += [reader, Reader("fast")]
-    world.publish(control, 10_000)
-    ahead = [at - reader.rate * time for at, time in enumerate(world.sent)]
+    session.readers += [reader, Reader("fast")]
+    session.publish(control, 10_000)
+    ahead = [at - reader.rate * time for at, time in enumerate(session.sent)]
     assert max(ahead) < WINDOW * 1.5
-    assert world.now == pytest.approx((10_000 - WINDOW) / rate, rel=0.2)
-    assert world.longest_pause() < 0.2
+    assert session.now == pytest.approx((10_000 - WINDOW) / rate, rel=0.2)
+    assert session.longest_pause() < 0.2
 
 
-def test_slow_reader_leaves_others_ten_messages_per_second(world: World, control: FlowControl) -> None:
+def test_slow_reader_leaves_others_ten_messages_per_second(session: FakeSession, control: FlowControl) -> None:
     """With a reader of one message per second, other readers get ten per second while the history cache has room."""
-    world.readers += [Reader("slow", rate=1.0), Reader("fast")]
-    world.publish(control, WINDOW + 1000)
-    assert world.now > 90.0
-    assert world.longest_pause() < 0.2
+    session.readers += [Reader("slow", rate=1.0), Reader("fast")]
+    session.publish(control, WINDOW + 1000)
+    assert session.now > 90.0
+    assert session.longest_pause() < 0.2
 
 
-def test_closed_reader_causes_no_wait(world: World, control: FlowControl) -> None:
+def test_closed_reader_causes_no_wait(session: FakeSession, control: FlowControl) -> None:
     """A closing reader acknowledges the open request, and the publisher continues."""
     reader = Reader("stuck", rate=0.0)
-    world.readers += [reader, Reader("fast")]
-    world.schedule(1.0, lambda: setattr(reader, "closed", True))
-    world.publish(control, 10_000)
-    assert world.now < 2.1
+    session.readers += [reader, Reader("fast")]
+    session.schedule(1.0, lambda: setattr(reader, "closed", True))
+    session.publish(control, 10_000)
+    assert session.now < 2.1
 
 
-def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> float:
-    """Publish 20,000 messages; return how many a reader lacked after `at` seconds. It reads nearly all in the end."""
+def measure_lead(session: FakeSession, control: FlowControl, reader: Reader, at: float) -> float:
+    """Publish 20,000 messages, which a reader finally reads; return the lead over it after `at` seconds."""
     lead: list[float] = []
-    world.schedule(at, lambda: lead.append(world.published - reader.read))
-    count = world.published + 20_000
-    world.publish(control, 20_000)
+    session.schedule(at, lambda: lead.append(session.published - reader.read))
+    count = session.published + 20_000
+    session.publish(control, 20_000)
     assert reader.read > count - WINDOW
     return lead[0]
 
@@ -150,151 +150,156 @@ def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> 
 @pytest.mark.parametrize("rate", [math.inf, 5_000.0])
 @pytest.mark.parametrize(
     ("interrupt", "begin", "end"),
-    [(World.cut, 0.1, 2.1), (World.restart_router, 0.1003, 4.5), (World.stop, 0.5, 60.5), (World.stop, 0.0, 90.0)],
+    [
+        (FakeSession.cut, 0.1, 2.1),
+        (FakeSession.restart_router, 0.1003, 4.5),
+        (FakeSession.stop, 0.5, 60.5),
+        (FakeSession.stop, 0.0, 90.0),
+    ],
 )
 def test_reader_that_returns_in_time_misses_nothing(  # noqa: PLR0917 - a table
-    world: World, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
+    session: FakeSession, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
 ) -> None:
     """A reader whose link was reset, whose router restarted, or that was suspended gets all messages.
 
     Until then other readers get ten messages per second.
     """
     reader = Reader("back", rate=rate)
-    world.readers += [reader, Reader("fast")]
-    interrupt(world, reader, begin, until=end)
-    assert WINDOW / 2 < lead_over(world, control, reader, end - 0.01) < LIMIT
-    assert world.longest_pause() < 0.2
-    assert world.now < end + 20_000 / min(rate, 10_000.0)
+    session.readers += [reader, Reader("fast")]
+    interrupt(session, reader, begin, until=end)
+    assert WINDOW / 2 < measure_lead(session, control, reader, end - 0.01) < LIMIT
+    assert session.longest_pause() < 0.2
+    assert session.now < end + 20_000 / min(rate, 10_000.0)
 
 
 @pytest.mark.parametrize(
     ("interrupt", "at", "seconds"),
     [
-        (World.cut, 0.1003, 5.0),
-        (World.restart_router, 0.1003, 1.0 + 5.0),
-        (World.stop, 0.1003, TIMINGS.lease + 90.0),
-        (World.stop, 0.0, TIMINGS.lease + 90.0),
+        (FakeSession.cut, 0.1003, 5.0),
+        (FakeSession.restart_router, 0.1003, 1.0 + 5.0),
+        (FakeSession.stop, 0.1003, TIMINGS.lease + 90.0),
+        (FakeSession.stop, 0.0, TIMINGS.lease + 90.0),
     ],
 )
 def test_lost_reader_is_given_up(
-    world: World, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
+    session: FakeSession, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
 ) -> None:
-    """A lost reader is given up after 5 s with a router, or 90 s after its lease; others get ten per second."""
+    """A lost reader is given up after 5 s with a router, or 90 s after its lease; until then others get 10 Hz."""
     reader = Reader("gone", rate=5_000.0)
-    world.readers += [reader, Reader("fast")]
-    interrupt(world, reader, at, until=math.inf)
-    world.publish(control, 20_000)
-    assert seconds - 0.3 < world.now - 18_000 / 10_000.0 < seconds + 1.0
-    assert world.longest_pause() < 0.2
+    session.readers += [reader, Reader("fast")]
+    interrupt(session, reader, at, until=math.inf)
+    session.publish(control, 20_000)
+    assert seconds - 0.3 < session.now - 18_000 / 10_000.0 < seconds + 1.0
+    assert session.longest_pause() < 0.2
 
 
 @pytest.mark.parametrize("away", [0.5, 4.0, 7.0, 60.0])
 @pytest.mark.parametrize("answered", [True, False])
 def test_wait_for_readers_is_extended_without_a_router(
-    world: World, control: FlowControl, away: float, answered: bool
+    session: FakeSession, control: FlowControl, away: float, answered: bool
 ) -> None:
     """A reader that returns 3 s after the router misses nothing, whether it ever replied or not."""
     reader = Reader("back")
-    world.readers.append(reader)
-    world.publish(control, 1000 if answered else 249)
+    session.readers.append(reader)
+    session.publish(control, 1000 if answered else 249)
     reader.alive = False
-    world.routers.clear()
-    world.schedule(away, lambda: world.routers.append("r2"))
-    world.schedule(away + 3.0, lambda: setattr(reader, "alive", True))
-    assert lead_over(world, control, reader, away + 2.99) < LIMIT
-    assert world.now < away + 3.0 + 20_000 / 10_000.0 + 0.2
+    session.routers.clear()
+    session.schedule(away, lambda: session.routers.append("r2"))
+    session.schedule(away + 3.0, lambda: setattr(reader, "alive", True))
+    assert measure_lead(session, control, reader, away + 2.99) < LIMIT
+    assert session.now < away + 3.0 + 20_000 / 10_000.0 + 0.2
 
 
 @pytest.mark.parametrize(("rate", "published"), [(0.0, 10_000.0), (100.0, 10_000.0), (math.inf, 200.0)])
 @pytest.mark.parametrize("second", range(20, 30, 2))
-def test_suspended_reader_is_waited_for_at_any_time(
-    world: World, control: FlowControl, rate: float, published: float, second: int
+def test_publisher_waits_for_a_suspended_reader(
+    session: FakeSession, control: FlowControl, rate: float, published: float, second: int
 ) -> None:
     """The publisher waits for a suspended reader, however its lease overlaps with requests and late replies."""
     reader = Reader("stopped", rate=rate)
-    world.readers += [reader, Reader("fast")]
-    world.stop(reader, second, until=math.inf)
-    while world.now < second + 60.0:
-        world.publish(control, 1, rate=published)
-    assert world.published - reader.read < LIMIT
+    session.readers += [reader, Reader("fast")]
+    session.stop(reader, second, until=math.inf)
+    while session.now < second + 60.0:
+        session.publish(control, 1, rate=published)
+    assert session.published - reader.read < LIMIT
 
 
 @pytest.mark.parametrize("others", [[], ["fast"]])
 @pytest.mark.parametrize("back", [0.1, 60.0])
 def test_reader_suspended_while_replying_is_recognized(
-    world: World, control: FlowControl, others: list[str], back: float
+    session: FakeSession, control: FlowControl, others: list[str], back: float
 ) -> None:
     """Once a reader that was suspended while replying returns, the publisher waits for no unknown reader."""
     reader = Reader("back", stops_in_answer=True)
-    world.readers += [reader, *map(Reader, others)]
-    world.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
-    assert WINDOW / 2 < lead_over(world, control, reader, TIMINGS.lease + back - 0.01) < LIMIT
-    assert world.now < TIMINGS.lease + back + 20_000 / 10_000.0
+    session.readers += [reader, *map(Reader, others)]
+    session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
+    assert WINDOW / 2 < measure_lead(session, control, reader, TIMINGS.lease + back - 0.01) < LIMIT
+    assert session.now < TIMINGS.lease + back + 20_000 / 10_000.0
 
 
-def test_reader_that_closes_during_a_long_request_is_given_up(world: World, control: FlowControl) -> None:
+def test_reader_that_closes_during_a_long_request_is_given_up(session: FakeSession, control: FlowControl) -> None:
     """A reader that closes while a stuck one delays the request is given up 5 s after the stuck one resumes."""
     stuck, ended = Reader("stuck", rate=0.0), Reader("ended")
-    world.readers += [stuck, ended]
-    world.schedule(10.0, lambda: setattr(ended, "closed", True))
-    world.schedule(20.0, lambda: setattr(stuck, "rate", math.inf))
-    world.publish(control, 10_000)
-    assert world.now < 20.0 + 5.0 + 1.5
+    session.readers += [stuck, ended]
+    session.schedule(10.0, lambda: setattr(ended, "closed", True))
+    session.schedule(20.0, lambda: setattr(stuck, "rate", math.inf))
+    session.publish(control, 10_000)
+    assert session.now < 20.0 + 5.0 + 1.5
 
 
-def test_closed_session_ends_the_wait(world: World, control: FlowControl) -> None:
+def test_closed_session_ends_the_wait(session: FakeSession, control: FlowControl) -> None:
     """Closing the session ends the wait for a stuck reader."""
-    world.readers.append(Reader("stuck", rate=0.0))
-    world.schedule(30.0, lambda: setattr(world, "closed", True))
+    session.readers.append(Reader("stuck", rate=0.0))
+    session.schedule(30.0, lambda: setattr(session, "closed", True))
     with pytest.raises(ClosedError):
-        world.publish(control, 10_000)
-    assert world.now < 50.0
+        session.publish(control, 10_000)
+    assert session.now < 50.0
 
 
-def test_flush_waits_for_reception_only(world: World, control: FlowControl) -> None:
+def test_flush_waits_for_reception_only(session: FakeSession, control: FlowControl) -> None:
     """A flush waits until readers have received all messages, not until they have read them."""
-    world.readers.append(Reader("slow", rate=0.0))
+    session.readers.append(Reader("slow", rate=0.0))
     assert control.wait(100, timeout=5.0)
-    assert world.requests == [{"publisher": "p:1", "number": "99", "read": "0"}]
-    assert world.now < 1.0
+    assert session.requests == [{"publisher": "p:1", "number": "99", "read": "0"}]
+    assert session.now < 1.0
 
 
-def test_flush_returns_false_on_timeout(world: World, control: FlowControl) -> None:
+def test_flush_returns_false_on_timeout(session: FakeSession, control: FlowControl) -> None:
     """A flush returns False if a connected reader does not reply, and True once it does."""
     reader = Reader("stopped", stopped=0.0)
-    world.readers.append(reader)
+    session.readers.append(reader)
     assert not control.wait(100, timeout=2.0)
-    assert world.now == pytest.approx(2.0, abs=0.02)
+    assert session.now == pytest.approx(2.0, abs=0.02)
     reader.stopped = None
     assert control.wait(100, timeout=15.0)
 
 
-def test_each_flush_sends_a_new_request(world: World, control: FlowControl) -> None:
-    """Each flush sends a new request, as there may be new readers; without messages it returns at once."""
+def test_each_flush_sends_a_new_request(session: FakeSession, control: FlowControl) -> None:
+    """Each flush sends a new request, because there may be new readers; without messages it returns at once."""
     assert control.wait(0, timeout=5.0)
-    assert world.requests == []
-    world.publish(control, 250)
-    world.advance(1.0)
+    assert session.requests == []
+    session.publish(control, 250)
+    session.advance(1.0)
     assert control.wait(250, timeout=5.0)
-    assert len(world.requests) == 2
-    world.readers.append(Reader("new", stopped=world.now))
+    assert len(session.requests) == 2
+    session.readers.append(Reader("new", stopped=session.now))
     assert not control.wait(250, timeout=2.0)
 
 
-def test_flush_waits_for_a_lost_reader(world: World, control: FlowControl) -> None:
+def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowControl) -> None:
     """A flush waits for a lost reader as long as publishing would, but not for a closed one."""
     ended, away = Reader("ended", stopped=0.0), Reader("away")
-    world.readers += [ended, away]
-    world.schedule(0.1, lambda: setattr(ended, "closed", True))
-    world.schedule(0.1, lambda: setattr(ended, "stopped", None))
+    session.readers += [ended, away]
+    session.schedule(0.1, lambda: setattr(ended, "closed", True))
+    session.schedule(0.1, lambda: setattr(ended, "stopped", None))
     assert control.wait(200, timeout=5.0)
-    assert world.now < 0.2
-    world.restart_router(away, 0.0, until=math.inf)
+    assert session.now < 0.2
+    session.restart_router(away, 0.0, until=math.inf)
     assert control.wait(300, timeout=60.0)
-    assert world.now == pytest.approx(6.0, abs=0.5)
+    assert session.now == pytest.approx(6.0, abs=0.5)
 
 
-def test_acknowledged_number_wraps(world: World, control: FlowControl) -> None:
+def test_acknowledged_number_wraps(session: FakeSession, control: FlowControl) -> None:
     """Message numbers wrap after 2^32, both at the reader and at the publisher."""
     assert control.wait(2**32 + 1, timeout=1.0)
-    assert world.requests[-1]["number"] == "0"
+    assert session.requests[-1]["number"] == "0"

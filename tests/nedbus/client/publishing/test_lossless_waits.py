@@ -15,12 +15,12 @@ import zenoh
 import nedbus
 from nedbus.transport import Session
 from tests.flights.messages import VLP
-from tests.nedbus.client.numbered import numbered, take
+from tests.nedbus.client.numbered import numbered, receive_timestamps
 from tests.peers.answering import answering
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_router
 
-COUNT = 5000  # messages, more than are published to a reader that reads nothing
+COUNT = 5000  # messages, more than a publisher sends to a stuck reader
 
 SCRIPT = """
 import asyncio
@@ -37,7 +37,7 @@ asyncio.run(main())
 """
 
 
-async def until_waiting(publisher: nedbus.AsyncPublisher) -> None:
+async def wait_for_minimum_share(publisher: nedbus.AsyncPublisher) -> None:
     """Wait until a publisher has published at least its minimum share of the window."""
     async with asyncio.timeout(DEADLINE):
         while publisher.published < 100:
@@ -53,11 +53,11 @@ def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
 
 @asynccontextmanager
 async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator[list[nedbus.AsyncPublisher]]:
-    """Yield publishers that wait for a reader; cancel their waits at the end."""
+    """Yield publishers that wait for a reader; finally cancel the waits."""
     publishers = [await bus.publisher(VLP, vehicle=each, lossless=True) for each in range(number)]
     waiting = [asyncio.create_task(each.publish_many(numbered(COUNT))) for each in publishers]
     for publisher in publishers:
-        await until_waiting(publisher)
+        await wait_for_minimum_share(publisher)
     yield publishers
     for task in waiting:
         task.cancel()
@@ -96,7 +96,7 @@ def test_cancelled_publish_many_can_be_continued(
                 pass
             sent = publisher.published
             assert 100 <= sent < COUNT
-            reading = asyncio.create_task(asyncio.to_thread(take, stuck, COUNT))
+            reading = asyncio.create_task(asyncio.to_thread(receive_timestamps, stuck, COUNT))
             await publisher.publish_many(numbered(COUNT - sent, first=sent + 1))
             assert await reading == list(range(1, COUNT + 1))
             assert publisher.published == COUNT
@@ -138,7 +138,7 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus
 
 
 def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus, raw: Session) -> None:
-    """A `with` block that ends with an exception, as Ctrl-C does, waits for no reader."""
+    """A `with` block that ends with an exception, such as Ctrl-C, waits for no reader."""
     queries: list[zenoh.Query] = []
     silent = answering(raw, f"nedbus/*/{VLP}/@ack", queries.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
@@ -184,4 +184,4 @@ def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus
     wait_for(lambda: len(bus.latest()) == 6, what=f"the messages: {process.err}")
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
-    wait_for(lambda: not bus.vehicles(), what="the vehicles to go")
+    wait_for(lambda: not bus.vehicles(), what="the vehicles to disappear")

@@ -17,7 +17,7 @@ from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.timings import Timings
 from nedbus.transport import open_router
 from tests.flights.messages import VLP
-from tests.nedbus.client.numbered import is_read, numbered, publish, take, wait_for_subscriber
+from tests.nedbus.client.numbered import has_subscriber, numbered, publish, receive_timestamps, wait_for_subscriber
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
@@ -76,12 +76,12 @@ def test_stuck_reader_slows_down_a_replay_without_losses(
 ) -> None:
     """While one reader is stuck, others get a window at once and then a trickle; finally all have all messages."""
     publisher, sending = publish_all(bus)
-    got = take(reader, WINDOW + 5)
+    got = receive_timestamps(reader, WINDOW + 5)
     assert publisher.published < COUNT
     late: list[int] = []
-    reading = threading.Thread(target=lambda: late.extend(take(stuck, COUNT)), daemon=True)
+    reading = threading.Thread(target=lambda: late.extend(receive_timestamps(stuck, COUNT)), daemon=True)
     reading.start()
-    got += take(reader, COUNT - len(got))
+    got += receive_timestamps(reader, COUNT - len(got))
     reading.join(DEADLINE)
     assert late == got == list(range(1, COUNT + 1))
     sending.join(DEADLINE)
@@ -109,7 +109,7 @@ def test_suspended_reader_gets_all_messages(
     publisher, sending = publish_all(bus, before=stop)
     process = psutil.Process(stopped.popen.pid)  # on a busy machine, a lease of 1 s may expire before the stop
     wait_for(lambda: process.status() == psutil.STATUS_STOPPED, what="the reader to stop")
-    wait_for(lambda: not is_read(publisher), what="the end of the lease")
+    wait_for(lambda: not has_subscriber(publisher), what="the end of the lease")
     assert sending.is_alive()
     stopped.popen.send_signal(signal.SIGCONT)
     sending.join(2 * DEADLINE)
@@ -182,7 +182,7 @@ def test_killed_reader_is_given_up(
     _, sending = publish_all(bus)
     wait_for(lambda: "ten" in dying.out, what="the first messages")
     dying.signal(number)
-    assert take(reader, COUNT) == list(range(1, COUNT + 1))
+    assert receive_timestamps(reader, COUNT) == list(range(1, COUNT + 1))
     sending.join(DEADLINE)
     assert not sending.is_alive()
 
@@ -192,8 +192,8 @@ def test_flush_does_not_wait_for_scripts_to_read(
 ) -> None:
     """A flush waits for messages to arrive at readers, not for scripts to read them."""
     publisher, sending = publish_all(bus, count=WINDOW // 2)
-    assert take(reader, WINDOW // 2)[-1] == WINDOW // 2
+    assert receive_timestamps(reader, WINDOW // 2)[-1] == WINDOW // 2
     reader.close()
     sending.join(DEADLINE)
     assert publisher.flush(DEADLINE)
-    assert take(stuck, WINDOW // 2)[-1] == WINDOW // 2
+    assert receive_timestamps(stuck, WINDOW // 2)[-1] == WINDOW // 2

@@ -44,7 +44,7 @@ class Stream:
         self.on_sent: Callable[[], object] = lambda: None
 
     def put(self, key: str, payload: bytes, *, congestion_control: zenoh.CongestionControl, priority: object) -> None:
-        """Record a heartbeat, as the session."""
+        """Record a heartbeat; called like `Session.put`."""
         assert (key, congestion_control) == ("key/@adv/pub/ab/7/_", zenoh.CongestionControl.DROP)
         self.sent.append((self.now, payload))
         self.on_sent()
@@ -80,12 +80,12 @@ def stream(monkeypatch: pytest.MonkeyPatch) -> Stream:
 
 @pytest.mark.parametrize("rate", [5, 7, 50, 400])
 def test_busy_stream_sends_no_heartbeats(stream: Stream, rate: int) -> None:
-    """A stream of 5 Hz or more needs no heartbeats, as its next message reveals losses; nor does an unused stream."""
+    """A stream of 5 Hz or more needs no heartbeats: its next message reveals losses; nor does an unused stream."""
     assert stream.wait(10.0) == []
     for _ in range(20 * rate):
         stream.publish()
         assert stream.wait(1 / rate) == []
-    assert stream.calls < 20 / 0.15, "there are fewer calls than messages"
+    assert stream.calls < 20 / 0.15, "the job is called too often"
 
 
 def test_heartbeats_of_a_silent_stream_back_off(stream: Stream) -> None:
@@ -103,7 +103,7 @@ def test_heartbeats_of_a_silent_stream_back_off(stream: Stream) -> None:
     for _ in range(50):
         stream.publish()
         stream.wait(0.1)
-    assert stream.wait(HEARTBEAT), "the first heartbeat after a busy time is early"
+    assert stream.wait(HEARTBEAT), "no heartbeat in time after a busy period"
 
 
 def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> None:

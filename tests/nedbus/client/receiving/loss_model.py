@@ -44,7 +44,7 @@ class Request(NamedTuple):
 class ReceivePath(Protocol):
     """The receive path of one subscription, without I/O. Mode `latest` has no heartbeats and no requests.
 
-    `link`: the link broke, or that was so long ago that a new publisher has sent nothing before.
+    `link`: the link broke, or has been up for so long that an unknown publisher is new.
     `answer`: with `final`, a request that these samples do not complete is given up.
     `read`: the timestamps of one or more messages, and the reported losses.
     """
@@ -116,8 +116,8 @@ class QueueReceivePath(PendingQueue):
 class PublisherRun:
     """One run of a publisher, until its restart; its messages are numbered from 0.
 
-    `known`: the newest number that reached the reader. `exact`: the reader received its first message. `whole`: that,
-    or the reader requested all earlier messages. `given_up`: a request may have been left unanswered.
+    `known`: the newest number that the reader has seen. `exact`: the reader received the first message. `whole`: it
+    received the first message or requested all earlier ones. `given_up`: a request may have been left unanswered.
     """
 
     index: int
@@ -241,7 +241,7 @@ class Simulation:
                 run.read.append(number)
 
     def settle(self) -> None:
-        """Deliver, reply to and read everything, then publish once more, as the next message reports all losses."""
+        """Deliver, reply to and read everything, then publish once more: the next message reports all losses."""
         self._settle()
         for run in self._running:
             self.publish(run.slot, 1)

@@ -78,7 +78,7 @@ def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> Pe
 
 
 def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
-    """Put samples into a queue, and give up all gaps, as no publisher replies."""
+    """Put samples into a queue, and give up all gaps, because no publisher replies."""
     pending_queue.put(samples, overflowed=overflowed)
     pending_queue.give_up()
 

@@ -33,7 +33,7 @@ class AcknowledgingReader:
         self.queue.acknowledge(AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained)
         return self.acknowledged
 
-    def take(self, count: int) -> list[str]:
+    def read(self, count: int) -> list[str]:
         """Read samples; return the names of all acknowledged requests."""
         assert all(self.queue.pop(rows=False) for _ in range(count))
         return self.acknowledged
@@ -53,11 +53,11 @@ def test_read_is_acknowledged_after_all_earlier_samples_are_read(reader: Acknowl
     """A request with `read` is acknowledged once all samples queued when its message arrived have been read."""
     reader.put(raw(0))
     reader.request(1, read=True)
-    assert reader.take(1) == []  # message 1 is still in transit
+    assert reader.read(1) == []  # message 1 is still in transit
     reader.put(raw(0, publisher="b"), raw(1))
     reader.put(raw(2))
-    assert reader.take(1) == []
-    assert reader.take(1) == ["1"]  # later samples need not be read
+    assert reader.read(1) == []
+    assert reader.read(1) == ["1"]  # later samples need not be read
 
 
 def test_unknown_publisher_is_acknowledged_once_the_ring_is_empty(reader: AcknowledgingReader) -> None:
@@ -68,8 +68,8 @@ def test_unknown_publisher_is_acknowledged_once_the_ring_is_empty(reader: Acknow
     reader.request(5, publisher="b")
     assert reader.request(6, publisher="b", read=True) == []
     assert reader.put(raw(0), raw(1)) == ["5"]
-    assert reader.take(1) == ["5"]
-    assert reader.take(1) == ["5", "6"]
+    assert reader.read(1) == ["5"]
+    assert reader.read(1) == ["5", "6"]
 
 
 def test_requests_of_publishers_are_independent(reader: AcknowledgingReader) -> None:
@@ -89,7 +89,7 @@ def test_number_of_open_requests_is_bounded(reader: AcknowledgingReader) -> None
 
 
 def test_reception_is_acknowledged_at_once(reader: AcknowledgingReader) -> None:
-    """A request without `read`, as of a flush, is acknowledged once its message is queued, even if it is unread."""
+    """A request without `read`, such as that of a flush, is acknowledged once its message is queued, even if unread."""
     reader.put(raw(0))
     assert reader.request(0) == ["0"]
     assert reader.request(1) == ["0"]

@@ -24,7 +24,7 @@ from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.flights.first_message import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
+from tests.nedbus.client.numbered import numbered, publish, receive_timestamps, wait_for_subscriber
 from tests.nedbus.client.test_bus import BOTH, SCHEMA
 from tests.peers.answering import answering, reply_with
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
@@ -60,7 +60,7 @@ def test_mode_latest_keeps_samples_of_quiet_vehicles(
 ) -> None:
     """A busy vehicle does not displace a quiet one while the reader pauses, and all messages are counted exactly."""
     subscription = client.subscribe(VLP)
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     publish(bus.publisher(VLP, vehicle="quiet"), 1)
     publish(publisher, *range(2, 3001))
 
@@ -89,17 +89,17 @@ def test_unread_subscription_delays_no_other_reader(
     stuck = client.subscribe(VLP, mode=mode)
     with nedbus.connect(endpoint) as other:
         read = [each.subscribe(VLP, mode="every") for each in (client, other)]
-        assert [take(each, 1) for each in read] == [[1], [1]]
+        assert [receive_timestamps(each, 1) for each in read] == [[1], [1]]
         for first in range(2, 3_001, 100):
             numbers = range(first, min(first + 100, 3_001))
             publish(publisher, *numbers)
-            assert [take(each, len(numbers)) for each in read] == [list(numbers)] * 2
+            assert [receive_timestamps(each, len(numbers)) for each in read] == [list(numbers)] * 2
     wait_for(lambda: stuck.counts.dropped, what="a dropped message")
     wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000], what="the last message")
     assert client.subscribe(VLP).receive(DEADLINE).message.timestamp > 0
     start = time.monotonic()
     stuck.close()
-    assert time.monotonic() - start < 9.0, "slow, as Zenoh's timeout for a blocked close is 10 s"
+    assert time.monotonic() - start < 9.0, "slow: Zenoh's timeout for a blocked close is 10 s"
 
 
 def test_missing_messages_are_counted_exactly(
@@ -146,7 +146,7 @@ def test_two_publishers_of_one_key_lose_nothing(client: nedbus.Bus, bus: nedbus.
 
 
 def test_two_reading_threads_receive_a_message_each(bus: nedbus.Bus) -> None:
-    """The thread that drains the ring wakes the other one, which gets the second message."""
+    """The thread that drains the ring wakes the other reading thread, which gets the second message."""
     publisher, subscription = bus.publisher(VLP, vehicle="1"), bus.subscribe(mode="every")
     wait_for_subscriber(publisher)
     with ThreadPoolExecutor(2) as pool, subscription:
@@ -161,7 +161,7 @@ def test_invalid_samples_do_not_end_an_iteration(
 ) -> None:
     """Invalid payloads and keys, deletes and wildcard puts are counted and logged once per key; valid ones arrive."""
     subscription = client.subscribe("*", mode="every")
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     good = encode(message(2, x=1.0))
     for key, payload in (
         (KEY, b"garbage"),
@@ -187,7 +187,7 @@ def test_long_invalid_keys_are_not_kept(
 ) -> None:
     """150 invalid keys of 60 kB are counted but not kept, and logged in at most 100 short lines."""
     subscription = bus.subscribe("*", mode="every")
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     tracemalloc.start()
     try:
         for number in range(150):
@@ -243,7 +243,7 @@ def test_messages_of_a_malformed_layout_are_invalid(bus: nedbus.Bus, raw: Sessio
         wait_for_reader(raw, KEY)
         raw.put(KEY, msgpack.packb([9, 1, 2]))
         raw.put(KEY, encode(message(2)))
-        assert take(subscription, 1) == [2]
+        assert receive_timestamps(subscription, 1) == [2]
         assert subscription.counts.invalid == 1
 
 
@@ -258,7 +258,7 @@ def test_peer_that_never_replies_delays_no_other_stream(bus: nedbus.Bus, raw: Se
         raw.put(f"nedbus/2/{VLP}", msgpack.packb([layout, 1, 2]))
     wait_for(lambda: subscription.waiting or subscription.counts.invalid, what="the first unknown layout")
     publish(publisher, 1)
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     wait_for(lambda: subscription.counts.invalid == 50, what="all unknown layouts")
     queries = []
     while (query := held.handler.try_recv()) is not None:
@@ -271,13 +271,13 @@ def test_unexpected_error_in_the_pump_is_counted(
 ) -> None:
     """An exception in the pump is logged, its sample counted and requested again, and the reader continues."""
     subscription = bus.subscribe(mode="every")
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     with monkeypatch.context() as patched:
         patched.setattr(PendingQueue, "_admit", lambda *_: 1 / 0)
         publish(publisher, 2)
         wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
     publish(publisher, 3)
-    assert take(subscription, 2) == [2, 3]
+    assert receive_timestamps(subscription, 2) == [2, 3]
     assert any("unexpected error, " in text and "discarded" in text for text in caplog.messages)
 
 

@@ -62,7 +62,7 @@ TestLossAccounting = LossMachine.TestCase
 TestLossAccounting.settings = settings(stateful_step_count=40, phases=set(Phase) - {Phase.explain})
 
 SEEDS = [
-    # 0 arrives, and is read, twice.
+    # 0 arrives twice, and was read twice.
     (Setting("latest"), "publish 0 1, delay 0 1 1, deliver 2"),
     # 0 replaces 1, which is newer.
     (Setting("latest"), "publish 0 2, delay 0 1, deliver 2"),
@@ -70,7 +70,7 @@ SEEDS = [
     (Setting("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
     # 1 and 2 are requested, only 2 arrives: 1 is not requested again, and lost.
     (Setting(), "publish 0 4, deliver 1, drop 0 2, deliver 1, answer 0 1 0"),
-    # 6 is expected of the first run: that of the second run is mistaken for it, and read before 0 to 5, and again.
+    # The first run has sent 0 to 5: 6 of the second run was mistaken for its 6, read before 0 to 5, and read again.
     (Setting(), "publish 0 6, deliver 6, link 1, restart 0, publish 0 8, drop 0 6, deliver 2"),
     # 1 is requested and 2 announced by a heartbeat when the publisher disappears: 1 is lost, 2 is not counted.
     (Setting(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),
@@ -82,7 +82,7 @@ SEEDS = [
 
 
 @pytest.mark.parametrize(("setting", "steps"), SEEDS)
-def test_steps_that_once_found_a_bug(setting: Setting, steps: str) -> None:
+def test_invariants_hold_after_steps_that_found_bugs(setting: Setting, steps: str) -> None:
     """All invariants hold after step sequences that found a bug in an earlier receive path."""
     simulation = Simulation(setting, QueueReceivePath(setting))
     for name, *arguments in map(str.split, f"{steps}, settle".split(", ")):

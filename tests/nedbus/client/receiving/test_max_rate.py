@@ -73,7 +73,7 @@ def test_gap_in_a_downsampled_stream_counts_as_lost() -> None:
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> None:
-    """At half the lowest rate the reader omits every second message, and reports a gap before it with the next one."""
+    """At half the lowest rate the reader omits every second message; the next one reports the losses before it."""
     queue = make_queue(mode, max_rate=0.5)
     assert queue.rate == 1
     taken = []
@@ -91,7 +91,7 @@ def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> N
 
 
 def test_last_message_is_received_once() -> None:
-    """The last message passes if it arrives first; downsampled messages up to it, or a later reply, are omitted."""
+    """The last message passes if it arrives first; downsampled messages up to it and later replies are omitted."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
@@ -120,7 +120,7 @@ def steady(rate: float, seconds: float) -> list[float]:
 
 
 def test_steady_stream_passes_evenly() -> None:
-    """From 100 Hz to 5 Hz every 20th message passes, at any jitter and without drift over ten minutes."""
+    """A gate of 5 Hz passes every 20th message of 100 Hz, with jitter and without drift over ten minutes."""
     times = [number / 100 + 0.002 * math.sin(number) for number in range(60_000)]
     taken = passed(5, times)
     assert len(taken) == 3_000

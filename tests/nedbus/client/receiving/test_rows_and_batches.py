@@ -19,11 +19,11 @@ from nedbus_msgs import Address, Row, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.flights.first_message import LAYOUTS, downgrade, encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
+from tests.nedbus.client.numbered import numbered, publish, receive_timestamps, wait_for_subscriber
 from tests.peers.ports import free_endpoint
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
-COUNT = 900  # fewer than half a window, as one thread publishes and reads
+COUNT = 900  # fewer than half a window, because one thread publishes and reads
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_lossless_close_waits_for_readers(
     sending.start()
     sending.join(0.2)
     assert sending.is_alive()
-    assert take(subscription, count) == list(range(1, count + 1))
+    assert receive_timestamps(subscription, count) == list(range(1, count + 1))
     sending.join(DEADLINE)
     assert not sending.is_alive()
     assert subscription.counts == nedbus.Counts(received=count)
@@ -122,14 +122,14 @@ def test_lossless_publisher_loses_nothing_in_a_router_restart() -> None:
         publisher = bus.publisher(VLP, vehicle="1", lossless=True)
         publish(publisher, 1)
         subscription = other.subscribe(VLP, mode="every")
-        assert take(subscription, 1) == [1]
+        assert receive_timestamps(subscription, 1) == [1]
         router.close()
         wait_for(lambda: not bus.connected and not other.connected, what="the loss of the link")
         sending = threading.Thread(target=publisher.publish_many, args=[numbered(count - 1, first=2)], daemon=True)
         sending.start()
         wait_for(lambda: publisher.published > WINDOW, what="a window of messages")
         router = open_router(listen=(endpoint,))
-        assert take(subscription, count - 1) == list(range(2, count + 1))
+        assert receive_timestamps(subscription, count - 1) == list(range(2, count + 1))
         sending.join(DEADLINE)
         assert publisher.flush()
         assert subscription.counts == nedbus.Counts(received=count)
@@ -247,7 +247,7 @@ def test_receive_batch_with_a_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> No
 
 
 def test_sample_has_source_and_missing_fields(bus: nedbus.Bus) -> None:
-    """Each sample has the source and missing fields of its message, also the last one from `latest`."""
+    """Each sample, including the last one from `latest`, has the source and missing fields of its message."""
     publisher = bus.publisher(VLP, vehicle="1", source="mine")
     whole = message(1).model_dump()
     publisher.publish(whole)
