@@ -26,7 +26,7 @@ class LossyQueue(PendingQueue):
 
 
 class Lossy:
-    """A subscription with a lossy queue; `requests`: its retransmission requests, the first `unanswered` without a reply."""
+    """A subscription with a lossy queue. `requests`: retransmission requests; the first `unanswered` get no reply."""
 
     def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
         self.session = session
