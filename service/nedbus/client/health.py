@@ -115,22 +115,20 @@ class _Window:
 
 
 class Histogram:
-    """Histogram of measurements; `limits` are the upper bounds of all buckets but the last, which is unbounded."""
+    """Histogram of measurements; `limits` are the upper bounds of all buckets but the last, which is unbounded.
+
+    `counts`: number of measurements in each bucket.
+    """
 
     def __init__(self, limits: Sequence[float]) -> None:
         self.limits = tuple(limits)
         self.sum = 0.0
-        self._counts = [0] * (len(self.limits) + 1)
+        self.counts = [0] * (len(self.limits) + 1)
 
     def add(self, value: float) -> None:
         """Count one measurement."""
-        self._counts[bisect_left(self.limits, value)] += 1
+        self.counts[bisect_left(self.limits, value)] += 1
         self.sum += value
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """Number of measurements in each bucket, the unbounded one last."""
-        return tuple(self._counts)
 
 
 class StreamHealth:
