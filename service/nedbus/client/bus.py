@@ -87,7 +87,7 @@ class Bus(AbstractContextManager["Bus"]):
         """Return a subscription to iterate over, which starts with the last message of each key.
 
         `message`: a message class such as VehicleAttitude, for its first topic or the one in `topic`, such as
-        "estimator_attitude", with fields that type checkers know. Or the name of a topic, or "*" for all topics.
+        "estimator_attitude"; samples are typed then. Or the name of a topic, or "*" for all topics.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
         about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.

@@ -221,7 +221,7 @@ class ServiceStatus(_FromPeer):
     sources: tuple[SourceStatus, ...] = ()
 
     def split(self, _: int) -> list[ServiceStatus]:
-        """Split into one status per source; split a single source by omitting its stream health; [] if it has none."""
+        """Split into one status per source; omit the stream health of a single source; return [] if it has none."""
         if len(self.sources) > 1:
             return [replace(self, sources=(each,)) for each in self.sources]
         return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]

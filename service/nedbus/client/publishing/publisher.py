@@ -41,7 +41,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         definition: Definition[Any],
         *,
         registry: PublisherRegistry,
-        matched: MatchingListener,
+        listener: MatchingListener,
         lossless: bool,
         source: str | None,
         owner: object,
@@ -67,7 +67,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
-        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=matched)
+        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=listener)
 
     @property
     def published(self) -> int:

@@ -46,9 +46,9 @@ class PublisherRegistry:
         self.publishers: dict[Address, Publisher] = {}  # open publishers
         self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
         self._schema_key = partial(schema_key, session=str(session.zid()), prefix=prefix)
-        self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
+        self._rate_listeners: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
-        self._shared: set[str] = set()
+        self._shared: set[str] = set()  # vehicles that another process also publishes
         self._lock = threading.Lock()
 
     def publisher(
@@ -74,14 +74,14 @@ class PublisherRegistry:
             if address in self.publishers:
                 raise AddressInUseError(address)
             vehicle, prefix = address.vehicle, self.prefix
-            if vehicle not in self._matched:
+            if vehicle not in self._rate_listeners:
                 selection = Selection(vehicle=vehicle)
                 tokens, rates = selection.alive_key_expr(prefix=prefix), selection.rate_key_expr(ANY, prefix=prefix)
                 self._directories[vehicle] = VehicleDirectory(tokens, prefix=prefix)
-                self._matched[vehicle] = MatchingListener(self._session, rates)
-            matched = self._matched[vehicle]
+                self._rate_listeners[vehicle] = MatchingListener(self._session, rates)
+            listener = self._rate_listeners[vehicle]
             publisher = self.publishers[address] = Publisher(
-                address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
+                address, definition, registry=self, listener=listener, lossless=lossless, source=source, owner=owner
             )
             self._queries.answer(f"{self.prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
             # One key per session: routers need quadratic time for a key that all sessions declare.
@@ -152,7 +152,7 @@ class PublisherRegistry:
             self.publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self.publishers):
                 self._queries.end(f"{self.prefix}/{address.vehicle}/**")
-                self._matched.pop(address.vehicle).close()
+                self._rate_listeners.pop(address.vehicle).close()
                 del self._directories[address.vehicle]
 
 

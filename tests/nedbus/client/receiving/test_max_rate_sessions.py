@@ -157,7 +157,7 @@ def test_closed_publishers_leave_no_listeners(bus: nedbus.Bus, clock: Clock) -> 
                 wait_for_downsampling_reader(publisher)
                 publish(publisher, clock, start, 100)
                 assert receive_timestamps(subscription, 5) == list(range(start, start + 100, 20))
-            assert not bus._publishers._matched  # not visible from outside
+            assert not bus._publishers._rate_listeners  # not visible from outside
         assert subscription.counts == nedbus.Counts(received=11)
 
 
