@@ -134,7 +134,7 @@ class AsyncBus:
         """Close the bus; see `Bus.close`. If cancelled, it closes at once, without waiting for readers."""
         if (bus := self._bus) is not None:  # in a new thread: those of the pool may be blocked
             thread = ThreadPoolExecutor(1, "nedbus-close")
-            await _run(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
+            await _run_cancellable(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
@@ -161,7 +161,7 @@ def _stop_waiting(bus: Bus) -> None:
         publisher._flow_control.cancelled.set()
 
 
-async def _run(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
+async def _run_cancellable(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
     """Run a call in a thread; on cancellation, call `cancel`, which must end it soon."""
     running = asyncio.get_running_loop().run_in_executor(thread, call)
     try:
@@ -227,4 +227,4 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
             finally:
                 flow_control.cancelled = threading.Event()
 
-        return await _run(self._thread, run, cancel=cancelled.set)
+        return await _run_cancellable(self._thread, run, cancel=cancelled.set)

@@ -1,4 +1,4 @@
-"""Lossless publishers that wait for a reader that never reads: waits can be cancelled, and delay nothing else."""
+"""Lossless publishers wait for their readers; the waits can be cancelled, and delay nothing else."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.transport import Session
+from nedbus.client.publishing.flow_control import CACHE, WINDOW
+from nedbus.transport import Session, open_router
 from tests.flights.messages import VLP
-from tests.nedbus.client.numbered import numbered, receive_timestamps
+from tests.nedbus.client.numbered import numbered, publish, receive_timestamps, wait_for_subscriber
 from tests.peers.answering import answering
+from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_router
 
@@ -185,3 +187,70 @@ def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
     wait_for(lambda: not bus.vehicles(), what="the vehicles to disappear")
+
+
+@pytest.fixture
+def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
+    """Subscribe to positions. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        yield subscription
+
+
+@pytest.mark.parametrize("whole_bus", [False, True])
+def test_lossless_close_waits_for_readers(
+    subscription: nedbus.Subscription[Any], bus: nedbus.Bus, whole_bus: bool
+) -> None:
+    """A lossless publisher, or its bus, closes only once a paused reader has received all messages."""
+    count = 3 * WINDOW
+    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+    wait_for_subscriber(publisher)
+
+    def send() -> None:
+        publisher.publish_many(numbered(count))
+        (bus if whole_bus else publisher).close()
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    sending.join(0.2)
+    assert sending.is_alive()
+    assert receive_timestamps(subscription, count) == list(range(1, count + 1))
+    sending.join(DEADLINE)
+    assert not sending.is_alive()
+    assert subscription.counts == nedbus.Counts(received=count)
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
+    """A `with` block that ends with an exception closes without a flush; otherwise it flushes, with either client."""
+    flushed: list[nedbus.Publisher] = []
+
+    def flush(publisher: nedbus.Publisher, *_: float) -> bool:
+        flushed.append(publisher)
+        return True
+
+    monkeypatch.setattr(nedbus.Publisher, "flush", flush)
+    client.publisher(VLP, vehicle="1", lossless=True)
+    client.__exit__(*((KeyError, KeyError(), None) if fails else (None, None, None)))  # the end of a `with` block
+    assert bool(flushed) is not fails
+
+
+def test_lossless_publisher_loses_nothing_in_a_router_restart() -> None:
+    """Without a router, a lossless publisher sends no more than its history cache, and continues with its reader."""
+    endpoint, count = free_endpoint(), CACHE + 1000
+    router = open_router(listen=(endpoint,))
+    with nedbus.connect(endpoint) as other, nedbus.connect(endpoint) as bus:
+        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        publish(publisher, 1)
+        subscription = other.subscribe(VLP, mode="every")
+        assert receive_timestamps(subscription, 1) == [1]
+        router.close()
+        wait_for(lambda: not bus.connected and not other.connected, what="the loss of the link")
+        sending = threading.Thread(target=publisher.publish_many, args=[numbered(count - 1, first=2)], daemon=True)
+        sending.start()
+        wait_for(lambda: publisher.published > WINDOW, what="a window of messages")
+        router = open_router(listen=(endpoint,))
+        assert receive_timestamps(subscription, count - 1) == list(range(2, count + 1))
+        sending.join(DEADLINE)
+        assert publisher.flush()
+        assert subscription.counts == nedbus.Counts(received=count)
+    router.close()

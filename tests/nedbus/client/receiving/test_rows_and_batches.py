@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -13,15 +12,13 @@ import pytest
 
 import nedbus
 from nedbus import Batch
-from nedbus.client.publishing.flow_control import CACHE, WINDOW
-from nedbus.transport import Session, open_router
+from nedbus.transport import Session
 from nedbus_msgs import Address, Row, VehicleLocalPosition
-from nedbus_msgs.arrays import DTYPE, to_array, to_message
+from nedbus_msgs.arrays import to_array, to_message
 from tests.flights.first_message import LAYOUTS, downgrade, encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.numbered import numbered, publish, receive_timestamps, wait_for_subscriber
-from tests.peers.ports import free_endpoint
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.nedbus.client.numbered import numbered, publish, wait_for_subscriber
+from tests.waits import DEADLINE, wait_for_reader
 
 COUNT = 900  # fewer than half a window, because one thread publishes and reads
 
@@ -76,66 +73,6 @@ def test_batches_equal_published_messages(subscription: nedbus.Subscription[Any]
     assert sum(batch.lost for batch in batches) == 0
 
 
-@pytest.mark.parametrize("whole_bus", [False, True])
-def test_lossless_close_waits_for_readers(
-    subscription: nedbus.Subscription[Any], bus: nedbus.Bus, whole_bus: bool
-) -> None:
-    """A lossless publisher, or its bus, closes only once a paused reader has received all messages."""
-    count = 3 * WINDOW
-    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
-    wait_for_subscriber(publisher)
-
-    def send() -> None:
-        publisher.publish_many(numbered(count))
-        (bus if whole_bus else publisher).close()
-
-    sending = threading.Thread(target=send)
-    sending.start()
-    sending.join(0.2)
-    assert sending.is_alive()
-    assert receive_timestamps(subscription, count) == list(range(1, count + 1))
-    sending.join(DEADLINE)
-    assert not sending.is_alive()
-    assert subscription.counts == nedbus.Counts(received=count)
-
-
-@pytest.mark.parametrize("fails", [True, False])
-def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
-    """A `with` block that ends with an exception closes without a flush; otherwise it flushes, with either client."""
-    flushed: list[nedbus.Publisher] = []
-
-    def flush(publisher: nedbus.Publisher, *_: float) -> bool:
-        flushed.append(publisher)
-        return True
-
-    monkeypatch.setattr(nedbus.Publisher, "flush", flush)
-    client.publisher(VLP, vehicle="1", lossless=True)
-    client.__exit__(*((KeyError, KeyError(), None) if fails else (None, None, None)))  # the end of a `with` block
-    assert bool(flushed) is not fails
-
-
-def test_lossless_publisher_loses_nothing_in_a_router_restart() -> None:
-    """Without a router, a lossless publisher sends no more than its history cache, and continues with its reader."""
-    endpoint, count = free_endpoint(), CACHE + 1000
-    router = open_router(listen=(endpoint,))
-    with nedbus.connect(endpoint) as other, nedbus.connect(endpoint) as bus:
-        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
-        publish(publisher, 1)
-        subscription = other.subscribe(VLP, mode="every")
-        assert receive_timestamps(subscription, 1) == [1]
-        router.close()
-        wait_for(lambda: not bus.connected and not other.connected, what="the loss of the link")
-        sending = threading.Thread(target=publisher.publish_many, args=[numbered(count - 1, first=2)], daemon=True)
-        sending.start()
-        wait_for(lambda: publisher.published > WINDOW, what="a window of messages")
-        router = open_router(listen=(endpoint,))
-        assert receive_timestamps(subscription, count - 1) == list(range(2, count + 1))
-        sending.join(DEADLINE)
-        assert publisher.flush()
-        assert subscription.counts == nedbus.Counts(received=count)
-    router.close()
-
-
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
 def test_batch_decodes_unusual_payloads(bus: nedbus.Bus, raw: Session, filler: int) -> None:
     """Payloads of other encoders or older layouts are in a batch; invalid payloads and keys are counted as invalid."""
@@ -178,35 +115,6 @@ def test_batch_of_mode_latest_has_newest_messages(bus: nedbus.Bus) -> None:
             newest[address.vehicle] = int(batch.messages["timestamp"][index])
         if newest == {"a": 199, "b": 199}:
             break
-
-
-@pytest.mark.parametrize("method", ["publish", "publish_row", "publish_many"])
-def test_every_publish_method_raises_for_invalid_messages(client: nedbus.Bus, method: str) -> None:
-    """Every publish method of either client raises InvalidMessageError for an invalid message, and sends nothing."""
-    publisher = client.publisher(VLP, vehicle="1")
-    fields = {**message(1).model_dump(), "eph": -1.0}
-    given: dict[str, object] = {
-        "publish": fields,
-        "publish_row": tuple(fields.values()),
-        "publish_many": to_array([message(1), VehicleLocalPosition.model_construct(**fields)]),
-    }
-    with pytest.raises(nedbus.InvalidMessageError, match=r"eph: must not be negative \(is -1.0\)") as info:
-        getattr(publisher, method)(given[method])
-    assert isinstance(info.value, nedbus.NedbusError)
-    assert ("at index 1:" in str(info.value)) is (method == "publish_many")
-    assert publisher.published == 0
-
-
-def test_publish_many_with_invalid_arguments_sends_nothing(bus: nedbus.Bus) -> None:
-    """Another dtype raises TypeError, an empty array sends nothing, and a closed publisher raises ClosedError."""
-    publisher = bus.publisher(VLP, vehicle="1")
-    with pytest.raises(TypeError, match="astype"):
-        publisher.publish_many(np.zeros(3, [("x", "f4")]))
-    publisher.publish_many(np.empty(0, DTYPE))
-    publisher.close()
-    with pytest.raises(nedbus.ClosedError):
-        publisher.publish_many(numbered(1))
-    assert publisher.published == 0
 
 
 def test_async_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
