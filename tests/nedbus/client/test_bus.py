@@ -178,7 +178,7 @@ def test_vehicles_are_listed_again_after_an_overflow(
 def test_vehicles_beyond_the_limit_are_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A list with fewer vehicles than exist is incomplete and logged once, and complete once they fit."""
+    """A list truncated at the limit is incomplete, which is logged once; it is complete once all vehicles fit."""
     monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
@@ -352,7 +352,7 @@ def test_published_fields_are_validated(client: nedbus.Bus, bus: nedbus.Bus) -> 
 
 
 def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Fields without a timestamp get the time since boot [us], as PX4's messages have; it does not count as missing."""
+    """Fields without a timestamp get the time since boot [us], like PX4's messages; it does not count as missing."""
     publisher, before = client.publisher(VLP, vehicle="1"), time.monotonic_ns() // 1000
     publisher.publish({"x": 2.0})
     wait_for(bus.latest, what="the message")

@@ -120,7 +120,7 @@ def test_cancelled_connect_leaves_no_thread() -> None:
     assert not errors
 
 
-def test_endpoint_from_a_list_or_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connect_uses_first_answering_endpoint_or_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of several endpoints that answers is used; NEDBUS_CONNECT is used by scripts without an endpoint."""
     with nedbus.connect([free_endpoint(), endpoint]) as bus:
         assert bus.connected
@@ -292,7 +292,7 @@ def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_garbage_collection_closes_on_the_closer_thread() -> None:
-    """Garbage is collected on any thread with any lock held, so collected objects are closed on the closer thread."""
+    """Garbage collection may run on a thread that holds a lock, so it leaves closing to the closer thread."""
     lock = threading.Lock()
     closed: list[threading.Thread] = []
 
@@ -303,7 +303,7 @@ def test_garbage_collection_closes_on_the_closer_thread() -> None:
 
     queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
     subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, owner=None)
-    with lock:  # as a thread may hold it during any call
+    with lock:  # a thread may hold it during any call
         del subscription
         gc.collect()  # closing on this thread would be a deadlock
     wait_for(lambda: closed, what="the subscription to be closed")
@@ -312,11 +312,11 @@ def test_garbage_collection_closes_on_the_closer_thread() -> None:
 
 def test_ctrl_c_ends_a_query_without_a_reply(start: Start, endpoint: str, raw: Session) -> None:
     """Ctrl-C ends the wait for a queryable that never replies."""
-    kept: list[zenoh.Query] = []
+    queries: list[zenoh.Query] = []
     code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
-    with answering(raw, "nedbus/**", kept.append):
+    with answering(raw, "nedbus/**", queries.append):
         process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
-        wait_for(lambda: kept, what="the query")
+        wait_for(lambda: queries, what="the query")
         process.signal(signal.SIGINT)
         assert process.wait() == -signal.SIGINT, process.err
 

@@ -89,7 +89,7 @@ def test_silent_stream_has_age_but_no_rate() -> None:
         ("battery_status", 2.0, "slow"),
     ],
 )
-def test_stream_on_change_has_no_usual_rate(topic: str, silence: float, state: str) -> None:
+def test_stream_on_change_is_stale_only_below_its_minimum_rate(topic: str, silence: float, state: str) -> None:
     """A stream published on change is not slow or stale unless it falls below its minimum rate.
 
     It has no gaps. Messages other than positions have neither flags nor resets.
@@ -225,10 +225,10 @@ def test_monitor_is_bounded() -> None:
     for each in flood:
         monitor.add(each)
         monitor.add(real)
-    kept = monitor.snapshot()
-    assert (len(kept), kept[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
-    assert flood[-4095].address in kept
-    assert flood[-4096].address not in kept
+    streams = monitor.snapshot()
+    assert (len(streams), streams[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
+    assert flood[-4095].address in streams
+    assert flood[-4096].address not in streams
     monitor.forget(real.address)
     assert real.address not in monitor.snapshot()
 

@@ -221,9 +221,9 @@ class Simulation:
         request = requests[position % len(requests)]
         run, numbers = self._runs[int(request.publisher.partition(":")[0])], request.numbers
         assert 0 <= numbers.start < numbers.stop <= run.sent
-        kept = [number for number in numbers if run.sent - run.cache <= number]
-        found = [number for bit, number in enumerate(kept) if not missing >> bit & 1]
-        run.given_up |= bool(final) and found != kept
+        cached = [number for number in numbers if run.sent - run.cache <= number]
+        found = [number for bit, number in enumerate(cached) if not missing >> bit & 1]
+        run.given_up |= bool(final) and found != cached
         self._add_arrived((run, number) for number in found)
         self.path.answer(request, [run.sample(number) for number in reversed(found)], final=bool(final))
 

@@ -42,8 +42,8 @@ def test_failed_layout_lookups_back_off() -> None:
     assert len(queried) == len(set(queried)) == 9 * len(payloads)
 
 
-def test_only_requested_layouts_are_kept() -> None:
-    """Of thousands of layouts in a reply, only those requested are kept, up to a limit."""
+def test_only_requested_layouts_are_stored() -> None:
+    """Of thousands of layouts in a reply, only the requested ones are stored, up to a limit."""
     fields = {"timestamp": "uint64", "x": "float32"}
     known: Schemas = {("VehicleLocalPosition", number): fields for number in range(9, 2000)}
     lookup = LayoutLookup(lambda _: known)
@@ -124,7 +124,7 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
 
 
 def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """The fields of all definitions are bounded; those in use are kept, and further ones rejected, logged once.
+    """The fields of all definitions are bounded; further ones are rejected, and logged once.
 
     Definitions no longer in use are evicted, least recently used first.
     """

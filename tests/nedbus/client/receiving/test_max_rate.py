@@ -91,7 +91,7 @@ def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> N
 
 
 def test_last_message_is_received_once() -> None:
-    """The last message passes if it arrives first; downsampled messages up to it and later replies are omitted."""
+    """The last message passes if it arrives first; downsampled messages sent before it and later replies are omitted."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
@@ -130,7 +130,7 @@ def test_steady_stream_passes_evenly() -> None:
 @pytest.mark.parametrize("rate", [0.3, 1, 3, 7, 30, 33, 70, 99, 100])
 @pytest.mark.parametrize("source", [100.0, 103.7, 250.0])
 def test_mean_rate_is_the_requested_rate(rate: float, source: float) -> None:
-    """Even if it does not divide the rate of the stream, the requested rate is met on average."""
+    """The mean rate is the requested one, even if it does not divide the rate of the stream."""
     seconds = 10_000 / source
     assert len(passed(rate, steady(source, seconds))) == pytest.approx(seconds * rate, abs=2)
 

@@ -115,16 +115,16 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogC
 
 
 def test_memory_for_invented_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The state of at most 10,000 keys, here 10, is kept; messages on further keys arrive."""
+    """A reader keeps the state of at most 10,000 keys, here 10; messages on further keys arrive."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_KEYS", 10)
     pending_queue = make_queue("every")
     tracemalloc.start()
     for number in range(2000):
         put(pending_queue, [raw(None, key=f"nedbus/{number}/vehicle_local_position")])
         assert len(drain(pending_queue)) == 1
-    kept, _ = tracemalloc.get_traced_memory()
+    allocated, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert kept < 100_000
+    assert allocated < 100_000
 
 
 def key_of(vehicle: str) -> str:
@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 2,000 vehicles that come and go, eight at a time, those of the last ten minutes stay in memory.
+    """Of 2,000 vehicles that appear and disappear, eight at a time, those of the last ten minutes stay in memory.
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
@@ -196,10 +196,10 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
         vehicles = [str(each) for each in range(max(0, number - 8), number)]
         put(pending_queue, [raw(number, key=key_of(each), publisher=each) for each in vehicles])
         drain(pending_queue)
-    kept = Counter(vehicles_in_memory())
-    assert {"steady", "silent", *map(str, range(1935, 1999))} <= kept.keys()
-    assert len(kept) <= 72
-    assert set(kept.values()) == {2}
+    measured = Counter(vehicles_in_memory())
+    assert {"steady", "silent", *map(str, range(1935, 1999))} <= measured.keys()
+    assert len(measured) <= 72
+    assert set(measured.values()) == {2}
 
 
 def test_loss_of_a_long_outage_is_counted() -> None:
@@ -215,7 +215,7 @@ def test_loss_of_a_long_outage_is_counted() -> None:
     assert pending_queue.counts.lost == 89
 
 
-def test_wait_ends_with_data_wake_end_or_timeout() -> None:
+def test_wait_ends_with_sample_wake_end_or_timeout() -> None:
     """A wait ends with a sample, a call of `wake`, the end of the queue or its timeout."""
     pending_queue = make_queue("every")
     assert not pending_queue.wait(0.0)
@@ -310,19 +310,19 @@ class Encoding(str):
 def test_stream_keeps_no_receive_buffer(mode: Mode) -> None:
     """The encoding of a Zenoh sample keeps its receive buffer alive, so the state of a key has a copy."""
     pending_queue, encoding = make_queue(mode), Encoding(SOURCE)
-    kept = weakref.ref(encoding)
+    reference = weakref.ref(encoding)
     put(pending_queue, [raw(0, encoding=encoding)])
     del encoding
     assert [sample.source for sample in drain(pending_queue)] == ["sim"]
-    assert kept() is None
+    assert reference() is None
 
 
 def test_long_encodings_are_truncated(small: PendingQueue) -> None:
     """Of a long encoding, waiting samples keep at most 512 characters."""
     for number in range(9):
         put(small, [raw(number, encoding=SOURCE + number * 10_000 * "x")])
-    kept = [arrival[2].encoding for arrival in small._every]
-    assert all(len(str(encoding)) <= 512 for encoding in kept[5:])
+    encodings = [arrival[2].encoding for arrival in small._every]
+    assert all(len(str(encoding)) <= 512 for encoding in encodings[5:])
     assert len(drain(small)) == 9
 
 

@@ -117,7 +117,7 @@ def test_batch_of_mode_latest_has_newest_messages(bus: nedbus.Bus) -> None:
             break
 
 
-def test_async_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
+def test_async_subscription_yields_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
     """AsyncSubscription provides rows and batches for `async for`."""
     publisher = bus.publisher(VLP, vehicle="1")
 
@@ -142,7 +142,7 @@ def test_async_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
     assert asyncio.run(read()) == (list(range(1, 101)), 200)
 
 
-def test_receive_batch_with_a_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+def test_receive_batch_raises_no_data_error_on_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
     """`receive_batch` raises NoDataError on timeout; its batch has the provenance of each message."""
     bus.publisher(VLP, vehicle="1", source="test").publish({"timestamp": 7, "x": 1.0})
     subscription = client.subscribe(VLP, mode="every")
