@@ -94,7 +94,7 @@ class StreamStatus:
     health: Health
 
 
-class _FromPeer:
+class _UntrustedReply:
     """Base of untrusted replies: an invalid value becomes the default, and invalid rows of a list are dropped."""
 
     __slots__ = ()
@@ -114,7 +114,7 @@ class _FromPeer:
 
 
 @dataclass(frozen=True, slots=True)
-class LogStreamStatus(_FromPeer):
+class LogStreamStatus(_UntrustedReply):
     """The ULog stream of one vehicle over MAVLink, of a source with `log=`.
 
     `state`: "streaming" while messages are published from the stream; otherwise they are converted from MAVLink.
@@ -159,7 +159,7 @@ class LogStreamStatus(_FromPeer):
 
 
 @dataclass(frozen=True, slots=True)
-class SourceStatus(_FromPeer):
+class SourceStatus(_UntrustedReply):
     """The status of one source.
 
     `state`: starting, waiting, running, retrying, done or failed; empty if not reported.
@@ -201,7 +201,7 @@ class SourceStatus(_FromPeer):
 
 
 @dataclass(frozen=True, slots=True)
-class ServiceStatus(_FromPeer):
+class ServiceStatus(_UntrustedReply):
     """The status of a service, from `bus.services()`.
 
     `service`: its id. `host`: the name of its host or container. `role`: "router" or "client".

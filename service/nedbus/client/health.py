@@ -87,7 +87,7 @@ class Health:
 _FlagCounts = Counter[tuple[str, bool]]  # messages by flag and value; unknown values are not counted
 
 
-def _shares(counts: _FlagCounts) -> dict[str, float]:
+def _flag_shares(counts: _FlagCounts) -> dict[str, float]:
     known = {flag: counts[flag, True] + counts[flag, False] for flag in DOUBT_FLAGS}
     return {flag: counts[flag, True] / total for flag, total in known.items() if total}
 
@@ -215,8 +215,8 @@ class StreamHealth:
             gaps=self._gaps,
             out_of_order=self._out_of_order,
             reboots=self._reboots,
-            flags=_shares(window.flags) if self._is_position and window.messages else None,
-            flags_ever=_shares(self._flags) if self._is_position and self._messages else None,
+            flags=_flag_shares(window.flags) if self._is_position and window.messages else None,
+            flags_ever=_flag_shares(self._flags) if self._is_position and self._messages else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,

@@ -95,7 +95,7 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 def has_downsampling_reader(publisher: nedbus.Publisher) -> bool:
     """Return True if a reader has requested downsampled streams of the publisher's vehicle."""
-    return publisher._downsampler.vehicle.is_matched()  # visible otherwise only once it publishes
+    return publisher._downsampler.vehicle_listener.is_matched()  # visible otherwise only once it publishes
 
 
 def wait_for_downsampling_reader(publisher: nedbus.Publisher) -> None:

@@ -54,24 +54,24 @@ class MatchingListener:
 class Downsampler:
     """Publisher of the downsampled copies of one address; not thread-safe.
 
-    `vehicle`: the listener of all downsampled streams of its vehicle.
+    `listener`: matched by subscribers of any downsampled stream of the vehicle.
     """
 
-    def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
-        self.vehicle, self._heartbeats = vehicle, heartbeats
+    def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, listener: MatchingListener) -> None:
+        self.vehicle_listener, self._heartbeats = listener, heartbeats
         self._key = partial(address.rate_key, prefix=prefix)
         self._topic = get_topic(address.topic)
-        self._any_rate: MatchingListener | None = None
+        self._address_listener: MatchingListener | None = None
         self._streams: list[_Stream] = []
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
-        if self._any_rate is None:
-            if not self.vehicle.is_matched():
+        if self._address_listener is None:
+            if not self.vehicle_listener.is_matched():
                 return
-            self._any_rate = MatchingListener(self._heartbeats.session, self._key(ANY))
+            self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
         now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
-        is_matched = self._any_rate.is_matched()
+        is_matched = self._address_listener.is_matched()
         if is_matched and not self._streams:
             self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES]
         for stream in self._streams:
@@ -82,8 +82,8 @@ class Downsampler:
         """Undeclare all streams and listeners."""
         for stream in self._streams:
             stream.close()
-        if self._any_rate is not None:
-            self._any_rate.close()
+        if self._address_listener is not None:
+            self._address_listener.close()
 
 
 class _Stream:

@@ -137,7 +137,7 @@ class FlowControl:
         self._logged = True
         self._wait(published, _MAX_UNACKNOWLEDGED, read=True, timeout=math.inf)
 
-    def wait(self, published: int, *, timeout: float) -> bool:
+    def wait_for_reception(self, published: int, *, timeout: float) -> bool:
         """Wait until readers have received all messages; return False after `timeout` s. Raises ClosedError."""
         with self._lock:
             if self._request is not None and self._request.read:

@@ -67,7 +67,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
-        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=listener)
+        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
 
     @property
     def published(self) -> int:
@@ -139,7 +139,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
         Raises ClosedError once the bus is closed.
         """
-        return self._flow_control.wait(self.published, timeout=timeout)
+        return self._flow_control.wait_for_reception(self.published, timeout=timeout)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Withdraw the address and free it for another publisher. Idempotent.

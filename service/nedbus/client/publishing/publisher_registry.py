@@ -169,7 +169,7 @@ def _reply_schemas(
     key_of: Callable[[str], str], definitions: Mapping[tuple[str, str], Definition[Any]], query: zenoh.Query
 ) -> None:
     """Reply with the schemas of the queried messages, or only with the one whose hash the query names."""
-    wanted = query.parameters.get("hash")
+    requested = query.parameters.get("hash")
     for (name, short), definition in tuple(definitions.items()):
-        if wanted in (None, short) and query.key_expr.intersects(key_of(name)):
+        if requested in (None, short) and query.key_expr.intersects(key_of(name)):
             query.reply(key_of(name), json.dumps({**definition.schema(), "hash": short}), encoding=JSON)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
-_MAX_WARNED: Final = 100  # keys with a logged warning about invalid messages
+_MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
 _MAX_ENCODING: Final = 512  # characters kept of an encoding; those of nedbus have 250 at most
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
@@ -158,10 +158,10 @@ class Decoder:
         """Count an invalid sample and log the reason once per key, for the first 100 keys only."""
         with self._counting:
             self.invalid += 1
-            if len(self._warned) >= _MAX_WARNED or hash(key) in self._warned:
+            if len(self._warned) >= _MAX_LOGGED_KEYS or hash(key) in self._warned:
                 return
             self._warned.add(hash(key))
-            last = "; further keys are only counted" if len(self._warned) == _MAX_WARNED else ""
+            last = "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
         reason = str(error)[:_MAX_TEXT]
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)

@@ -36,8 +36,8 @@ _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
 _BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait for longer
 
 # Message name, and number of a newer layout or, for a message not installed here, hash of its definition.
-Wanted = tuple[str, int | str]
-Schemas = Mapping[Wanted, Mapping[str, str]]  # definitions from publishers: field types by name
+SchemaId = tuple[str, int | str]
+Schemas = Mapping[SchemaId, Mapping[str, str]]  # definitions from publishers: field types by name
 
 
 class LayoutLookup:
@@ -48,19 +48,19 @@ class LayoutLookup:
     """
 
     def __init__(
-        self, find: Callable[[Collection[Wanted]], Schemas], *, now: Callable[[], float] = time.monotonic
+        self, find: Callable[[Collection[SchemaId]], Schemas], *, now: Callable[[], float] = time.monotonic
     ) -> None:
         self._find = find
         self._now = now
         self._newer: dict[str, dict[int, Sequence[str]]] = {}
-        self._codecs: dict[Wanted, Codec[Any]] = {}
-        self._used: dict[Wanted, float] = {}  # monotonic time of the last use of each codec [s]
+        self._codecs: dict[SchemaId, Codec[Any]] = {}
+        self._used: dict[SchemaId, float] = {}  # monotonic time of the last use of each codec [s]
         self._full = False
         self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
-        self._open: dict[Wanted, object] = {}  # with the publisher; the queried ones first
-        self._failed: dict[Wanted, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
+        self._open: dict[SchemaId, object] = {}  # with the publisher; the queried ones first
+        self._failed: dict[SchemaId, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
         self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last futile wait
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
@@ -73,15 +73,15 @@ class LayoutLookup:
         `publisher`: after a failed lookup, one for another publisher starts at once, without backoff.
         `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
         """
-        wanted = name, identity
-        codec = self._codecs.get(wanted)
+        schema_id = name, identity
+        codec = self._codecs.get(schema_id)
         if codec is None:
-            self._request(wanted, publisher)
+            self._request(schema_id, publisher)
             if wait:
-                self.wait(wanted)
-                codec = self._codecs.get(wanted)
+                self.wait(schema_id)
+                codec = self._codecs.get(schema_id)
         if codec is not None:
-            self._used[wanted] = self._now()
+            self._used[schema_id] = self._now()
         return codec
 
     def check(self, codec: Codec[Any], payload: bytes) -> None:
@@ -94,15 +94,15 @@ class LayoutLookup:
                 self._request((name, exc.layout))
             raise
 
-    def wait(self, wanted: Wanted | None = None) -> None:
+    def wait(self, schema_id: SchemaId | None = None) -> None:
         """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
         with self._changed:
             start = time.monotonic()
             longest = TIMINGS.definition_timeout
             budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
-            is_pending = self._open.__len__ if wanted is None else partial(self._open.__contains__, wanted)
-            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if wanted is None else budget)
-            if wanted is not None and wanted not in self._codecs:
+            is_pending = self._open.__len__ if schema_id is None else partial(self._open.__contains__, schema_id)
+            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if schema_id is None else budget)
+            if schema_id is not None and schema_id not in self._codecs:
                 self._budget_time = time.monotonic()
                 self._wait_budget = max(0.0, budget - (self._budget_time - start))
 
@@ -115,14 +115,14 @@ class LayoutLookup:
         if thread is not None:
             join_thread(thread, TIMINGS.definition_timeout)
 
-    def _request(self, wanted: Wanted, publisher: object = None) -> None:
+    def _request(self, schema_id: SchemaId, publisher: object = None) -> None:
         with self._changed:
-            _, due, failed = self._failed.get(wanted, (0, float("-inf"), None))
+            _, due, failed = self._failed.get(schema_id, (0, float("-inf"), None))
             is_due = self._now() >= due or publisher != failed
-            is_known = wanted in self._codecs or wanted[1] in self._newer.get(wanted[0], ())
+            is_known = schema_id in self._codecs or schema_id[1] in self._newer.get(schema_id[0], ())
             if self._closed or is_known or not is_due or len(self._open) >= 2 * _MAX_UNKNOWN:
                 return
-            self._open[wanted] = publisher
+            self._open[schema_id] = publisher
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="nedbus-layouts", daemon=True)
                 self._thread.start()
@@ -134,32 +134,32 @@ class LayoutLookup:
                     self._thread = None
                     return
                 queried = dict(islice(self._open.items(), _MAX_UNKNOWN))
-            added: list[Wanted] = []
+            added: list[SchemaId] = []
             try:
                 with suppress(NedbusError):  # the session is closed
                     found = self._find(queried)
-                    added = [wanted for wanted in queried if wanted in found and self._add(wanted, found[wanted])]
+                    added = [each for each in queried if each in found and self._add(each, found[each])]
             finally:
                 self._finish_query(queried, added)
 
-    def _finish_query(self, queried: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
+    def _finish_query(self, queried: Mapping[SchemaId, object], added: Collection[SchemaId]) -> None:
         with self._changed:
-            for wanted, queried_publisher in queried.items():
-                publisher = self._open.pop(wanted)
-                failures = self._failed.pop(wanted, (0,))[0]
-                if wanted not in added and publisher != queried_publisher:
-                    self._open[wanted] = publisher  # this publisher may have appeared after the query
-                elif wanted not in added:
+            for schema_id, queried_publisher in queried.items():
+                publisher = self._open.pop(schema_id)
+                failures = self._failed.pop(schema_id, (0,))[0]
+                if schema_id not in added and publisher != queried_publisher:
+                    self._open[schema_id] = publisher  # this publisher may have appeared after the query
+                elif schema_id not in added:
                     pause = _PAUSES[min(failures, len(_PAUSES) - 1)]
-                    self._failed[wanted] = failures + 1, self._now() + pause, publisher
+                    self._failed[schema_id] = failures + 1, self._now() + pause, publisher
             while len(self._failed) > _MAX_FAILED:
                 del self._failed[next(iter(self._failed))]
             self._changed.notify_all()
             if not added:
                 self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
 
-    def _add(self, wanted: Wanted, fields: Mapping[str, str]) -> bool:
-        name, which = wanted
+    def _add(self, schema_id: SchemaId, fields: Mapping[str, str]) -> bool:
+        name, which = schema_id
         return self._add_layout(name, which, fields) if isinstance(which, int) else self._define(name, which, fields)
 
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
@@ -181,12 +181,12 @@ class LayoutLookup:
     def _evict(self, size: int) -> bool:
         """Evict unused definitions, least recently used first; return False if that frees too little."""
         known = sorted(self._codecs, key=self._used.__getitem__)
-        free = _MAX_FIELDS - sum(len(self._codecs[wanted].definition.types) + _BASE for wanted in known)
-        for wanted in known:
-            if free >= size or self._now() - self._used[wanted] < _IN_USE:
+        free = _MAX_FIELDS - sum(len(self._codecs[schema_id].definition.types) + _BASE for schema_id in known)
+        for schema_id in known:
+            if free >= size or self._now() - self._used[schema_id] < _IN_USE:
                 break
-            free += len(self._codecs.pop(wanted).definition.types) + _BASE
-            del self._used[wanted]
+            free += len(self._codecs.pop(schema_id).definition.types) + _BASE
+            del self._used[schema_id]
         return free >= size
 
     def _add_layout(self, name: str, number: int, fields: Mapping[str, str]) -> bool:
@@ -215,14 +215,14 @@ class _Layout:
 _LAYOUT: Final = TypeAdapter(_Layout)
 
 
-def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
+def find_schemas(ids: Collection[SchemaId], *, session: Session, prefix: str) -> Schemas:
     """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
 
     Returns once all are found, without waiting for stopped publishers or bad links.
     """
-    found: dict[Wanted, dict[str, str]] = {}
+    found: dict[SchemaId, dict[str, str]] = {}
     keys = {
-        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
+        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in ids
     }
     queries = [ask(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
     replies = islice(wait_for_answers(queries), MAX_ANSWERS)
@@ -236,8 +236,8 @@ def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -
                 # Compute the hash from the fields: the peer's own `hash` is untrusted.
                 types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
                 which = short_hash(name, types) if types else parsed.wire
-                if len(fields) == len(parsed.fields) and (name, which) in wanted:
+                if len(fields) == len(parsed.fields) and (name, which) in ids:
                     found.setdefault((name, which), fields)
-        if len(found) == len(wanted):
+        if len(found) == len(ids):
             break
     return found

@@ -138,7 +138,7 @@ class PendingQueue:
         if self._ack_requests:
             self.acknowledge(drained=True)
 
-    def on_link(self) -> None:
+    def on_link_change(self) -> None:
         """Handle a link that broke or came back."""
         with self._lock:
             self._settling_until = self._clock() + _SETTLING
@@ -288,7 +288,7 @@ class PendingQueue:
         if request.read_target is None:
             stream = self._streams.get(request.key)
             writer = stream and stream.writers.get(request.publisher)
-            if writer.has(request.number) if writer else drained and not self._settling:
+            if writer.is_settled(request.number) if writer else drained and not self._settling:
                 request.read_target = self._arrived if request.read else 0
         return self.ended or (request.read_target is not None and self._arrived - self.waiting >= request.read_target)
 

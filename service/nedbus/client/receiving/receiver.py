@@ -200,7 +200,7 @@ class Receiver:
             return
         try:
             while self._take_link() is not None:
-                self._queue.on_link()
+                self._queue.on_link_change()
             while (query := self._take_query()) is not None:
                 self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
                 key, get = str(query.key_expr), query.parameters.get

@@ -148,7 +148,7 @@ class WriterProxy:
             self._count_gap(min(self.held, default=self.request.stop))
             self._release()
 
-    def has(self, number: int) -> bool:
+    def is_settled(self, number: int) -> bool:
         """Return True if this message has arrived or counts as lost."""
         return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 

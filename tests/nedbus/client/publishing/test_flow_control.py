@@ -259,7 +259,7 @@ def test_closed_session_ends_the_wait(session: FakeSession, control: FlowControl
 def test_flush_waits_for_reception_only(session: FakeSession, control: FlowControl) -> None:
     """A flush waits until readers have received all messages, not until they have read them."""
     session.readers.append(Reader("slow", rate=0.0))
-    assert control.wait(100, timeout=5.0)
+    assert control.wait_for_reception(100, timeout=5.0)
     assert session.requests == [{"publisher": "p:1", "number": "99", "read": "0"}]
     assert session.now < 1.0
 
@@ -268,22 +268,22 @@ def test_flush_returns_false_on_timeout(session: FakeSession, control: FlowContr
     """A flush returns False if a connected reader does not reply, and True once it does."""
     reader = Reader("stopped", stopped=0.0)
     session.readers.append(reader)
-    assert not control.wait(100, timeout=2.0)
+    assert not control.wait_for_reception(100, timeout=2.0)
     assert session.now == pytest.approx(2.0, abs=0.02)
     reader.stopped = None
-    assert control.wait(100, timeout=15.0)
+    assert control.wait_for_reception(100, timeout=15.0)
 
 
 def test_each_flush_sends_a_new_request(session: FakeSession, control: FlowControl) -> None:
     """Each flush sends a new request, because there may be new readers; without messages it returns at once."""
-    assert control.wait(0, timeout=5.0)
+    assert control.wait_for_reception(0, timeout=5.0)
     assert session.requests == []
     session.publish(control, 250)
     session.advance(1.0)
-    assert control.wait(250, timeout=5.0)
+    assert control.wait_for_reception(250, timeout=5.0)
     assert len(session.requests) == 2
     session.readers.append(Reader("new", stopped=session.now))
-    assert not control.wait(250, timeout=2.0)
+    assert not control.wait_for_reception(250, timeout=2.0)
 
 
 def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowControl) -> None:
@@ -292,14 +292,14 @@ def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowContro
     session.readers += [ended, away]
     session.schedule(0.1, lambda: setattr(ended, "closed", True))
     session.schedule(0.1, lambda: setattr(ended, "stopped", None))
-    assert control.wait(200, timeout=5.0)
+    assert control.wait_for_reception(200, timeout=5.0)
     assert session.now < 0.2
     session.restart_router(away, 0.0, until=math.inf)
-    assert control.wait(300, timeout=60.0)
+    assert control.wait_for_reception(300, timeout=60.0)
     assert session.now == pytest.approx(6.0, abs=0.5)
 
 
 def test_acknowledged_number_wraps(session: FakeSession, control: FlowControl) -> None:
     """Message numbers wrap after 2^32, both at the reader and at the publisher."""
-    assert control.wait(2**32 + 1, timeout=1.0)
+    assert control.wait_for_reception(2**32 + 1, timeout=1.0)
     assert session.requests[-1]["number"] == "0"

@@ -80,7 +80,7 @@ class QueueReceivePath(PendingQueue):
 
     def link(self, *, broken: bool) -> None:
         if broken:
-            self.on_link()
+            self.on_link_change()
         else:
             self._since_link += 60.0
 

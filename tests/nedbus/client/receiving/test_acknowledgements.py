@@ -121,7 +121,7 @@ def test_unknown_publisher_is_acknowledged_after_receiving(reader: Acknowledging
 def test_unknown_publisher_is_not_acknowledged_after_a_link_change(reader: AcknowledgingReader) -> None:
     """After a link change, an unknown publisher may have sent messages, which its heartbeats will reveal."""
     reader.drained = True
-    reader.queue.on_link()
+    reader.queue.on_link_change()
     reader.request(1)
     assert reader.put(raw(0, publisher="b")) == []
     assert reader.put(raw(0), raw(1)) == ["1"]

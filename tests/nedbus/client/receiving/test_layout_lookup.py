@@ -12,7 +12,7 @@ import pytest
 
 import nedbus
 from nedbus.client.receiving import LayoutLookup, layout_lookup
-from nedbus.client.receiving.layout_lookup import Schemas, Wanted
+from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
 from nedbus_msgs import DEFAULT, codec_of
 from tests.waits import DEADLINE, wait_for
 
@@ -27,11 +27,11 @@ def look_up(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
 
 def test_failed_layout_lookups_back_off() -> None:
     """A failed lookup of a layout is repeated after growing intervals, because its publisher may start later."""
-    now, queried = 0.0, list[tuple[float, Wanted]]()
+    now, queried = 0.0, list[tuple[float, SchemaId]]()
     payloads = [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
 
-    def find(wanted: Collection[Wanted]) -> Schemas:
-        queried.extend((now, each) for each in wanted)
+    def find(schema_ids: Collection[SchemaId]) -> Schemas:
+        queried.extend((now, each) for each in schema_ids)
         return {}
 
     lookup = LayoutLookup(find, now=lambda: now)
@@ -65,7 +65,7 @@ def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
     """A check on the receiving thread starts a lookup without waiting for it; closing waits for the open one."""
     queried, answering = threading.Event(), threading.Event()
 
-    def find(_: Collection[Wanted]) -> Schemas:
+    def find(_: Collection[SchemaId]) -> Schemas:
         queried.set()
         answering.wait(DEADLINE)
         return {("VehicleLocalPosition", 9): {"timestamp": "uint64", "x": "float32"}}
@@ -85,12 +85,12 @@ def test_requests_during_a_lookup_are_queried_next() -> None:
 
     A definition in the first reply is not looked up again, even if more of its messages have arrived.
     """
-    answering, queried = threading.Event(), list[set[Wanted]]()
+    answering, queried = threading.Event(), list[set[SchemaId]]()
 
-    def find(wanted: Collection[Wanted]) -> Schemas:
-        queried.append(set(wanted))
+    def find(schema_ids: Collection[SchemaId]) -> Schemas:
+        queried.append(set(schema_ids))
         answering.wait(DEADLINE)
-        return {each: {"timestamp": "uint64", "x": "float32"} for each in wanted}
+        return {each: {"timestamp": "uint64", "x": "float32"} for each in schema_ids}
 
     lookup = LayoutLookup(find)
     for name in ("First", "First", "Second"):
@@ -108,8 +108,8 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
     Definitions of other peers are found, and memory for failed lookups is bounded.
     """
 
-    def find(wanted: Collection[Wanted]) -> Schemas:
-        return {each: {"timestamp": "uint64"} for each in wanted if each[0] == "Honest"}
+    def find(schema_ids: Collection[SchemaId]) -> Schemas:
+        return {each: {"timestamp": "uint64"} for each in schema_ids if each[0] == "Honest"}
 
     lookup = LayoutLookup(find)
     lookup._wait_budget, lookup._budget_time = 0.0, time.monotonic()  # the state after 3 s of futile waits
@@ -130,7 +130,7 @@ def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, capl
     """
     now = 0.0
     monkeypatch.setattr(layout_lookup, "_MAX_FIELDS", 10 * (1 + layout_lookup._BASE))
-    lookup = LayoutLookup(lambda wanted: {each: {"timestamp": "uint64"} for each in wanted}, now=lambda: now)
+    lookup = LayoutLookup(lambda schema_ids: {each: {"timestamp": "uint64"} for each in schema_ids}, now=lambda: now)
     known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
     assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
     assert lookup.codec("Honest", "0") is known[0]

@@ -91,7 +91,7 @@ def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> N
 
 
 def test_last_message_is_received_once() -> None:
-    """The last message passes if it arrives first; downsampled messages sent before it and later replies are omitted."""
+    """The last message passes if it arrives first; earlier downsampled messages and later replies are omitted."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])

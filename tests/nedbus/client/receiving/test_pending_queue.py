@@ -16,7 +16,7 @@ from nedbus import Batch, Counts, Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
 from nedbus.client.receiving import pending_queue as module
 from nedbus.client.receiving.decoder import KeyState
-from nedbus.client.receiving.layout_lookup import Schemas, Wanted
+from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.timings import Timings
@@ -387,7 +387,7 @@ def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -
     timings.definition_timeout = DEADLINE
     queried, answered = threading.Event(), threading.Event()
 
-    def find(_: Collection[Wanted]) -> Schemas:
+    def find(_: Collection[SchemaId]) -> Schemas:
         queried.set()
         answered.wait(DEADLINE)
         return {}
