@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKey
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from nedbus import clock
+from nedbus.atomic_write import atomic_write
 from nedbus.errors import PkiError
-from nedbus.whole_file import whole_file
 
 from .certificate import DAYS, MAX_NAME, Certificate
 
@@ -179,10 +179,10 @@ def _write_files(
     written = {path: item for path, item in items.items() if item is not None}
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as opened:
-            parts = [opened.enter_context(whole_file(path, replace=replace)) for path in written]
-            for part, item in zip(parts, written.values(), strict=True):
-                write_new(part, item)
+        with ExitStack() as stack:
+            temporary = [stack.enter_context(atomic_write(path, replace=replace)) for path in written]
+            for path, item in zip(temporary, written.values(), strict=True):
+                write_new(path, item)
     except FileExistsError as exc:
         reason = "move it away, or choose another folder or name"
         raise PkiError(f"{exc.filename} exists and is not overwritten: {reason}") from exc
