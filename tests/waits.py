@@ -12,7 +12,7 @@ from typing import cast
 import zenoh
 
 from nedbus.timings import TIMINGS, Timings
-from nedbus.transport import Session, alive_keys
+from nedbus.transport import Session, token_keys
 
 DEADLINE = 30.0
 """Seconds that a test waits for a condition before it fails."""
@@ -35,7 +35,7 @@ def wait_for_reader(raw: Session, key: str) -> None:
 
 def wait_for_router(raw: Session) -> None:
     """Wait until the router knows what a session has declared: it answers in the order in which it is told."""
-    alive_keys(raw, "nowhere", timeout=DEADLINE)
+    token_keys(raw, "nowhere", timeout=DEADLINE)
 
 
 @contextmanager

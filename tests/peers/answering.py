@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from nedbus.transport import Session, alive_keys
+from nedbus.transport import Session, token_keys
 from tests.waits import DEADLINE
 
 
@@ -16,7 +16,7 @@ from tests.waits import DEADLINE
 def answering(session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]) -> Iterator[None]:
     """Let a peer answer what is asked for on these keys, which its router knows from the beginning."""
     queryable = session.declare_queryable(key_expr, zenoh.handlers.Callback(reply, indirect=False))
-    alive_keys(session, "nedbus/*/@alive/*/**", timeout=DEADLINE)  # who answers has noted what was declared before
+    token_keys(session, "nedbus/*/@alive/*/**", timeout=DEADLINE)  # who answers has noted what was declared before
     yield
     queryable.undeclare()
 

@@ -41,7 +41,7 @@ class Lossy:
     def ask(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
         self.asked.append((key, numbers.start, numbers.stop))
         if len(self.asked) <= self.unanswered:
-            return SimpleNamespace(ended=True, take=dict)
+            return SimpleNamespace(ended=True, poll=dict)
         self.open += 1
         self.most = max(self.most, self.open)
         return Counted(RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self)
@@ -54,8 +54,8 @@ class Counted:
         self._answers = answers
         self._lossy = lossy
 
-    def take(self) -> dict[int, RawSample]:
-        was, taken = self._answers.ended, self._answers.take()
+    def poll(self) -> dict[int, RawSample]:
+        was, taken = self._answers.ended, self._answers.poll()
         self._lossy.open -= self._answers.ended and not was
         return taken
 

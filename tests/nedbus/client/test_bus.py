@@ -24,7 +24,7 @@ import zenoh
 import nedbus
 from nedbus import Mode
 from nedbus.timings import Timings
-from nedbus.transport import Session, alive_tokens, open_router
+from nedbus.transport import Session, liveliness, open_router
 from nedbus.transport.queries import Replies
 from nedbus_msgs import DEFAULT, Address
 from tests.flights.local_position import encode
@@ -144,8 +144,8 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
         asked.extend([key_expr] if "*" in key_expr else [])
         return query_tokens(session, key_expr, timeout)
 
-    query_tokens = alive_tokens._query_tokens
-    monkeypatch.setattr(alive_tokens, "_query_tokens", record_query)
+    query_tokens = liveliness._query_tokens
+    monkeypatch.setattr(liveliness, "_query_tokens", record_query)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
             other.publisher("estimator_local_position", vehicle=vehicle, instance=2)
@@ -161,7 +161,7 @@ def test_more_vehicles_appear_between_calls_than_are_kept(
     endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After an overflow all tokens are listed again: the list is complete and has no vehicles that left."""
-    monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 20)
+    monkeypatch.setattr(liveliness, "_MAX_CHANGES", 20)
     gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
     gone.undeclare()
@@ -177,7 +177,7 @@ def test_vehicles_beyond_the_limit_are_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Two of three are an incomplete list, which is logged once; it completes once there is room."""
-    monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 2)
+    monkeypatch.setattr(liveliness, "MAX_REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with nedbus.connect(endpoint) as other:
