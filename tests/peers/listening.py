@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from typing import Self, cast
 
 import nedbus
-from nedbus.sources import Absence, LiveSource, Rejection, SourceMessage, parse_source
+from nedbus.sources import LiveSource, Rejection, SourceMessage, UnavailableTopics, parse_source
 from nedbus.transport import Session
 from tests.waits import DEADLINE
 
@@ -18,10 +18,10 @@ class Listener:
     def __init__(self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None) -> None:
         source = parse_source(text).open_source(vehicle="1", routers=routers)
         assert isinstance(source, LiveSource)
-        self._events = cast("Generator[SourceMessage | Rejection | Absence | None]", source.listen(router))
+        self._events = cast("Generator[SourceMessage | Rejection | UnavailableTopics | None]", source.listen(router))
         self.messages: list[SourceMessage] = []
         self.rejections: list[Rejection] = []
-        self.absence = Absence()
+        self.unavailable = UnavailableTopics()
         self.turn()
 
     @property
@@ -34,8 +34,8 @@ class Listener:
         event = next(self._events)
         if isinstance(event, SourceMessage):
             self.messages.append(event)
-        elif isinstance(event, Absence):
-            self.absence = event
+        elif isinstance(event, UnavailableTopics):
+            self.unavailable = event
         elif event is not None:
             self.rejections.append(event)
 

@@ -1,4 +1,4 @@
-"""Bridges from a bus to ROS 2 nodes and to Foxglove."""
+"""Bridges from a bus to ROS 2 and to Foxglove."""
 
 from typing import TYPE_CHECKING, Final
 

@@ -1,11 +1,11 @@
-"""Foxglove server for live vehicles: all fields for plots, poses and frames for 3D, positions for the map panel.
+"""Foxglove server for live vehicles: all fields for plots, poses and frames for 3D, positions for the Map panel.
 
     /<vehicle>/<topic>     px4_msgs/msg/..., every field
     /<vehicle>/pose        foxglove.PoseInFrame in ENU and FLU, from vehicle_local_position and vehicle_attitude
     /<vehicle>/location    foxglove.LocationFix, while the position is valid and has a global origin
     /tf                    foxglove.FrameTransforms: map -> <vehicle>/local -> <vehicle>
 
-Vehicles with different origins share the frame `map`; its origin is the first global origin of any vehicle.
+Vehicles with different origins share the frame `map`, whose origin is the first global origin of any vehicle.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ class FoxgloveServer:
 
     Fields are encoded only for channels with a subscriber. A slow client misses the oldest messages.
 
-    Raises ListenError when it cannot listen on the address.
+    Raises ListenError if the address is not available.
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
         self._bus = bus
         self._context = foxglove.Context()
         self._fields: dict[tuple[Address, Definition[Any]], foxglove.Channel] = {}
-        # The last message of each stream without a rate, until a client subscribes.
+        # The last message of each stream without a rate, kept until a client subscribes.
         self._unseen: dict[Address, tuple[Message, int]] = {}
-        self._channels: dict[str, tuple[PoseInFrameChannel, LocationFixChannel]] = {}  # of each vehicle
-        self._attitudes: dict[str, Any] = {}  # last message of each vehicle
-        self._map: MapProjection | None = None  # at the first global origin of any vehicle
-        self._altitude = math.nan  # of the first origin that has one
-        self._local_in_map: dict[str, messages.Vector3] = {}  # the last known translation of each vehicle's local frame
+        self._channels: dict[str, tuple[PoseInFrameChannel, LocationFixChannel]] = {}  # by vehicle
+        self._attitudes: dict[str, Any] = {}  # last message by vehicle
+        self._map: MapProjection | None = None  # its origin: the first global origin of any vehicle
+        self._altitude = math.nan  # [m], of the first origin with an altitude
+        self._local_in_map: dict[str, messages.Vector3] = {}  # last known translation of each local frame
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
         except RuntimeError as exc:  # "...: Address already in use (os error 98)"
@@ -71,10 +71,7 @@ class FoxgloveServer:
         self.url = f"ws://{host}:{self._server.port}"
 
     def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
-        """Serve the selected addresses, by default all, until `stop` is set.
-
-        Raises ClosedError when the bus is closed meanwhile.
-        """
+        """Serve the selected addresses, by default all, until `stop` is set; raise ClosedError if the bus is closed."""
         with self._bus.subscribe_to(selection or Selection()) as subscription:
             next_poll = time.monotonic() + TIMINGS.bridge_poll
             while not stop.is_set():
@@ -89,7 +86,7 @@ class FoxgloveServer:
                     continue
 
     def show(self, sample: Sample[Any]) -> None:
-        """Log one sample to the channels of its address and its vehicle."""
+        """Log a sample to the channels of its address and of its vehicle."""
         time_ns = sample.sent or sample.received
         self._show_fields(sample.address, sample.message, time_ns)
         if sample.topic == _ATTITUDE:
@@ -119,7 +116,7 @@ class FoxgloveServer:
             self._unseen.pop(address, None)
             channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
         elif not get_topic(address.topic).rate:
-            self._unseen[address] = message, time_ns  # there may be no further message
+            self._unseen[address] = message, time_ns  # it may be the only message
 
     def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         if vehicle not in self._channels:
@@ -161,7 +158,7 @@ class FoxgloveServer:
             locations.log(fix, log_time=time_ns)
 
     def _locate(self, message: VehicleLocalPosition) -> messages.Vector3:
-        """Return the translation of a local frame with a global origin in the map, in ENU [m]."""
+        """Return the translation from `map` to the local frame of a message with a global origin, in ENU [m]."""
         if self._map is None:
             self._map = MapProjection(message.ref_lat, message.ref_lon)
         if math.isnan(self._altitude) and message.z_global:
@@ -174,7 +171,7 @@ class FoxgloveServer:
         """Close the channels of addresses that are no longer published."""
         published = {address for addresses in self._bus.vehicles().values() for address in addresses}
         if not self._bus.connected:
-            return  # without a link the reply is incomplete
+            return  # without a link the list of vehicles is incomplete
         for address, definition in [stream for stream in self._fields if stream[0] not in published]:
             self._fields.pop((address, definition)).close()
             self._unseen.pop(address, None)
@@ -190,7 +187,7 @@ class FoxgloveServer:
 def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
     """Return the rotation from FLU to ENU as (x, y, z, w).
 
-    Taken from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, facing east.
+    From a VehicleAttitude within 0.5 s of the position, else from the heading; without either, facing east.
     """
     if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
         w, x, y, z = quaternion_ned_to_enu(attitude.q)

@@ -1,4 +1,4 @@
-"""Filter of late samples, by each publisher's own clock; no I/O, and no synchronized clocks needed."""
+"""Filter for late samples that needs no synchronized clocks; no I/O."""
 
 from collections import Counter
 from typing import Any, Final
@@ -8,24 +8,24 @@ from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 
 DRIFT: Final = 60 * 10**9
-"""Nanoseconds for which the fastest sample is the reference: the two clocks drift apart."""
+"""Nanoseconds for which the fastest sample is the reference; limited, as the two clocks drift apart."""
 
 _STALLED: Final = 1000  # ns; timestamps closer together come from a stalled clock
 
 
 class LateFilter:
-    """Pass the current samples of each address, and count the late ones, and retained ones, whose age is unknown."""
+    """Admit current samples; hold back and count late ones, and retained ones, whose age is unknown."""
 
     def __init__(self) -> None:
-        self._clocks: dict[Address, tuple[str, _PublisherClock]] = {}  # and the session that stamps
+        self._clocks: dict[Address, tuple[str, _PublisherClock]] = {}  # id of the publishing session, and its clock
         self._held = Counter[Address]()
-        self._latest = 0  # ns, greatest lateness among these
+        self._latest = 0  # ns, maximum lateness of these
         self._limit = round(1e9 * TIMINGS.lateness)  # ns
 
     def admits(self, sample: Sample[Any], *, arrived: int) -> bool:
-        """Return True if a sample is current or has no timestamp.
+        """Return whether a sample is current; one without a timestamp is.
 
-        `arrived`: arrival time by this host's monotonic clock [ns].
+        `arrived`: arrival time on this host's monotonic clock [ns].
         """
         sent, stamp, address, late = sample.sent, sample.stamp, sample.address, 0
         if sent is None or stamp is None:
@@ -46,7 +46,7 @@ class LateFilter:
         self._clocks.pop(address, None)
 
     def report(self) -> str | None:
-        """Describe the samples held back since the last report; None if there were none."""
+        """Return a summary of the samples held back since the last report, or None."""
         if not self._held:
             return None
         first, *others = sorted(self._held)

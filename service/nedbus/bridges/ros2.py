@@ -1,4 +1,4 @@
-"""Bridge from a bus to ROS 2: CDR over rmw_zenoh, in the message layout of the ROS 2 workspace."""
+"""Bridge from a bus to ROS 2: CDR over rmw_zenoh, in the px4_msgs layout of the ROS 2 workspace."""
 
 import logging
 import os
@@ -39,11 +39,11 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
-_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; publishers keep 20 s for recovery
-_MAX_LEFT_OUT: Final = 1000  # addresses logged as unsupported
+_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; above the 20 s of recovery
+_MAX_LEFT_OUT: Final = 1000  # addresses that are logged as unsupported
 _REFUSALS: Final = {
     "conflict": "%s is not published: %s already uses the topic /%s: set --namespace",
-    "defer": "%s is left to node %s, which already publishes /%s",
+    "defer": "%s is not published: node %s already publishes /%s",
 }  # by action
 
 
@@ -53,11 +53,11 @@ class Ros2Bridge:
     While a vehicle is published, `ros2 topic list` shows its topics as `/fmu/out/<topic>`, prefixed with a namespace
     (see `Ros2Arbiter`). Instances are named `estimator_local_position_0`, `_1` and so on; the first instance of
     `battery_status` and other topics of PX4's default list has no suffix.
-    A topic that another node publishes is left to that node, so a PX4 that speaks Zenoh itself is not published twice.
+    A topic that another node already publishes is not published, for example that of a PX4 with its own Zenoh client.
 
     `selection`: the addresses to publish, by default all; `layout`: a PX4 release or a layout.
-    `hashed=False`: for ROS 2 Humble, whose keys have no type hash.
-    `observer`: a second session at the same router; it detects access control, which denies silently.
+    `hashed`: False for ROS 2 Humble, whose keys have no type hash.
+    `observer`: a second session to the same router, to detect access control, which denies silently.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -82,7 +82,7 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # messages of the workspace
+        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # by topic, as the workspace has them
         for topic, definition in BY_TOPIC.items():
             if found := definition.layout_of_release(layout):
                 type_hash = hash_of(found, ros2_type(definition)) if hashed else transport.NO_HASH
@@ -90,17 +90,16 @@ class Ros2Bridge:
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
-        self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter still knows their clocks
+        self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter keeps their clocks
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
         self._left_out: set[Address] = set()
-        self._held: dict[Address, Sample[Any]] = {}  # last sample of streams without a rate, until published
+        self._held: dict[Address, Sample[Any]] = {}  # last sample of streams without a rate, kept until published
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
 
-        Raises ClosedError when the bus or the session is closed meanwhile, NedbusError when access control hides the
-        bridge from the observer.
+        Raises ClosedError if the bus or the session is closed, NedbusError if access control hides the bridge.
         """
         key = transport.node_token(self._domain, self._zid, self._node)
         with transport.translate_zenoh_errors():
@@ -120,7 +119,7 @@ class Ros2Bridge:
         end = time.monotonic() + TIMINGS.token_visible
         while not stop.is_set() and not transport.token_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
-                end = time.monotonic() + TIMINGS.token_visible  # without a link the token cannot be visible
+                end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
             elif time.monotonic() > end:
                 raise NedbusError(
                     "the router's access control denies the keys of ROS 2, so no ROS 2 node sees this bridge:"
@@ -138,7 +137,7 @@ class Ros2Bridge:
                 sample = subscription.receive(0.1)
             except NoDataError:
                 continue
-            # In a stream without a rate a message stays current until the next one, at any age.
+            # In a stream without a rate, a message is current until the next one.
             has_rate = get_topic(sample.topic).rate > 0
             if has_rate and not self._late_filter.admits(sample, arrived=time.monotonic_ns()):
                 continue
@@ -148,9 +147,9 @@ class Ros2Bridge:
                 self._held[sample.address] = sample
 
     def _poll(self) -> None:
-        """Report late samples, query the addresses of the bus and the nodes of ROS 2, and apply the decisions."""
+        """Report late samples, query the bus and the ROS 2 nodes, and apply the decisions."""
         if held_back := self._late_filter.report():
-            _log.warning("%s: ROS 2 would take them for the current estimate", held_back, extra=about("bridge_late"))
+            _log.warning("%s: ROS 2 nodes would use them as current", held_back, extra=about("bridge_late"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
             self._held.pop(address, None)
@@ -159,7 +158,7 @@ class Ros2Bridge:
         addresses = list(filter(self._is_bridged, published))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
-        nodes, own = dict[transport.TopicKey, str](), self._zid  # other nodes by the topic that they publish
+        nodes, own = dict[transport.TopicKey, str](), self._zid  # other nodes, by the topic they publish
         for text in transport.token_keys(self._session, transport.px4_publishers_key_expr(self._domain), timeout=0.5):
             with suppress(DecodeError):
                 token = transport.PublisherToken.parse(text)
@@ -184,7 +183,7 @@ class Ros2Bridge:
             _log.warning(_REFUSALS[decision.action], address, other, topic, extra=about("conflict", address))
         else:
             self._close(address)
-            # After a router restart the address soon returns, followed by the messages of the outage.
+            # After a router restart the address soon returns, with the messages of the outage.
             self._withdrawn[address] = time.monotonic()
             text = "%s is no longer on the bus: /%s is withdrawn"
             _log.info(text, address, topic, extra=about("withdrawn", address))
@@ -219,7 +218,7 @@ class Ros2Bridge:
         return transport.TopicKey(self._domain, self._arbiter.topic_of(address), name, type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
-        """Return whether an address is selected and the workspace has its message; warn once if it has not."""
+        """Return whether an address is selected and the workspace has its message; log a missing message once."""
         if not self._selection.matches(address):
             return False
         if address.topic in self._types:
@@ -238,7 +237,7 @@ class Ros2Bridge:
 
 @dataclass(slots=True, eq=False)
 class _Ros2Publisher:
-    """One ROS 2 topic: its publisher with gid and sequence number, and its liveliness token."""
+    """A published ROS 2 topic: publisher, gid, last sequence number, and liveliness token."""
 
     gid: bytes
     publisher: zenoh.Publisher

@@ -1,4 +1,4 @@
-"""Arbitration of ROS 2 topics: the addresses to publish and their topic names; no I/O, no clock."""
+"""Arbitration of ROS 2 topics: which addresses to publish, under which names; no I/O, no clock."""
 
 import math
 import re
@@ -29,10 +29,10 @@ class Decision:
 
 
 class Ros2Arbiter:
-    """Decide topic changes from the addresses on the bus and the publishers of other ROS 2 nodes.
+    """Decide which addresses to publish, from those on the bus and the publishers of other ROS 2 nodes.
 
     The topics of every vehicle except "1" have a namespace: the one in `namespaces`, else the vehicle's name, with the
-    prefix `px4_` if it does not start with a letter.
+    prefix `px4_` unless it starts with a letter.
 
     Raises AddressError for a namespace that is invalid in ROS 2.
     """
@@ -43,7 +43,7 @@ class Ros2Arbiter:
                 raise AddressError("namespace", namespace, "a letter, then letters, digits and _, with / between names")
         self._namespaces = {"1": "", **namespaces}
         self._published: dict[Address, str] = {}
-        self._deferred: dict[Address, float] = {}  # time another node's publisher was last seen
+        self._deferred: dict[Address, float] = {}  # when another node's publisher was last seen [s]
         self._conflicts: set[Address] = set()
 
     def topic_of(self, address: Address) -> str:
@@ -59,8 +59,8 @@ class Ros2Arbiter:
     ) -> list[Decision]:
         """Return the changes since the last call.
 
-        `addresses`: those on the bus; `other_nodes`: for addresses whose topic another node publishes, its name.
-        `now`: seconds on any monotonic clock.
+        `addresses`: those on the bus; `other_nodes`: the other node that publishes the topic of an address.
+        `now`: time on any monotonic clock [s].
         """
         present = set(addresses)
         gone = sorted(self._published.keys() - present)

@@ -13,7 +13,7 @@ from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegist
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
+from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
@@ -49,8 +49,8 @@ class SourceOutput:
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
-        self.absence = Absence()  # topics that vehicles advertise but a live source does not deliver
-        self.log_streams: dict[str, LogStreamStatus] = {}  # of a live source, by vehicle
+        self.unavailable = UnavailableTopics()  # topics that vehicles publish and a live source does not deliver now
+        self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
         self._text = text
@@ -223,10 +223,10 @@ class SourceOutput:
             self._account.reject(rejection.address, reason, clock.steady())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
-    def note(self, absence: Absence) -> None:
-        """Store the absent topics of a live source, and log each silent address once."""
-        self.absence = absence
-        if new := [address for address in absence.silent if address not in self._silent]:
+    def note(self, unavailable: UnavailableTopics) -> None:
+        """Store the absent topics of a live source; log each silent address once."""
+        self.unavailable = unavailable
+        if new := [address for address in unavailable.silent if address not in self._silent]:
             self._silent.update(new)
             text = f"advertised, but no message arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))

@@ -12,7 +12,7 @@ from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceS
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage
+from nedbus.sources import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
@@ -26,7 +26,7 @@ _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
 _MAX_STREAMS: Final = 100  # in a status, which must fit into one reply
 
-_Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
+_Item = SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
 
@@ -130,8 +130,8 @@ class Worker:
             warnings=run.warnings if run else output.warnings,
             error=self._error,
             streams=output.streams(max_streams),
-            not_carried=output.absence.not_carried,
-            silent=output.absence.silent,
+            not_carried=output.unavailable.unsupported,
+            silent=output.unavailable.silent,
             log_streams=tuple(output.log_streams.values()),
         )
 
@@ -244,7 +244,7 @@ class Worker:
                     return
                 if isinstance(item, Rejection):
                     self._output.reject(item)
-                elif isinstance(item, Absence):
+                elif isinstance(item, UnavailableTopics):
                     self._output.note(item)
                 elif isinstance(item, LogStreamStatus):
                     self._output.log_streams[item.vehicle] = item

@@ -11,7 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.sources import Link, Senders, open_link, why_ignored
+from nedbus.sources import DuplicateIds, Link, ignore_reason, open_link
 from nedbus.timings import TIMINGS
 
 from .finding import Finding, limit_findings, list_names
@@ -47,7 +47,7 @@ def check_mavlink(link: str) -> Iterator[Finding]:
     yield from limit_findings(
         Finding("mavlink", f"{link} system {system} component {component}", "wrong", fault)
         for (system, component), fault in sorted(faults.items())
-        if system not in systems or not why_ignored(system, component)
+        if system not in systems or not ignore_reason(system, component)
     )
     yield from limit_findings(
         _judge_system(f"{link} system {number}", link, messages, TIMINGS.listen)
@@ -63,7 +63,7 @@ def check_mavlink(link: str) -> Iterator[Finding]:
 def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[int, int], str]]:
     """Return packets by sender, messages by system, and faults by system and component; ask PX4s for SDLOG_BACKEND."""
     faults: dict[tuple[int, int], str] = {}
-    both = Senders()
+    both = DuplicateIds()
     senders: Counter[str] = Counter()
     systems: dict[int, list[Any]] = {}
     end, next_heartbeat, parser = time.monotonic() + seconds, 0.0, None
@@ -85,7 +85,7 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[An
             for message in parser.parse_buffer(data) or []:
                 if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these have no header
                     ids = message.get_srcSystem(), message.get_srcComponent()
-                    ignored = why_ignored(*ids)
+                    ignored = ignore_reason(*ids)
                     if fault := f"ignored: {ignored}" if ignored else both.add(ids[0], peer, now):
                         faults[ids] = fault
                     if ignored:

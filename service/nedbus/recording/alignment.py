@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
-_MAX_ROWS: Final = 10_000_000  # rows of a table resampled at a rate; a damaged timestamp must not exhaust memory
-_STALE: Final = 1_000_000  # us; a message that is older than the start of recording by more was sent before it
-_STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
+_MAX_ROWS: Final = 10_000_000  # rows at a given rate; a damaged timestamp must not exhaust memory
+_STALE: Final = 1_000_000  # us; messages older than this at the start of recording were sent before it
+_STRAY: Final = 0.01  # fraction of messages that may be out of order; a larger one indicates several boots
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
 _Floats = npt.NDArray[np.float64]
@@ -61,7 +61,7 @@ def align(
     """Return several streams of one or several files, or arrays from `read`, as one table, aligned in time.
 
     `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
-    `fields`: the columns besides `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".
+    `fields`: the columns in addition to `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".
     `on`: the rows of the table: the messages of a stream, a rate [Hz], or times on the clock of PX4's `timestamp` [us].
     Columns are `timestamp` [us], and for each stream `<stream>.<field>` and `<stream>.age` [s], the time since the
     message with these values. Before the first message the age is NaN, floats are NaN, and other values 0 or false.
@@ -96,7 +96,7 @@ def align(
         if not found:
             expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
             raise ArgumentError("on", on, expected, problem="is not in this flight")
-        on, *_ = reference = found[:1]  # of the first vehicle that has it
+        on, *_ = reference = found[:1]  # the first vehicle that has it
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
@@ -131,7 +131,7 @@ def align(
 
 
 def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    """Return the columns that these fields select, and the times; raise ArgumentError for an unknown field."""
+    """Return the time columns and those that `fields` selects; raise ArgumentError for an unknown field."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):
         raise ArgumentError("fields", sorted(unknown), f"some of {', '.join(columns)}", problem="are in no stream")
@@ -140,8 +140,8 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
-    """Return for each time the row of its message (-1 for none), the next row, and the fraction of the way to it."""
-    if method == "own" or not len(stamps):  # by index: two messages may share a timestamp
+    """Return for each time the row of its message (-1: none), the next row, and the interpolation weight of that."""
+    if method == "own" or not len(stamps):  # by index, as messages may share a timestamp
         rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
         return rows, rows, np.zeros(len(times))
     order = np.argsort(stamps, kind="stable")
@@ -177,7 +177,7 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
-    """Interpolate linearly, angles the shorter way around: from minus half a period if one is negative, else from 0."""
+    """Interpolate linearly, angles the shorter way, to a range from -period/2 if one is negative, else from 0."""
     with np.errstate(invalid="ignore"):  # infinity minus infinity, and an infinite period
         step = second - first
         turned = first + weight * (step - np.sign(step) * period)
@@ -208,7 +208,7 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
 def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start: int) -> _Ints:
     """Return the given times, or times at the given rate from the first to the last message [us].
 
-    PX4 logs the last message of a topic that is seldom sent with its old time: rows begin at `start` then.
+    The first message may be much older than the recording, as PX4 logs the last one of slow topics: begin at `start`.
     """
     given = np.asarray(on)
     if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):

@@ -1,4 +1,4 @@
-"""Messages of a log or recording as NumPy arrays or data frames, with PX4's own types."""
+"""Messages of a log or recording as NumPy arrays or data frames, with PX4's field types."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _Mask = npt.NDArray[np.bool_]
 Absent = Mapping[str, _Mask]
 """Masks of the messages that lack a field, by field."""
 Streams = dict[str, tuple[MessageArray, Absent]]
-"""The messages of streams, by topic or topic/instance."""
+"""Messages by stream: topic or topic/instance."""
 
 Pandas = Literal["pandas"]
 Polars = Literal["polars"]
@@ -39,7 +39,7 @@ Library = Literal["pandas", "polars"] | None
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
-    """Return the fields that some or all of these messages lack; their values are NaN, false or 0.
+    """Return the fields that some or all of these messages lack, where their values are NaN, false or 0.
 
     `read` stores the names in the metadata of the dtype: slices, masks and copies keep them, `numpy.save` does not.
     """
@@ -48,17 +48,17 @@ def missing_of(messages: MessageArray) -> frozenset[str]:
 
 
 def addresses_of(path: str | Path) -> list[Address]:
-    """Return the addresses in a .ulg log or an .mcap recording; raises the errors of `read`."""
+    """Return the addresses in a .ulg log, an .mcap recording or a .tlog; raises the errors of `read`."""
     with Flight(Path(path).expanduser()) as flight:
         return flight.addresses
 
 
 class Flight(ExitStack):
-    """A .ulg log, an .mcap recording or a .tlog open for reading: its addresses, and the messages of each.
+    """A .ulg log, an .mcap recording or a .tlog open for reading: its addresses and their messages.
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
-    `start`: when recording began, on the clock of the messages' timestamps [us]; of a recording, once it is read.
-    `boot_utc`: Unix time of the boot, as the file has it besides its messages [us]; 0 if unknown.
+    `start`: when recording began, on the clock of the timestamps [us]; for an MCAP file set by `read`.
+    `boot_utc`: Unix time of the boot in the file's metadata [us], 0 if unknown.
 
     Raises SourceError if the file cannot be read.
     """
@@ -67,7 +67,7 @@ class Flight(ExitStack):
         super().__init__()
         self.definitions: dict[Address, Definition[Any]]
         self._file: Any
-        self._payloads = defaultdict[LoggedStream, bytearray](bytearray)  # of a log
+        self._payloads = defaultdict[LoggedStream, bytearray](bytearray)  # of a .ulg log
         self._converted = defaultdict[Address, list[_Decoded]](list)  # of a .tlog
         self._invalid: list[str] = []
         self.start = 0
@@ -75,7 +75,7 @@ class Flight(ExitStack):
             reader = import_optional("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file = self.enter_context(reader)
             self.definitions = {stream.address: stream.definition for stream in reader.counts}
-        elif form == "tlog":  # converted by the source, which is above this package
+        elif form == "tlog":  # imported late: this package is below nedbus.sources
             self._file = import_optional("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
             self.definitions = self._file.definitions
             for address, own in _by_address(self._file.messages()):
@@ -90,7 +90,7 @@ class Flight(ExitStack):
 
     @property
     def warnings(self) -> list[str]:
-        """Damage found and messages left out so far."""
+        """Damage found and messages skipped so far."""
         return [*self._file.warnings, *self._invalid]
 
     @property
@@ -99,7 +99,7 @@ class Flight(ExitStack):
         return bool(self._file.damaged)
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
-        """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
+        """Return the messages of each address, with a mask of the messages that lack a field, by field."""
         found = dict[Address, tuple[MessageArray, Absent]]()
         if isinstance(self._file, UlogReader):
             for address in addresses:
@@ -125,7 +125,7 @@ class Flight(ExitStack):
         return parts
 
     def _valid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
-        """Drop the invalid messages, and store the names of missing fields in the dtype."""
+        """Drop invalid messages, and store the names of missing fields in the dtype."""
         messages, valid, absent = decoded
         if not valid.all():
             self._invalid.append(f"{address.stream}: skipped {np.sum(~valid)} of {len(valid)} messages as invalid")
@@ -147,7 +147,7 @@ def _by_address(messages: Iterator[Any]) -> Iterator[tuple[Address, list[Any]]]:
 
 
 class _Decoded(NamedTuple):
-    """Messages of one definition, with a mask of the valid ones and, by field, of those that lack the field."""
+    """Messages of one definition, a mask of the valid ones, and by field a mask of those that lack it."""
 
     messages: MessageArray
     valid: _Mask
@@ -155,13 +155,13 @@ class _Decoded(NamedTuple):
 
     @classmethod
     def empty(cls, definition: Definition[Any], count: int) -> Self:
-        """Return `count` messages with no field set and none marked valid."""
+        """Return `count` invalid messages without any field set."""
         absent = np.zeros(count, [(name, bool) for name in definition.types])
         return cls(arrays_of(definition).absent(count), np.zeros(count, bool), absent)
 
 
 def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
-    """Decode the messages of a log vectorized; decode those with fields of another type one by one."""
+    """Decode messages of a log, vectorized; those with fields of another type one by one."""
     table: npt.NDArray[np.void] = np.frombuffer(payloads, np.dtype(stream.subscription.layout.dtype))
     definition, columns = stream.definition, {name: table[name] for name in stream.names}
     decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(tuple(columns))
@@ -188,7 +188,7 @@ def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
 
 
 def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> _Decoded:
-    """Decode messages vectorized; decode those that this rejects or cannot handle one by one."""
+    """Decode CDR messages, vectorized; those that this rejects or does not support one by one."""
     arrays = arrays_of(definition)
     decoded = _Decoded.empty(definition, len(chunk))
     by_stream: dict[RecordedStream, list[int]] = {}
@@ -213,7 +213,7 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
 
 
 def _decode_fields(definition: Definition[Any], chunk: Sequence[Any]) -> _Decoded:
-    """Decode messages that have their fields by name."""
+    """Validate messages whose fields are given by name."""
     decoded = _Decoded.empty(definition, len(chunk))
     for index, each in enumerate(chunk):
         with suppress(ValidationError):
@@ -225,7 +225,7 @@ def _decode_fields(definition: Definition[Any], chunk: Sequence[Any]) -> _Decode
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
-    """Convert a structured array to a data frame with nulls for absent fields; for None return it unchanged."""
+    """Convert a structured array to a data frame with nulls for absent fields; without a library return it as is."""
     if library is None:
         return messages
     if library not in ("pandas", "polars"):

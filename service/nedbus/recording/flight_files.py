@@ -1,4 +1,4 @@
-"""Flight files: format by suffix, opening, and selection of streams."""
+"""Flight files: formats by suffix, opening, and selection of streams."""
 
 import re
 from collections import Counter
@@ -10,21 +10,21 @@ from nedbus.errors import AddressError, ConfigError, SourceError
 from nedbus_msgs import Address, Selection
 
 SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap", ".tlog": "tlog"}
-"""The source type that replays a file, by suffix."""
+"""The type of source that replays a file, by suffix."""
 
 _MAX_NAMED: Final = 10  # addresses listed in an error
 _UNREADABLE: Final = {
     b"ULogKey": "an encrypted log: decrypt it with PX4's Tools/decrypt_ulog.py and the private key first",
     b"PK\x03\x04": "a zip archive: unpack it first",
-    b"\x1f\x8b": "compressed by gzip: unpack it first",
-    b"version https://git-lfs": "a pointer of Git LFS in place of the file: fetch the file with 'git lfs pull'",
-    b"SQLite format 3": "a bag in SQLite: convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
+    b"\x1f\x8b": "a gzip file: unpack it first",
+    b"version https://git-lfs": "a Git LFS pointer instead of the file: fetch the file with 'git lfs pull'",
+    b"SQLite format 3": "an SQLite bag: convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
     b"": "an empty file: copy it again, or look for another log of this flight",
 }  # by first bytes
 
 
 def find_format(path: str | PurePath) -> str | None:
-    """Return the format of a flight file, "ulog", "mcap" or "tlog", by its suffix; a folder is a bag of MCAP files."""
+    """Return the format of a flight file by its suffix, "ulog", "mcap" or "tlog", or None; a folder is an MCAP bag."""
     suffix = PurePath(str(path).lower().removesuffix(".zstd")).suffix
     return SUFFIXES.get(suffix) or ("mcap" if Path(path).expanduser().is_dir() else None)
 
@@ -45,7 +45,7 @@ def check_recording(path: Path) -> None:
 
 
 def open_flight(path: Path) -> BinaryIO:
-    """Open a file for reading; raise SourceError if that fails, and for a pipe or folder: a flight is read twice."""
+    """Open a file for reading; raise SourceError if that fails, or for a pipe, which cannot be read twice."""
     try:
         if path.exists() and not path.is_file():
             raise SourceError(str(path), "not a regular file: save the data to a file first")
@@ -57,16 +57,13 @@ def open_flight(path: Path) -> BinaryIO:
 
 
 def recording_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return the MCAP files of a recording, which may be a folder of ROS 2, in order, and the names of missing ones.
-
-    Raises SourceError for a folder without MCAP files.
-    """
+    """Return the MCAP files of a recording or bag folder, in order, and missing ones; raise SourceError without any."""
     if not path.is_dir():
         return [path], []
     found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
     if not found:
         reason = next(filter(None, map(_why_unreadable, sorted(path.glob("*.db3")))), "")
-        raise SourceError(str(path), reason or "no .mcap file is in this folder")
+        raise SourceError(str(path), reason or "no .mcap file in this folder")
     found.sort(key=lambda each: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", each.name)])
     metadata = path / "metadata.yaml"
     text = metadata.read_text(errors="replace") if metadata.exists() else ""
@@ -75,7 +72,7 @@ def recording_files(path: Path) -> tuple[list[Path], list[str]]:
 
 
 def _why_unreadable(path: Path) -> str:
-    """Return what a file is in place of a flight, and what to do; "" if it may be one, or cannot be opened."""
+    """Return why a file is not a flight file, and the remedy; "" if it may be one, or does not exist."""
     if not path.is_file():
         return ""
     with path.open("rb") as file:
@@ -85,7 +82,7 @@ def _why_unreadable(path: Path) -> str:
 
 
 def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict[str, str]]:
-    """Return for each file the names of its vehicles; a vehicle that is in several files is named after its file."""
+    """Map each file's vehicles to unique names; a vehicle that is in several files is named after its file."""
     counts = Counter(vehicle for _, vehicles in flights for vehicle in vehicles)
     taken, found = set(counts), []
     for path, vehicles in flights:
@@ -111,9 +108,9 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
 
 
 def single_match(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
-    """Return the single selected address of a file; raise AddressError if there is none or more than one.
+    """Return the single selected address of a file in a list; raise AddressError for none or more than one.
 
-    Of a topic without a file in nedbus, the first instance has the plain address, and is the one that a topic selects.
+    Of a topic that only the file defines, the first instance has no instance number; the plain topic selects it.
     """
     found = matching(path, addresses, selection)
     plain = [address for address in found if address.instance is None]

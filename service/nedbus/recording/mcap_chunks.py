@@ -1,7 +1,7 @@
-"""MCAP file reader that goes chunk by chunk, and skips and reports damaged parts.
+"""MCAP file reader that reads chunk by chunk, and skips and reports damaged parts.
 
-The summary, which has its own CRC, lists the chunks; without a summary the records are scanned one by one.
-Decompression is bounded in memory; the readers of the `mcap` package have no limit and stop at the first damage.
+The summary, which has its own CRC, lists the chunks; without it the records are scanned one by one. Decompression is
+bounded in memory. The readers of the `mcap` package have no limit and stop at the first damage.
 """
 
 import os
@@ -33,10 +33,10 @@ READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryErro
 """Errors that the mcap package and the decompressors raise for a damaged file."""
 
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
-"""The first bytes of zstd frames."""
+"""Magic number of zstd frames."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
-_SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that a record may be longer than its fields: no other one fits
+_SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that a record may exceed its fields by: too few for another record
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of the compression's name
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 _FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, start of summary and summary offsets, CRC, magic
@@ -53,7 +53,7 @@ _MAX_WARNINGS: Final = 100
 class ChunkFile:
     """An MCAP file open for reading.
 
-    `summary`: the schemas, channels, chunk indexes and statistics of the summary; empty if it is absent or damaged.
+    `summary`: schemas, channels, chunk indexes and statistics; empty if the summary is absent or damaged.
     `warnings`: the damage found so far; `damaged`: True if it cost messages.
 
     Raises SourceError if the file is not MCAP or cannot be opened.
@@ -96,13 +96,13 @@ class ChunkFile:
                 self.warn(f"the chunk {_describe(record, offset)} is damaged: its messages are skipped", lost=True)
 
     def warn(self, warning: str, *, lost: bool = False) -> None:
-        """Add a warning unless it was given before; `lost`: the damage cost messages."""
+        """Add a warning unless it is a duplicate; `lost`: the damage cost messages."""
         self.damaged |= lost
         if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
             self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed")
 
     def _decompress(self, packed: BinaryIO) -> BinaryIO:
-        """Return a temporary file with the contents of a compressed one, up to where that is damaged."""
+        """Return a temporary file with the decompressed contents, up to the first damage."""
         packed.seek(0)
         with packed, ExitStack() as on_error:
             unpacked = on_error.enter_context(TemporaryFile())
@@ -144,7 +144,7 @@ class ChunkFile:
         self._chunks, self.summary = chunks, records
 
     def _follow(self) -> Iterator[tuple[int, int, int]]:
-        """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages outside."""
+        """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages between them."""
         offset, after_chunk = len(MCAP0_MAGIC), False
         while True:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
@@ -156,7 +156,7 @@ class ChunkFile:
                 return
             if opcode in _LENGTHS:
                 return
-            # The index after a chunk has no checksum: one flipped bit makes its opcode that of a message.
+            # The message index after a chunk has no CRC: one flipped bit turns its opcode into that of a message.
             is_index = length == _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length)
             if after_chunk and opcode == Opcode.MESSAGE and is_index:
                 opcode = Opcode.MESSAGE_INDEX
@@ -169,7 +169,7 @@ class ChunkFile:
 
 
 def _own_length(opcode: int, body: bytes, length: int) -> int:
-    """Return the record length implied by its first fields, `length` for record types without length fields."""
+    """Return the record length implied by the lengths of its fields; `length` for types without such fields."""
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:
@@ -202,7 +202,7 @@ def _unpack_chunk(record: bytes) -> bytes:
     body = ReadDataStream(BytesIO(record[_RECORD_HEAD.size :]))
     chunk = Chunk.read(body)
     opcode, length = _RECORD_HEAD.unpack_from(record)
-    if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:  # all zeros would parse as an empty chunk
+    if opcode != Opcode.CHUNK or length - body.count not in _SURPLUS:  # zeros would parse as an empty chunk
         raise ValueError(len(record))
     size, packed = chunk.uncompressed_size, chunk.data
     if size > max(_MAX_SMALL_CHUNK, min(_MAX_CHUNK, _MAX_RATIO * len(packed))):
@@ -220,7 +220,7 @@ def _unpack_chunk(record: bytes) -> bytes:
 
 
 def _describe(chunk: bytes, offset: int) -> str:
-    """Return the byte offset of a chunk and the time range of its messages, as text."""
+    """Return byte offset and time range of a chunk as text."""
     if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
         return f"at byte {offset}"
     start, end, *_ = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)

@@ -1,4 +1,4 @@
-"""Reader of MCAP recordings by nedbus, and of px4_msgs recorded by `ros2 bag record`."""
+"""Reader of MCAP files recorded by nedbus, and of px4_msgs recorded by `ros2 bag record`."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -27,16 +27,16 @@ from nedbus_msgs import (
 from .flight_files import recording_files
 from .mcap_chunks import READ_ERRORS, ZSTD_MAGIC, ChunkFile, records_of
 
-_MAX_PAYLOAD: Final = 2**16  # bytes of a message that the recorder compressed
+_MAX_PAYLOAD: Final = 2**16  # decompressed size of a message compressed by rosbag2
 
-_MAX_DEFINITIONS: Final = 16_000  # fields, or the time of as many: 32 for a message, 1 for 256 characters
+_MAX_DEFINITIONS: Final = 16_000  # cost in fields: a message costs 32 more, 256 characters 1 more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
-    """One channel: its address, the layout of its messages, and the fields its source did not provide.
+    """A channel: its address, the layout of its messages, and the fields that its source did not provide.
 
-    `is_input`: messages to the vehicle, `/fmu/in/...`.
+    `is_input`: True for messages to the vehicle, `/fmu/in/...`.
     """
 
     address: Address
@@ -60,25 +60,25 @@ class RecordedMessage(NamedTuple):
 
 
 class RecordingReader(ExitStack):
-    """An MCAP file, or a folder with the files of one bag, open for reading, one chunk at a time; a context manager.
+    """An MCAP file, or the folder of a bag, open for reading one chunk at a time; a context manager.
 
-    `vehicle`: the vehicle of channels that name none; `counts`: the number of messages per stream.
+    `vehicle`: the vehicle of channels without one; `counts`: the number of messages per stream.
     `warnings`: the damage found, complete after `messages` or `check` has finished.
 
-    Raises SourceError if a file is not MCAP, cannot be opened, or if there is no message of a PX4 topic, with reasons.
+    Raises SourceError if a file is not MCAP, cannot be opened, or has no readable message of a PX4 topic.
     """
 
     def __init__(self, path: str | Path, *, vehicle: str) -> None:
         super().__init__()
         paths, lacking = recording_files(Path(path).expanduser())
-        self._lacking = [f"{name} of this bag is not there" for name in lacking]
+        self._lacking = [f"{name} of this bag is missing" for name in lacking]
         self._files: list[_RecordedFile] = []
         try:
             for each in paths:
                 self._files.append(_RecordedFile(each, vehicle))
                 self.callback(self._files[-1].chunks.close)
             if not self.counts:
-                reasons = [*self.warnings[:3]] or ["nothing in it is of px4_msgs"]
+                reasons = [*self.warnings[:3]] or ["no channel has a type of px4_msgs"]
                 problem = "no message can be read" if self.damaged else "this recording has no messages of PX4 topics"
                 raise SourceError(str(path), f"{problem}: {'; '.join(reasons)}")
         except BaseException:
@@ -92,13 +92,13 @@ class RecordingReader(ExitStack):
 
     @property
     def warnings(self) -> list[str]:
-        """Damage and what was left out so far."""
+        """Damage found and channels skipped so far."""
         where = {file: f"{file.name}: " if len(self._files) > 1 else "" for file in self._files}
         return [*self._lacking, *(f"{where[file]}{text}" for file in self._files for text in file.chunks.warnings)]
 
     @property
     def boot_utc(self) -> int:
-        """Unix time of the boot, as the log had it that this was converted from [us]; 0 if unknown."""
+        """Unix time of the boot, from the log that was converted to this file [us]; 0 if unknown."""
         known = {boot for file in self._files for boot in file.boots}
         return int(known.pop()) if len(known) == 1 else 0
 
@@ -113,7 +113,7 @@ class RecordingReader(ExitStack):
             file.check()
 
     def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages in file order; `only`: those of these addresses."""
+        """Yield the messages of all or `only` these addresses, in file order."""
         for file in self._files:
             yield from file.messages(only)
 
@@ -128,14 +128,14 @@ class _RecordedFile:
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
-        self._left = _MAX_DEFINITIONS
+        self._definition_budget = _MAX_DEFINITIONS
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
         self.counts: Mapping[RecordedStream, int]
         for record in sorted(self.chunks.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
-            # A summary may repeat channels without their schemas, which are then in the chunks.
+            # A summary may repeat channels without schemas; the schemas are in the chunks then.
             if not isinstance(record, Channel) or record.schema_id in {0, *self._schemas}:
-                self._learn(record)
+                self._register(record)
             if isinstance(record, Statistics):
                 totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
@@ -155,7 +155,7 @@ class _RecordedFile:
             try:
                 for record in records_of(part):
                     if not isinstance(record, Message):
-                        self._learn(record)
+                        self._register(record)
                         continue
                     if (number := record.channel_id) not in self._streams:
                         self._streams[number] = None
@@ -173,8 +173,8 @@ class _RecordedFile:
         streams = self._streams.items()
         return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
-    def _learn(self, record: McapRecord) -> None:
-        """Register a schema or channel; the first with its id wins."""
+    def _register(self, record: McapRecord) -> None:
+        """Register a schema or channel; later ones with the same id are ignored."""
         if isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
         elif isinstance(record, Channel) and record.id not in self._streams:
@@ -208,13 +208,13 @@ class _RecordedFile:
         return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
 
     def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:
-        """Return the definition and layout of a schema; raise ValueError if it is not that of this message."""
+        """Return the definition and layout of a schema; raise ValueError if they do not match the message."""
         if schema.id not in self._layouts:
-            if self._left < 0:
-                raise ValueError("the definitions of this file are more than those of 250 topics of PX4")
-            self._left -= len(schema.data) // 256
+            if self._definition_budget < 0:
+                raise ValueError("the definitions in this file exceed the limit, which is that of 250 PX4 topics")
+            self._definition_budget -= len(schema.data) // 256
             known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
-            self._left -= 32 + len(read_msg(text))
+            self._definition_budget -= 32 + len(read_msg(text))
             definition = known or define_msg(schema.name.rpartition("/")[2], text)
             types = {field.name: field.type for field in read_msg(text)} if known else definition.types
             same = (each for each in definition.layouts.values() if [*each.types.items()] == [*types.items()])
@@ -222,17 +222,17 @@ class _RecordedFile:
         return self._layouts[schema.id]
 
     def _own_layout(self, known: Definition[Any], types: Mapping[str, FieldType], topic: str) -> Layout:
-        """Return a layout that only this file has; further fields are left out, and named."""
+        """Return a layout that only this file has; warn about unknown fields, which are left out."""
         wrong = [name for name, kind in types.items() if kind not in known.known_types.get(name, {kind})]
         if lacking := sorted({*wrong, *(known.always - types.keys())}):
-            raise ValueError(f"its definition of {', '.join(lacking)} is not that of any PX4 release")
+            raise ValueError(f"its definition of {', '.join(lacking)} matches no PX4 release")
         if unknown := sorted(types.keys() - known.known_types.keys()):
-            self.chunks.warn(f"{topic}: {', '.join(unknown)} left out: not in any {known.name} that nedbus knows")
+            self.chunks.warn(f"{topic}: {', '.join(unknown)} left out: unknown to nedbus in {known.name}")
         return Layout("of the file", "", types=types)
 
 
 def _unpack(payload: bytes) -> bytes:
-    """Decompress a message that rosbag2 compressed by itself; if that fails, leave it for its decoder to reject."""
+    """Decompress a message compressed by rosbag2; on failure return it unchanged, for the decoder to reject."""
     with suppress(ZstdError):
         if payload.startswith(ZSTD_MAGIC) and frame_content_size(payload) <= _MAX_PAYLOAD:
             return ZstdDecompressor().decompress(payload, max_output_size=_MAX_PAYLOAD)

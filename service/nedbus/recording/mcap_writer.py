@@ -1,4 +1,4 @@
-"""Writer of MCAP files for Foxglove, PlotJuggler and any MCAP reader: CDR messages with their definitions.
+"""Writer of MCAP files with CDR messages and their ROS 2 definitions, for Foxglove, PlotJuggler and any MCAP reader.
 
 A file is valid from the start and after every flush: a footer follows the last chunk, and the next chunk overwrites
 it. A power cut costs only the messages since the last flush, never the file.
@@ -22,14 +22,14 @@ from nedbus_msgs import Address, Definition, Layout, Message, Provenance, defini
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.messages import LogMessage
 
-_CHUNK: Final = 2**23  # bytes; a flush every second makes smaller chunks
+_CHUNK: Final = 2**23  # bytes; flushing every second makes smaller chunks
 _MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
-_MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have any timestamp
+_MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have larger timestamps
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
 )
 
-_ROS2: Final = "offered_qos_profiles"  # metadata by which tools of ROS 2 recognize their bags
+_ROS2: Final = "offered_qos_profiles"  # metadata that ROS 2 tools expect in a bag
 _LOG_TYPE: Final = "rcl_interfaces/msg/Log"
 _LOG_DEFINITION: Final = f"""builtin_interfaces/Time stamp
 uint8 level
@@ -43,7 +43,7 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-_LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # fatal, error, warning, information, debug; by severity
+_LOG_LEVELS: Final = (50, 50, 50, 40, 30, 20, 20, 10)  # FATAL, ERROR, WARN, INFO, DEBUG, by PX4's severity
 
 _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
 
@@ -53,9 +53,9 @@ class RecordingWriter:
 
     Each address, definition and provenance has its own channel, in the message's current layout. If no PX4 layout has
     all fields of the message, a PX4 layout with exactly the fields provided by the source is preferred.
-    Texts of PX4 are there again as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
-    A flipped bit costs one chunk, of up to `chunk_size` bytes before compression. `boot_utc`: Unix time of the
-    vehicle's boot [us], for `utc_of` of a recording whose messages do not give it.
+    PX4's texts are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
+    `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
+    vehicle's boot [us], for `utc_of` if the messages do not provide it.
 
     Raises OutputError if the file exists, is deleted while open, or cannot be written; flushed messages stay readable.
     """
@@ -65,7 +65,7 @@ class RecordingWriter:
         self.messages = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
-        # Large chunks: the writer keeps an index of each chunk in memory, with an entry per channel.
+        # Large chunks: the writer keeps an index per chunk and channel in memory.
         self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=chunk_size)
         self._writer.start(profile="ros2", library="nedbus")
         try:
@@ -76,7 +76,7 @@ class RecordingWriter:
             raise
         self._schemas: dict[tuple[str, str], int] = {}  # by type and text
         self._channels: dict[Definition[Any], dict[tuple[Address, Provenance], tuple[int, Layout]]] = {}
-        self._log_channels = dict[str, int]()  # by vehicle; readers of nedbus leave them out
+        self._log_channels = dict[str, int]()  # by vehicle; RecordingReader ignores these
 
     def write(
         self,
@@ -92,9 +92,9 @@ class RecordingWriter:
         self._add(self._encode(messages, definition, streams, zip(logged, published, sequence, strict=False)))
 
     def write_messages(self, messages: Iterable[tuple[Message, Address, Provenance, int]]) -> None:
-        """Write messages of any types, each with address, provenance and log time [ns], in the order of log times.
+        """Write messages of any types, each with address, provenance and log time [ns], sorted by log time.
 
-        The publish time of a message is its own timestamp.
+        The publish time of a message is its timestamp.
         """
         by_kind: dict[Definition[Any], list[tuple[Message, Address, Provenance, int]]] = {}
         for each in messages:
@@ -171,8 +171,7 @@ class RecordingWriter:
             metadata["boot_time_utc_us"] = str(self._boot_utc)
         if provenance.missing:
             metadata["missing"] = " ".join(sorted(provenance.missing))
-        text = definition_text(definition, layout)
-        channel = self._register(f"/{address}", ros2_type(definition), text, metadata)
+        channel = self._register(f"/{address}", ros2_type(definition), definition_text(definition, layout), metadata)
         self._channels[definition][address, provenance] = channel, layout
         return channel, layout
 
@@ -183,7 +182,7 @@ class RecordingWriter:
 
 
 def _encode_log(vehicle: str, message: LogMessage, time_ns: int) -> bytes:
-    """Return the CDR payload of a text of a vehicle as _LOG_TYPE, which Foxglove's Log panel and ROS 2 show."""
+    """Encode a text of a vehicle as the CDR payload of _LOG_TYPE."""
     seconds = min(time_ns // 10**9, 2**31 - 1)
     body = struct.pack("<iIB", seconds, time_ns % 10**9, _LOG_LEVELS[message.severity])
     for part in (vehicle, message.text, "", ""):
@@ -202,7 +201,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 class _AppendFile:
-    """An append-only file for the MCAP writer that ends with a valid footer after each `sync`."""
+    """An append-only file for the MCAP writer; after each `sync` it ends with a valid footer."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -220,7 +219,7 @@ class _AppendFile:
         return self._offset + len(self._pending)
 
     def flush(self) -> None:
-        """Do nothing: `sync` writes to the disk."""
+        """Do nothing; `sync` writes to disk."""
 
     def sync(self, end: bytes = _END) -> None:
         """Write the pending data and a footer to disk; restore the previous footer if that fails."""

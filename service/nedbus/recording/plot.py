@@ -51,7 +51,7 @@ _COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy",
 
 
 class _Stream(NamedTuple):
-    """A plotted stream, with the times of its messages since the first message of all streams [s], and its colour."""
+    """A plotted stream: its messages, their times since the first message of all streams [s], and its colour."""
 
     address: Address
     messages: MessageArray
@@ -59,12 +59,12 @@ class _Stream(NamedTuple):
     color: str
 
     def resets(self, counter: str) -> Any:
-        """Return the times at which a reset counter changed [s]."""
+        """Return the times of the changes of a reset counter [s]."""
         return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
 
 
 class _Mark(NamedTuple):
-    """An event with its text, from begin to end [s]; both are equal for an instantaneous event."""
+    """An event with its text, begin and end [s]; an instantaneous event has equal ones."""
 
     event: Event
     text: str
@@ -83,19 +83,19 @@ def draw(
     """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
     Each stream must have at least one message.
-    The time axis has UTC if `times` has that of all vehicles, else seconds since boot.
+    The time axis shows UTC if `times` has it for all vehicles, else seconds since boot.
     Positions are local NED in metres; altitude is -z.
     Fields named by `missing_of` are not plotted; a note lists them.
-    `events`: for the streams' vehicles, events of severity bad or watch, mode changes, arming and landing are marked.
+    `events`: those of severity bad or watch, mode changes, arming and landing of the plotted vehicles are marked.
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
     if Path(path).suffix.lower() not in _SUFFIXES:
-        raise ConfigError(str(path), f"not a picture format: the name must end with {' or '.join(_SUFFIXES)}")
+        raise ConfigError(str(path), f"not an image format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
         with atomic_write(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
             figure = draw_figure(streams, title=title, events=events, times=times)
-            figure.savefig(part)  # a glyph missing in the font is only a warning
+            figure.savefig(part)  # a glyph that the font lacks is only a warning
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
@@ -141,7 +141,7 @@ def draw_figure(
 
 
 def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Times) -> str:
-    """Put ticks on time axes that begin at `start` [s since boot], in UTC if it is one for all; return their label."""
+    """Label time axes that begin at `start` [s since boot], in UTC if the vehicles agree; return the axis label."""
     found = [times.utc_of_boot(stream.address.vehicle, start) for stream in streams]
     utc = [each for each in found if each is not None]
     has_utc = len(utc) == len(found) and max(utc) - min(utc) < 1.0
@@ -155,7 +155,7 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
 
 
 def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None:
-    """Plot the tracks, with a circle at the start and a square at the end of each, altitude and speed."""
+    """Plot altitude, speed, and tracks with a circle at the start and a square at the end."""
     tracks = [(each.messages["y"], each.messages["x"]) for each in streams]
     _draw_lines(axes["track"], streams, "xy_valid", tracks, width=1.2)
     altitudes = [(each.seconds, -each.messages["z"]) for each in streams]
@@ -182,7 +182,7 @@ def _draw_estimates(axes: Mapping[str, Any], streams: Sequence[_Stream]) -> None
 def _draw_lines(
     axes: Any, streams: Sequence[_Stream], flag: str, lines: Sequence[tuple[Any, Any]], *, width: float
 ) -> None:
-    """Plot a line per stream, thin where its flag is not set; thin parts scale the axes only if no part is valid."""
+    """Plot a line per stream, thin where its flag is false; thin parts affect the limits only if nothing is valid."""
     valid = [stream.messages[flag] for stream in streams]
     in_scale = not any(np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True))
     for stream, each, line in zip(streams, valid, lines, strict=True):
@@ -193,7 +193,7 @@ def _draw_lines(
 
 
 def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
-    """Return label, stream and field of each row: flags, resets of each quantity that was reset, and heading resets."""
+    """Return label, stream and field of each row: flags, heading resets, and resets of other quantities with any."""
     rows: list[tuple[str, _Stream, str]] = []
     for stream in streams:
         suffix, missing = f" {stream.address}" if len(streams) > 1 else "", missing_of(stream.messages)
@@ -211,7 +211,7 @@ def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
             axes.plot(times, np.full(len(times), number), "|", color=stream.color, markersize=7)
         else:
             flag, color = stream.messages[field], _WARNING_COLOR if field == "dead_reckoning" else stream.color
-            is_shown = flag | np.append(False, flag[:-1])  # fill up to the first message without the flag
+            is_shown = flag | np.append(False, flag[:-1])  # fill to the first message without the flag
             axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
     axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
@@ -219,9 +219,9 @@ def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
 
 
 def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> dict[str, list[_Mark]]:
-    """Return the marks of the streams' vehicles by row, the most severe first, each row in order of time.
+    """Return the marks of the plotted vehicles by row, the most severe row first, each row in order of time.
 
-    Events far from all messages are left out: their time is damaged.
+    Events far from all messages are left out, as their time must be damaged.
     """
     timed = [event for event in events if event.boot is not None]
     rows = defaultdict[str, dict[Event, _Mark]](dict)
@@ -241,7 +241,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
             text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
             marks = rows[f"{row} {vehicle}" if len(vehicles) > 1 else row]
             end = max(begin, last if span.until is None else min(span.until + offset, last))
-            # Conditions that began together share a mark until the last of them ends.
+            # Conditions that began together share a mark, which ends with the last of them.
             marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
 
     def order(marks: list[_Mark]) -> tuple[int, float]:
@@ -252,7 +252,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
-    """Mark the begin of bad and watch events on the track and on the time axes of altitude and speed."""
+    """Mark the start of bad and watch events on the track and on the time axes of altitude and speed."""
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():
@@ -278,7 +278,7 @@ def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Ite
 
 
 def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
-    """Plot the marks row by row, and label each if the text fits before the next mark."""
+    """Plot the marks row by row, with labels where they fit before the next mark."""
     for number, marks in enumerate(rows.values()):
         for mark in marks:
             marker, color, size = _MARKERS[mark.event.severity]
@@ -288,7 +288,7 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
     axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
     axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
-    figure.draw_without_rendering()  # lays out the axes, which determines the room for labels
+    figure.draw_without_rendering()  # computes the layout, on which the space for labels depends
     gap = _GAP * _DPI / 72
     for number, marks in enumerate(rows.values()):
         places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]

@@ -1,4 +1,4 @@
-"""Reading of streams of one file or of several, as arrays or data frames."""
+"""Reading of streams from one or several files as arrays or data frames."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ def read(
     `dataframe`: return a pandas or polars data frame, with array fields as columns `delta_xy[0]`, `delta_xy[1]` and
     nulls for missing fields; a pandas data frame names these in `attrs["missing"]`.
     A list of topics, or of streams such as "sensor_gps/1", returns a dict by stream, for one vehicle. "*" selects all
-    streams of the file, including messages that are defined only by the file.
+    streams of the file, including messages that only the file defines.
     A list of files returns a dict by vehicle and stream, with `timestamp` in Unix time [us]; a vehicle that is in
     several files is named after its file.
 
-    Raises SourceError if a file cannot be read, or is one of several and gives no UTC; AddressError if no stream or
+    Raises SourceError if a file cannot be read, or is one of several and has no UTC; AddressError if no stream or
     several streams match topic, vehicle and instance; ConfigError if the package that reads the file is not installed.
     """
     streams, _ = read_streams(path, topic, vehicle=vehicle, instance=instance)
@@ -85,9 +85,9 @@ def read(
 def read_streams(
     path: _Files, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None
 ) -> tuple[Streams, int]:
-    """Return the messages of streams of one vehicle, or of several files, and when recording began [us].
+    """Return the messages of one vehicle's streams, or of several files, and when recording began [us].
 
-    `topics`: None selects all streams, for a log all of known topics.
+    `topics`: None selects all streams; of a log, those of topics known to nedbus.
     """
     if not isinstance(path, FlightPath):
         names = [topics] if isinstance(topics, str) else topics
@@ -121,7 +121,7 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
         if vehicle not in (ANY, name) or wanted == []:
             continue
         if (utc := utc_of(path, vehicle=own)) is None:
-            raise SourceError(str(path), "no message gives UTC, the time of several files: read it alone")
+            raise SourceError(str(path), "no message provides UTC, which reading several files requires: read it alone")
         found, start = read_streams(path, wanted, vehicle=own)
         starts.append(int(utc.unix_us(start)) if start else 0)
         for stream, (messages, absent) in found.items():

@@ -35,7 +35,7 @@ class Recorder:
 
     @property
     def status(self) -> str:
-        """The counts so far, as one line of text."""
+        """The counts so far as text, such as "120 messages, 2 lost"."""
         names = ("lost", "dropped", "invalid", "discarded", "forgotten")
         counts = ((getattr(self._subscription.counts, name), name) for name in names)
         return ", ".join([f"{self.messages} messages", *(f"{count} {name}" for count, name in counts if count)])

@@ -1,4 +1,4 @@
-"""Reader of PX4 .ulg logs, message by message."""
+"""Streaming reader of PX4 .ulg logs."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -13,17 +13,16 @@ from nedbus_msgs import TOPICS, Address
 from .flight_files import open_flight
 
 _CHUNK: Final = 2**17  # bytes read at a time
-_MAX_NAMED: Final = 5  # damaged places in the warnings
-_MAX_TOPICS: Final = 10  # in an error
+_MAX_NAMED: Final = 5  # places of damage listed in the warnings
+_MAX_TOPICS: Final = 10  # topics listed in an error
 
 
 class UlogReader:
-    """Read the messages of a log in the log's order; the memory does not grow with the log.
+    """Read the messages of a log in file order, with memory independent of its size.
 
     `topics`: those to read, None for all. `vehicle`: by default the log's MAV_SYS_ID, else `default_vehicle`.
-    `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if the log has none so far.
-    `position`: bytes read so far.
-    `dropout`: seconds that the logger lost, until the caller resets it. `streams`: those with a message so far.
+    `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if unknown. `position`: bytes read.
+    `dropout`: seconds lost by the logger since the caller last reset it. `streams`: those with a message so far.
     `damaged`: True if damage may have cost messages so far.
     """
 
@@ -32,25 +31,26 @@ class UlogReader:
     ) -> None:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
-        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.Texts()
+        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.LogMessageBuilder()
         self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
-        self._checksums: dict[ulog.LoggedStream, int] = {}  # of the messages so far, for topics with several
-        self._firsts: dict[ulog.LoggedStream, ulog.LoggedStream] = {}  # by the second, as PX4 can log a topic twice
+        # PX4 can log a topic twice: checksums of the messages of such topics, and the first stream by its duplicate.
+        self._checksums: dict[ulog.LoggedStream, int] = {}
+        self._firsts: dict[ulog.LoggedStream, ulog.LoggedStream] = {}
         self.streams: dict[Address, ulog.LoggedStream] = {}
         self.dropout = 0.0
         self.damaged = False
 
     @property
     def warnings(self) -> list[str]:
-        """Damage and skipped parts so far."""
-        ends = {f"damaged: {self._places - _MAX_NAMED} further places": self._places > _MAX_NAMED}
+        """Damage found and parts skipped so far."""
+        ends = {f"damaged: {self._places - _MAX_NAMED} further locations": self._places > _MAX_NAMED}
         ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
-        ends |= {f"left out: {self._texts.limit.omitted} texts beyond 100 a second": self._texts.limit.omitted > 0}
+        ends |= {f"left out: {self._texts.limit.omitted} texts above 100 per second": self._texts.limit.omitted > 0}
         ends |= {self._texts.problem: bool(self._texts.problem)}
-        reasons = [reason for stream in self.streams.values() for reason in stream.unfit.values()]
+        reasons = [reason for stream in self.streams.values() for reason in stream.omitted.values()]
         return self._warnings + reasons + [text for text, holds in ends.items() if holds]
 
     def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:
@@ -77,7 +77,7 @@ class UlogReader:
         for second, first in firsts.items():
             if checksums.get(second) != checksums.get(first):
                 number = second.subscription.multi_id
-                self._warnings.append(f"skipped a second {second.address.topic} [{number}] with other messages")
+                self._warnings.append(f"skipped a duplicate {second.address.topic} [{number}] with different messages")
                 self.damaged |= second.address.instance is not None or number == 0
         if not self.streams:
             topics = self._topics
@@ -102,7 +102,7 @@ class UlogReader:
             raise SourceError(str(self._path), (exc.strerror or str(exc)).lower()) from exc
 
     def _note(self, record: ulog.Record) -> None:
-        """Take what is not a message."""
+        """Process a record that is not a message."""
         if isinstance(record, ulog.Header):
             self.start = record.timestamp
         elif isinstance(record, ulog.Information):
@@ -123,7 +123,7 @@ class UlogReader:
                 self._warnings.append(f"{'truncated' if record.is_end else 'damaged'}: {record.reason}")
 
     def _open(self, subscription: ulog.Subscription) -> ulog.LoggedStream | None:
-        """Return the stream of a subscription with its first message; None if it is not wanted, or cannot be used."""
+        """Return the stream of a subscription at its first message, None if it is not selected or not usable."""
         topic = subscription.name
         if self._topics is not None and topic not in self._topics:
             return None

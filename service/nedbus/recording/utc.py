@@ -15,7 +15,7 @@ from nedbus_msgs.arrays import MessageArray, to_array
 from .arrays import Flight, missing_of
 from .flight_files import matching, require_one_vehicle
 
-_FIELDS: Final = ("time_utc_usec", "estimated_offset")  # a GNSS receiver's UTC, or the offset to a companion's clock
+_FIELDS: Final = ("time_utc_usec", "estimated_offset")  # UTC of a GNSS receiver, or offset to a companion's clock
 _RELATIVE: Final = "timestamp_time_relative"  # us from the message's timestamp to the receiver's UTC
 _TOLERANCE: Final = 1_000_000  # us; messages this close to the median agree
 _AGREEING: Final = 0.9  # fraction that must agree; fewer indicate several boots or a clock step
@@ -25,10 +25,10 @@ _AGREEING: Final = 0.9  # fraction that must agree; fewer indicate several boots
 class UtcOffset:
     """Offset from a vehicle's time since boot to Unix time [us], and its source.
 
-    `source`: the stream, "boot_time_utc_us" of a log, or "timestamp" if timestamps are Unix time already, as those that
-    uXRCE-DDS has synchronized. timesync_status is the clock of a companion computer, and only as accurate as that.
-    `offset_us`: the median over its messages. A GNSS fix is some tenths of a second older than its message.
-    `count`: the number of messages within one second of the median; `spread_us`: their maximum minus minimum.
+    `source`: the stream, "boot_time_utc_us" of a log, or "timestamp" if timestamps are Unix time already, as uXRCE-DDS
+    sends them once synchronized. The stream timesync_status is as accurate as the clock of the companion computer.
+    `offset_us`: median over the messages of the source; a GNSS fix is some tenths of a second older than its message.
+    `count`: messages within one second of the median; `spread_us`: their maximum minus minimum.
     """
 
     source: str
@@ -37,11 +37,11 @@ class UtcOffset:
     spread_us: int
 
     def at(self, timestamp: int) -> datetime:
-        """Return the UTC of a `timestamp` of this vehicle from the same boot, which may be Unix time already."""
+        """Return the UTC of a `timestamp` from the same boot of this vehicle; Unix time is used as it is."""
         return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(self.unix_us(int(timestamp))))
 
     def unix_us(self, timestamps: Any) -> Any:
-        """Return the Unix time [us] of a timestamp, or of an array of them."""
+        """Return the Unix time [us] of a timestamp or an array of timestamps."""
         return timestamps + self.offset_us * ~np.asarray(is_unix_time(timestamps))
 
 
@@ -76,7 +76,7 @@ def utc_of(
 
 
 def _find_utc(streams: Mapping[str, MessageArray], boot_utc: int = 0) -> UtcOffset | None:
-    """Return the offset from the best of these streams, None if no stream provides one."""
+    """Return the offset from the best source among these streams, or None."""
     unix = sum(int(np.sum(is_unix_time(messages["timestamp"]))) for messages in streams.values())
     if unix > sum(map(len, streams.values())) / 2:
         return UtcOffset("timestamp", 0, unix, 0)

@@ -1,10 +1,11 @@
-"""Web page with a map, a table and plots of all vehicles, live or from a recording; needs the extra `web`."""
+"""Web page with a map, a list and plots of all vehicles, live or from recordings; needs the extra `web`."""
 
 from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .server import Where, serve_live, serve_recording
+    from .server import PageOptions, serve_live, serve_recording
 else:
-    __getattr__ = lazy_exports(__name__, dict.fromkeys(("Where", "serve_live", "serve_recording"), ("web", "server")))
+    _NAMES = "PageOptions", "serve_live", "serve_recording"
+    __getattr__ = lazy_exports(__name__, dict.fromkeys(_NAMES, ("web", "server")))

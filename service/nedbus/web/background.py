@@ -1,4 +1,4 @@
-"""Background of the map: GeoJSON, or a picture with a world file, in WGS 84."""
+"""Map background: GeoJSON, or an image with a world file, in WGS 84."""
 
 import json
 import math
@@ -15,17 +15,17 @@ from nedbus_msgs.frames import MapProjection
 
 from .style import Style
 
-_PICTURES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # world files
-_MAX_SIDE: Final = 2000  # pixels; larger pictures are scaled down
+_WORLD_FILES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # suffixes
+_MAX_SIDE: Final = 2000  # pixels; larger images are scaled down
 _PARTS: Final = {"FeatureCollection": "features", "GeometryCollection": "geometries", "Feature": "geometry"}
 
 Ring = list[tuple[float, float]]
 
 
 class Background:
-    """A background file, read once and drawn for each viewer when the common origin is known.
+    """A background file, read once, and drawn for each viewer once the common origin is known.
 
-    Raises ConfigError if the file is neither GeoJSON nor a picture with a world file.
+    Raises ConfigError if the file is neither GeoJSON nor an image with a world file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,40 +33,40 @@ class Background:
         self.pixels: Any = None
         self._corners: Ring = []
         try:
-            if path.suffix.lower() in _PICTURES:
-                self._read_picture(path)
+            if path.suffix.lower() in _WORLD_FILES:
+                self._read_image(path)
             else:
                 self.rings = list(_rings(json.loads(path.read_bytes())))
         except OSError as exc:
             raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
         except (ValueError, TypeError, LookupError, RecursionError) as exc:
             reason = f"{exc} is missing" if isinstance(exc, KeyError) else str(exc)
-            expected = "expected GeoJSON, or a picture with a world file, in WGS 84"
+            expected = "expected GeoJSON, or an image with a world file, in WGS 84"
             raise ConfigError("--map", f"{path} cannot be drawn ({reason}): {expected}") from exc
         if not self.rings and self.pixels is None:
             raise ConfigError("--map", f"{path} has no lines, polygons or points")
 
     def draw(self, plot: figure, style: Style, projection: MapProjection) -> None:
-        """Draw the background on a map in metres from the origin of `projection`."""
+        """Draw the background on a map whose axes are metres from the origin of `projection`."""
 
-        def place(longitude: float, latitude: float) -> tuple[float, float]:
+        def project(longitude: float, latitude: float) -> tuple[float, float]:
             north, east = projection.project(latitude, longitude)
             return east, north
 
         if self.pixels is not None:
-            (west, south), (east, north) = (place(*corner) for corner in self._corners)
+            (west, south), (east, north) = (project(*corner) for corner in self._corners)
             plot.image_rgba([self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image")
-        lines = [list(zip(*(place(*point) for point in ring), strict=True)) for ring in self.rings]
+        lines = [list(zip(*(project(*point) for point in ring), strict=True)) for ring in self.rings]
         source = ColumnDataSource({"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]})
         plot.multi_line("east", "north", source=source, color=style.quiet, line_width=1.5, level="underlay")
         points = [line for line in lines if len(line[0]) == 1]
         easts, norths = [east[0] for east, _ in points], [north[0] for _, north in points]
         plot.scatter(easts, norths, marker="cross", color=style.quiet, level="underlay")
 
-    def _read_picture(self, path: Path) -> None:
+    def _read_image(self, path: Path) -> None:
         from PIL import Image
 
-        worlds = [path.with_suffix(suffix) for suffix in (_PICTURES[path.suffix.lower()], ".wld")]  # GDAL writes .wld
+        worlds = [path.with_suffix(each) for each in (_WORLD_FILES[path.suffix.lower()], ".wld")]  # GDAL writes .wld
         world = next((each for each in worlds if each.exists()), None)
         if world is None:
             raise ValueError(f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES")
@@ -74,33 +74,33 @@ class Background:
         if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
             raise ValueError("world file is not north up in degrees: convert with gdalwarp -t_srs EPSG:4326")
         try:
-            with Image.open(path) as picture:
-                columns, rows = picture.size
-                picture.thumbnail((_MAX_SIDE, _MAX_SIDE))
-                pixels = np.asarray(picture.convert("RGBA"))[::-1]
+            with Image.open(path) as image:
+                columns, rows = image.size
+                image.thumbnail((_MAX_SIDE, _MAX_SIDE))
+                pixels = np.asarray(image.convert("RGBA"))[::-1]
         except Image.DecompressionBombError as exc:
             raise ValueError(str(exc)) from exc
         self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
-        left, top = west - width / 2, north - height / 2  # the file has the centre of the first pixel
+        left, top = west - width / 2, north - height / 2  # the world file has the centre of the first pixel
         self._corners = [(left, top + rows * height), (left + columns * width, top)]
 
 
 def _rings(shape: Any) -> Iterator[Ring]:
-    """Yield the lines of a GeoJSON object or of nested coordinates; a point is a line of length 1."""
+    """Yield the lines of a GeoJSON object or nested coordinates; a point is a line of length 1."""
     if not shape:
         return
     if isinstance(shape, dict):
         yield from _rings(shape[_PARTS.get(shape["type"], "coordinates")])
     elif isinstance(shape[0], int | float):
-        yield [_place(shape)]
+        yield [_point_of(shape)]
     elif isinstance(shape[0], list) and isinstance(shape[0][0], int | float):
-        yield [_place(each) for each in shape]
+        yield [_point_of(each) for each in shape]
     else:
         for each in shape:
             yield from _rings(each)
 
 
-def _place(point: Sequence[Any]) -> tuple[float, float]:
+def _point_of(point: Sequence[Any]) -> tuple[float, float]:
     longitude, latitude = float(point[0]), float(point[1])
     if not (math.isfinite(longitude) and abs(latitude) <= 90 and abs(longitude) <= 180):
         raise ValueError(f"{point} is not a longitude and latitude in degrees")

@@ -1,4 +1,4 @@
-"""Bokeh column data of a viewer, updated incrementally."""
+"""Bokeh column data sources of a viewer, updated incrementally."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,23 +13,23 @@ from .fleet import TRUTH
 from .stream import COLUMNS, History
 from .style import PALETTE
 
-_MAX_POINTS: Final = 6_000  # points of all tracks together; a browser can draw these ten times a second
+_MAX_POINTS: Final = 6_000  # points of all tracks together, which a browser can draw ten times a second
 _MIN_TRACK_POINTS: Final = 60
 _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
 _DOUBT, _TRUE = "doubtful", "truth"
 NAMES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBT, _TRUE)
 """Line types: valid tracks in each vehicle colour, doubtful tracks, and ground truth."""
 
-Track = tuple[History, int]  # points, and number of the colour
+Track = tuple[History, int]  # points, and colour number
 
 
 def table(*names: str) -> ColumnDataSource:
-    """Return an empty source with these columns."""
+    """Return an empty data source with these columns."""
     return ColumnDataSource({name: [] for name in names})
 
 
 def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Replace the rows; send only changed columns, or all columns if the number of rows changes."""
+    """Replace all rows; send only changed columns, or all columns if the number of rows changed."""
     old = source.data
     new = {name: [row[name] for row in rows] for name in old}
     if any(len(column) != len(rows) for column in old.values()):
@@ -42,10 +42,10 @@ def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None
 
 
 class Tracks:
-    """Tracks of all streams: a column for east, and one for north per line type, NaN where that line is interrupted.
+    """Tracks of all streams: a column for east and one per line type for north, NaN where that line has a gap.
 
-    Each track is a ring of slots with a moving gap after the newest point, followed by a copy of its first slot and a
-    permanent gap that separates it from the next track.
+    Each track is a ring buffer of slots with a moving gap after the newest point, followed by a copy of the first slot
+    and a permanent gap before the next track.
     """
 
     def __init__(self) -> None:
@@ -55,8 +55,8 @@ class Tracks:
         self._step = self._slots = 1
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
-        """Send the new points of these tracks."""
-        if tracks != self._tracks:  # for example after a seek, which creates new histories
+        """Add the new points of these tracks."""
+        if tracks != self._tracks:  # a new vehicle, or a seek, which creates new histories
             # Choose the number of slots, and the number of points per slot.
             self._tracks, self._seen = dict(tracks), [0] * len(tracks)
             longest = max((history.size for history, _ in tracks.values()), default=1)

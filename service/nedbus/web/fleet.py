@@ -1,4 +1,4 @@
-"""Streams of a page, and the snapshot of their states that all parts of the page show; no I/O."""
+"""Vehicles and streams of a page, and the snapshot of them that all parts of the page show; no I/O."""
 
 import math
 import re
@@ -28,8 +28,8 @@ from nedbus_msgs.messages import VehicleStatus
 from .stream import LONG, Origin, PageStream, is_position
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
-MAX_STREAMS: Final = 1000  # streams shown on a page, positions before others; further streams are only counted
-_SILENT: Final = 60.0  # s without a message after which a stream makes room for another
+MAX_STREAMS: Final = 1000  # streams shown on a page, positions first; further ones are only counted
+_SILENT: Final = 60.0  # s without a message after which a stream may be replaced
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _OK: Final = State("info", "ok", None, ())
@@ -37,7 +37,7 @@ _DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its 
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class StreamView:
     """Snapshot of one stream: its health and state."""
 
     address: Address
@@ -47,8 +47,8 @@ class Line:
     rejected: int
 
     @property
-    def words(self) -> str:
-        """Description of the state and flags."""
+    def description(self) -> str:
+        """State and flags as text."""
         return describe_stream(self.health, self.state)
 
     @property
@@ -57,32 +57,32 @@ class Line:
         return self.health.age or 0.0 if self.state.name in ("disconnected", "gone", "stale") else None
 
 
-class Fact(NamedTuple):
-    """A value of another message than the position, "" if unknown; `age` of one that arrives no more [s], else None."""
+class StatusValue(NamedTuple):
+    """A value from a message other than the position, "" if unknown; `age` [s] if its stream is silent, else None."""
 
     text: str = ""
     age: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class VehicleView:
     """Snapshot of one vehicle: its state and its streams.
 
-    `main`: the stream shown as its marker; `facts`: mode, armed, battery and gps; `number`: determines its colour;
-    `log`: its ULog stream over MAVLink, None without one.
+    `main`: the stream that its map marker shows; `status`: mode, armed, battery and gps; `number`: selects its colour;
+    `log`: its ULog stream over MAVLink, if any.
     """
 
     vehicle: str
     state: State
-    main: Line
-    lines: tuple[Line, ...]
-    facts: Mapping[str, Fact]
+    main: StreamView
+    streams: tuple[StreamView, ...]
+    status: Mapping[str, StatusValue]
     number: int
     log: LogStreamStatus | None = None
 
     @property
     def grade(self) -> str:
-        """The severity of the state, with "ok" for "info"."""
+        """The severity of the state, "ok" instead of "info"."""
         return "ok" if self.state.severity == "info" else self.state.severity
 
     @property
@@ -91,21 +91,21 @@ class Row:
         return _DETAIL.split(self.state.text, maxsplit=1)[0]
 
     @property
-    def where(self) -> str:
-        """Description of the last valid position."""
-        place, projection = self.main.stream.valid, self.main.stream.origin.projection
-        if place is None:
+    def last_position(self) -> str:
+        """The last valid position as text."""
+        position, projection = self.main.stream.valid, self.main.stream.origin.projection
+        if position is None:
             return "none yet"
-        text = f"{place.north:z.1f} m north, {place.east:z.1f} m east"
-        text += f", altitude {place.altitude:z.1f} m" if math.isfinite(place.altitude) else ""
-        if not place.common or projection is None:
+        text = f"{position.north:z.1f} m north, {position.east:z.1f} m east"
+        text += f", altitude {position.altitude:z.1f} m" if math.isfinite(position.altitude) else ""
+        if not position.common or projection is None:
             return text
-        latitude, longitude = projection.reproject(place.north, place.east)
+        latitude, longitude = projection.reproject(position.north, position.east)
         return f"{text} ({latitude:.6f}, {longitude:.6f})"
 
     @property
-    def is_here(self) -> bool:
-        """True while valid positions arrive."""
+    def has_position(self) -> bool:
+        """True while valid positions are received."""
         last = self.main.stream.last
         if self.main.silence is not None or last is None or not is_position(self.main.address):
             return False
@@ -113,32 +113,32 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """Snapshot of all vehicles, the most severe first; `alarms`: the faults of the link and of this page."""
+class FleetSnapshot:
+    """Snapshot of all vehicles, the most severe first; `alarms`: faults of the link and of this page."""
 
     time: float
-    rows: Sequence[Row] = ()
+    vehicles: Sequence[VehicleView] = ()
     reports: Sequence[RejectionReport] = ()
     rejected: int = 0
     left_out: int = 0
     alarms: Sequence[str] = ()
 
-    def row(self, vehicle: str | None) -> Row | None:
-        """Return the row of a vehicle, None if there is none."""
-        return next((row for row in self.rows if row.vehicle == vehicle), None)
+    def vehicle(self, name: str | None) -> VehicleView | None:
+        """Return the vehicle of this name, or None."""
+        return next((view for view in self.vehicles if view.vehicle == name), None)
 
 
 class Fleet:
-    """All streams; one thread may add samples while another one takes pictures.
+    """All streams of a page; one thread may add samples while another one takes snapshots.
 
     `origin`: the common origin, by default the first global origin in any message.
-    `long`: the number of points in the longer histories, and the seconds between two points.
+    `long`: number of points in the longer histories, and seconds between two points.
     """
 
     def __init__(self, origin: Origin | None = None, long: tuple[int, float] = LONG) -> None:
         self.origin = origin or Origin()
         self.streams: dict[Address, PageStream] = {}
-        self.picture = Picture(0.0)
+        self.snapshot = FleetSnapshot(0.0)
         self._long = long
         numbers = count()
         self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
@@ -148,7 +148,7 @@ class Fleet:
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
 
     def add(self, sample: Sample[Any], time: float) -> None:
-        """Add a sample received at `time`, in seconds since the Unix epoch or since the start of a recording."""
+        """Add a sample received at `time`: seconds since the Unix epoch, or since the start of a recording."""
         while self._gone:
             self.streams.pop(self._gone.pop(), None)
         address = sample.address
@@ -172,40 +172,40 @@ class Fleet:
                 del self._rejected[next(iter(self._rejected))]
 
     def clear(self) -> None:
-        """Remove all streams and reports, but keep the common origin; called before a seek."""
+        """Remove all streams and reports but keep the common origin, for a seek."""
         for part in (self.streams, self._left_out, self._rejected, self._reports):
             part.clear()
 
     def update(
         self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus] = MappingProxyType({})
     ) -> None:
-        """Take a picture and keep it in `picture`; `states`, `logs`: states and ULog streams by vehicle."""
+        """Update `snapshot`; `states`, `logs`: states and ULog streams by vehicle."""
         self.reject(now.rejected)
         time, alive = now.time, now.alive
         if alive is not None and not now.link:
             known, silent = {*alive, *now.healths}, time - _SILENT
             self._gone = [key for key, stream in [*self.streams.items()] if key not in known and stream.time < silent]
             self._left_out.intersection_update(alive)
-        lines: dict[str, list[Line]] = {}
+        views: dict[str, list[StreamView]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
                 continue
             health = now.healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
-            line = Line(address, stream, health, state, self._rejected[address])
-            lines.setdefault(address.vehicle, []).append(line)
-        rows = []
-        for name, each in lines.items():
-            main = min(each, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
+            view = StreamView(address, stream, health, state, self._rejected[address])
+            views.setdefault(address.vehicle, []).append(view)
+        vehicles = []
+        for name, each in views.items():
+            main = min(each, key=lambda view: (view.address.topic != DEFAULT_TOPIC, not is_position(view.address)))
             held, number = states.get(name, _OK), self._number_of(name)
-            rows.append(Row(name, held, main, tuple(each), _facts(each), number, logs.get(name)))
-        rows.sort(key=lambda row: rank_vehicle(row.vehicle, row.state.severity))
+            vehicles.append(VehicleView(name, held, main, tuple(each), _status(each), number, logs.get(name)))
+        vehicles.sort(key=lambda view: rank_vehicle(view.vehicle, view.state.severity))
         alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
         rejected = self._rejected.total()
-        self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), alarms)
+        self.snapshot = FleetSnapshot(time, vehicles, tuple(self._reports), rejected, len(self._left_out), alarms)
 
     def _make_room(self, time: float) -> bool:
-        """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""
+        """Remove the least recent stream, positions last and only if silent; return whether one was removed."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False
@@ -213,18 +213,18 @@ class Fleet:
         return True
 
 
-def _facts(lines: Sequence[Line]) -> dict[str, Fact]:
-    known = {(line.address.topic, line.address.instance or 0): line for line in lines}
+def _status(views: Sequence[StreamView]) -> dict[str, StatusValue]:
+    known = {(view.address.topic, view.address.instance or 0): view for view in views}
 
-    def fact(topic: str, describe: Callable[[Any], str]) -> Fact:
-        line = known.get((topic, 0))
-        last = None if line is None else line.stream.last
-        return Fact() if line is None or last is None else Fact(describe(last.message), line.silence)
+    def value_of(topic: str, describe: Callable[[Any], str]) -> StatusValue:
+        view = known.get((topic, 0))
+        last = None if view is None else view.stream.last
+        return StatusValue() if view is None or last is None else StatusValue(describe(last.message), view.silence)
 
     gps = "vehicle_gps_position" if ("vehicle_gps_position", 0) in known else "sensor_gps"
     return {
-        "mode": fact("vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))),
-        "armed": fact("vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"),
-        "battery": fact("battery_status", lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else ""),
-        "gps": fact(gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"),
+        "mode": value_of("vehicle_status", lambda last: MODES.get(last.nav_state, str(last.nav_state))),
+        "armed": value_of("vehicle_status", lambda last: "armed" if last.arming_state == _ARMED else "disarmed"),
+        "battery": value_of("battery_status", lambda m: f"{100 * m.remaining:.0f} %" if 0 <= m.remaining <= 1 else ""),
+        "gps": value_of(gps, lambda last: f"{FIXES.get(last.fix_type, last.fix_type)} · {last.satellites_used}"),
     }

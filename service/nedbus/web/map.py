@@ -1,4 +1,4 @@
-"""Map of all vehicles in metres, north up."""
+"""Map of all vehicles: metres east and north of the common origin, north up."""
 
 import math
 import re
@@ -15,25 +15,26 @@ from nedbus_msgs import Address
 
 from .background import Background
 from .column_data import NAMES, Track, Tracks, replace, table
-from .fleet import TRUTH, Fleet, Picture, Row
-from .stream import Place
+from .fleet import TRUTH, Fleet, FleetSnapshot, VehicleView
+from .stream import Position
 from .style import MARKERS, Style
 
 FOCUSES: Final = ("all", "follow", "vehicle")
-MIN_SIDE: Final = 20.0  # minimum side of the map [m]; anything smaller shows the noise of a vehicle at rest
-_MIN_ZOOM: Final = 0.01  # m; smallest visible range taken from the browser
+MIN_SIDE: Final = 20.0  # minimum side of the map [m]; a smaller one would magnify the noise of a vehicle at rest
+_MIN_ZOOM: Final = 0.01  # m; smallest visible range accepted from the browser
 _MARGIN: Final = 0.08  # margin on each side, as a fraction of the extent
 _FOLLOWED_SIDE: Final = 60.0  # m; side of the map while following a vehicle
 _LETTER, _HEIGHT, _MARK = 6.5, 12.0, 5.0  # pixels; width of a character, height of a label, radius of a marker
 _MAX_EVENTS: Final = 60  # latest events marked on the map
+_Placed = Sequence[tuple[VehicleView, Position]]
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 
 
 class Map:
     """The map of one viewer.
 
-    `marks` has a row per vehicle in `shown`, `events` a row per event in `shown_events`; both can be tapped.
-    `focus`: one of FOCUSES; `is_long`: True for trails longer than a minute; `truth`: True to draw ground truth.
+    `marks`: a row per vehicle in `shown`; `events`: a row per event in `shown_events`; both can be tapped.
+    `focus`: one of FOCUSES; `is_long`: draw trails longer than a minute; `truth`: draw the ground truth.
     """
 
     def __init__(self, style: Style, background: Background | None) -> None:
@@ -51,41 +52,40 @@ class Map:
         self._frame = table("east", "north")
         self.figure = self._draw()
 
-    def update(self, picture: Picture, whole: Fleet, row: Row | None) -> None:
-        """Move the markers and extend the tracks; `row` is the selected vehicle, `whole` has the long tracks."""
+    def update(self, snapshot: FleetSnapshot, overview: Fleet, chosen: VehicleView | None) -> None:
+        """Move the markers and extend the tracks; `chosen`: the selected vehicle, `overview`: has the long tracks."""
         tracks: dict[Address, Track] = {}
-        for each in sorted(picture.rows, key=lambda each: each.number):
-            for line in each.lines:
-                if line is each.main or (self.truth and line.address.topic == TRUTH):
-                    kept = whole.streams.get(line.address) if self.is_long else None
-                    tracks[line.address] = kept.long if kept is not None else line.stream.minute, each.number
+        for each in sorted(snapshot.vehicles, key=lambda each: each.number):
+            for stream in each.streams:
+                if stream is each.main or (self.truth and stream.address.topic == TRUTH):
+                    kept = overview.streams.get(stream.address) if self.is_long else None
+                    tracks[stream.address] = kept.long if kept is not None else stream.stream.minute, each.number
         self._tracks.update(tracks)
-        placed = [(each, place) for each in picture.rows if (place := each.main.stream.valid) is not None]
-        chosen = [(each, place) for each, place in placed if each is row]
-        frame = self._frame_of(chosen or placed if self.focus == "vehicle" else placed, tracks)
-        if self.focus == "follow" and chosen:
+        placed = [(each, position) for each in snapshot.vehicles if (position := each.main.stream.valid) is not None]
+        focused = [(each, position) for each, position in placed if each is chosen]
+        frame = self._frame_of(focused or placed if self.focus == "vehicle" else placed, tracks)
+        if self.focus == "follow" and focused:
             half = _FOLLOWED_SIDE / 2
-            frame = [[middle - half, middle + half] for middle in chosen[0][1][:2]]
+            frame = [[middle - half, middle + half] for middle in focused[0][1][:2]]
         replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
-        labels = self._labels(placed, row, frame)
-        marks = [self._mark(each, place, labels.get(each.vehicle)) for each, place in placed]
-        replace(self.marks, marks)
+        labels = self._labels(placed, chosen, frame)
+        replace(self.marks, [self._mark(each, position, labels.get(each.vehicle)) for each, position in placed])
         self.shown = [each.vehicle for each, _ in placed]
-        ephs = [each.main.stream.last.message.eph for each, _ in chosen if each.main.stream.last is not None]
+        ephs = [each.main.stream.last.message.eph for each, _ in focused if each.main.stream.last is not None]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
-        replace(self._ring, [{"east": place.east, "north": place.north, "radius": radius} for _, place in chosen])
-        if self._background is not None and whole.origin.projection is not None:
-            self._background.draw(self.figure, self._style, whole.origin.projection)
+        replace(self._ring, [{"east": at.east, "north": at.north, "radius": radius} for _, at in focused])
+        if self._background is not None and overview.origin.projection is not None:
+            self._background.draw(self.figure, self._style, overview.origin.projection)
             self._background = None
 
-    def mark(self, events: Sequence[Event], row: Row | None, whole: Fleet) -> None:
-        """Mark the positions of the selected vehicle at its events."""
-        placed: list[tuple[Event, Place]] = []
-        if row is not None:
-            stream = whole.streams.get(row.main.address, row.main.stream)
+    def mark(self, events: Sequence[Event], chosen: VehicleView | None, overview: Fleet) -> None:
+        """Mark where the selected vehicle was at each of its events."""
+        placed: list[tuple[Event, Position]] = []
+        if chosen is not None:
+            stream = overview.streams.get(chosen.main.address, chosen.main.stream)
             events = events[-_MAX_EVENTS:]
-            places = stream.places_at([event.time for event in events])
-            placed = [(event, place) for event, place in zip(events, places, strict=True) if place is not None]
+            positions = stream.positions_at([event.time for event in events])
+            placed = [(event, at) for event, at in zip(events, positions, strict=True) if at is not None]
         self.shown_events = [event for event, _ in placed]
         marks = [
             {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.words[:80],
@@ -95,13 +95,13 @@ class Map:
         replace(self.events, marks)
 
     def resize(self, size: str) -> None:
-        """Set the size of the map as reported by the browser, such as 600x500 [pixels]; ignore other text."""
+        """Set the map size that the browser reported, such as "600x500" [pixels]; ignore malformed text."""
         if found := _SIZE.fullmatch(size):
             self.size = float(found[1]), float(found[2])
 
-    def _frame_of(self, shown: Sequence[tuple[Row, Place]], tracks: dict[Address, Track]) -> list[list[float]]:
+    def _frame_of(self, shown: _Placed, tracks: dict[Address, Track]) -> list[list[float]]:
         """Return the extent of the map: [west, east], [south, north] [m]."""
-        points = [np.array([place[:2] for _, place in shown] or [(0.0, 0.0)])]
+        points = [np.array([position[:2] for _, position in shown] or [(0.0, 0.0)])]
         points += [tracks[each.main.address][0].points()[:, 1:3] for each, _ in shown]
         found = np.concatenate(points)
         sides = []
@@ -111,8 +111,8 @@ class Map:
             sides.append([math.floor((low - grow) / step) * step, math.ceil((high + grow) / step) * step])
         return sides
 
-    def _labels(self, shown: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]) -> dict[str, bool]:
-        """Return the names that have room, the most severe vehicles first, and whether each is left of its marker."""
+    def _labels(self, shown: _Placed, chosen: VehicleView | None, frame: list[list[float]]) -> dict[str, bool]:
+        """Return the labels that fit, the most severe vehicles first, and whether each is left of its marker."""
         (west, east), (south, north) = frame
         width, height = self.size
         scale, right = max((east - west) / width, (north - south) / height), east  # m per pixel
@@ -120,14 +120,14 @@ class Map:
         if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
             scale, right = (end - start) / width, end
         places = [(each, at.east / scale, at.north / scale) for each, at in shown]
-        severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is row}  # may cover other markers
+        severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is chosen}  # may cover markers
         taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
         labels: dict[str, bool] = {}
-        for each, x, y in sorted(places, key=lambda known: known[0] is not row):
+        for each, x, y in sorted(places, key=lambda known: known[0] is not chosen):
             name, low, size = each.vehicle, y + _MARK, len(each.vehicle) * _LETTER + 2 * _MARK
-            is_left = x + size > right / scale  # it would extend beyond the map
+            is_left = x + size > right / scale  # otherwise it would extend beyond the map
             begin, end = (x - size, x) if is_left else (x, x + size)
-            if each is row or all(
+            if each is chosen or all(
                 end < left or wide < begin or low + _HEIGHT <= bottom or top <= low
                 for owner, left, wide, bottom, top in taken
                 if owner != name and (owner in ("", *severe) or name not in severe)
@@ -136,16 +136,16 @@ class Map:
                 labels[name] = is_left
         return labels
 
-    def _mark(self, row: Row, place: Place, is_left: bool | None) -> dict[str, Any]:
-        """Return a vehicle's marker, shaped by grade: filled at its current position, open at its last valid one."""
-        last = row.main.stream.last
+    def _mark(self, view: VehicleView, at: Position, is_left: bool | None) -> dict[str, Any]:
+        """Return a marker shaped by grade: filled at the current position, open at the last valid one."""
+        last = view.main.stream.last
         heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
-        colour = self._style.vehicle(row.number)
+        colour = self._style.vehicle(view.number)
         return {
-            "east": round(place.east, 3), "north": round(place.north, 3), "angle": round(math.pi / 2 - heading, 3),
-            "shape": MARKERS[row.grade], "colour": colour, "fill": colour if row.is_here else self._style.ground,
-            "edge": colour if row.grade == "ok" else self._style.grades[row.grade],
-            "label": "" if is_left is None else row.vehicle, "name": row.vehicle, "words": row.state.text,
+            "east": round(at.east, 3), "north": round(at.north, 3), "angle": round(math.pi / 2 - heading, 3),
+            "shape": MARKERS[view.grade], "colour": colour, "fill": colour if view.has_position else self._style.ground,
+            "edge": colour if view.grade == "ok" else self._style.grades[view.grade],
+            "label": "" if is_left is None else view.vehicle, "name": view.vehicle, "words": view.state.text,
             "align": "right" if is_left else "left", "offset": -11 if is_left else 11,
         }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Playback of a recording: its messages and events, and a clock with play, pause and seek."""
+"""Playback of recordings: messages and events in memory, and a clock with play, pause and seek."""
 
 import logging
 import threading
@@ -16,36 +16,36 @@ from nedbus.errors import NedbusError
 from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.sources import KEPT_OF_FILE, Flights, follow
+from nedbus.sources import MAX_FILE_EVENTS, Flights, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
-from .chronicle import Chronicle
+from .event_timeline import EventTimeline
 from .fleet import Fleet
 from .stream import is_position
 
 _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s of history loaded before the playback position
-_WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two points
-_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # topics shown as values
+_OVERVIEW: Final = 20_000, 0.5  # number of points of a whole flight, and s between two points
+_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # topics with shown values
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
 class Recording:
-    """The messages of files in time order, loaded in a background thread.
+    """The messages of one or several files in order of time, loaded in a background thread.
 
-    Positions and the topics whose values are shown are kept as payloads; of all others, only PX4's timestamp.
-    `whole`: the flight at two points per second; `chronicle`: the events, in seconds since the first message.
-    `entries`: for each message its address, and its payload, timestamp or reason of rejection.
-    `dues`: for each message its time since the first message [s].
+    Positions and topics whose values are shown are kept as payloads; of all others, only PX4's timestamp.
+    `overview`: the whole flight at two points per second; `timeline`: the events, in seconds since the first message.
+    `entries`: address of each message, and its payload, timestamp or reason of rejection.
+    `dues`: time of each message since the first one [s].
 
-    Raises ConfigError and SourceError if the file cannot be read.
+    Raises ConfigError and SourceError if a file cannot be read.
     """
 
     def __init__(self, *paths: Path) -> None:
         self.name = ", ".join(path.name for path in paths)
-        self.whole = Fleet(long=_WHOLE)
-        self.chronicle = Chronicle(Account(KEPT_OF_FILE), times=Times())
+        self.overview = Fleet(long=_OVERVIEW)
+        self.timeline = EventTimeline(Account(MAX_FILE_EVENTS), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
@@ -59,9 +59,9 @@ class Recording:
         return self.dues[-1] if self.dues else 0.0
 
     def _read(self) -> None:
-        flights, account = self._flights, self.chronicle.account
+        flights, account = self._flights, self.timeline.account
         try:
-            self.chronicle.times = flights.times
+            self.timeline.times = flights.times
             for message, reason, payload in follow(flights.messages(), account, ended=flights.ended):
                 address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
                 kept: bytes | str | int = stamp if reason is None else reason
@@ -69,9 +69,9 @@ class Recording:
                     kept = payload
                     if is_position(address):
                         row = codec_of(DEFAULT).decode_row(payload)
-                        self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
+                        self.overview.add(Sample(row, address, round(message.due * 1e9)), message.due)
                 if reason is None and address not in self.indices and is_position(address):
-                    self.chronicle.set_start(address.vehicle, stamp / 1e6, message.due)
+                    self.timeline.set_start(address.vehicle, stamp / 1e6, message.due)
                 self.indices.setdefault(address, []).append(len(self.entries))
                 self.entries.append((address, kept))
                 self.dues.append(message.due)
@@ -86,24 +86,24 @@ class Recording:
 class Player:
     """Playback of a recording for one viewer; `fleet` shows the playback position.
 
-    `on_jump` is called after each seek; `controls`: the play button, speed menu and slider of the page.
+    `on_seek`: called after each seek; `controls`: play button, speed menu and slider of the page.
     """
 
     def __init__(self, recording: Recording) -> None:
-        self.fleet = Fleet(recording.whole.origin)
-        self.on_jump: Callable[[], object] = lambda: None
+        self.fleet = Fleet(recording.overview.origin)
+        self.on_seek: Callable[[], object] = lambda: None
         self.time = 0.0
         self.recording = recording
         self._monitor = Monitor()
         self._next = 0
         self._ticked = time.monotonic()
-        self._shown = 0.0  # as last set: the slider has another value while it is dragged
+        self._shown = 0.0  # last value set by the player; the slider has another one while it is dragged
         self._play = Toggle(label="pause", active=True, width=80)
         self._speed = Select(options=_SPEEDS, value="1", width=80)
         self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
         self.controls = self._play, self._speed, self._slider
         self._play.on_change("active", lambda _, __, active: self._play.update(label="pause" if active else "play"))
-        self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
+        self._slider.on_change("value_throttled", lambda _, __, value: self.seek(value))
 
     def tick(self) -> None:
         """Advance the playback position by the elapsed time."""
@@ -121,29 +121,29 @@ class Player:
         """Toggle between play and pause; with `pause`, pause."""
         self._play.active = not (pause or self._play.active)
 
-    def jump(self, seconds: float) -> None:
-        """Seek to a time within the part read so far, and load the minute before it."""
+    def seek(self, seconds: float) -> None:
+        """Seek to a time, limited to the part read so far, and load the minute before it."""
         self._shown = self._slider.value
         self.fleet.clear()
         self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.recording.length)
         self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
         indices = list(self.recording.indices.values())
         silent = (known[at - 1] for known in indices if (at := bisect_left(known, self._next)))
-        for index in sorted(silent):  # the last message of streams that are silent in this minute
+        for index in sorted(silent):  # the last message of each stream that was silent in this minute
             self._show(index)
         for address, stream in self.fleet.streams.items():
-            whole = self.recording.whole.streams.get(address)
-            if stream.valid is None and whole is not None:
-                (stream.valid,) = whole.places_at([self.time])
+            overview = self.recording.overview.streams.get(address)
+            if stream.valid is None and overview is not None:
+                (stream.valid,) = overview.positions_at([self.time])
         self._feed()
-        self.on_jump()
+        self.on_seek()
 
     def _feed(self) -> None:
         end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
             self._show(index)
         self._next = max(self._next, end)
-        states = {name: state_at(spans, self.time) for name, spans in self.recording.chronicle.spans.items()}
+        states = {name: state_at(spans, self.time) for name, spans in self.recording.timeline.spans.items()}
         self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states)
 
     def _show(self, index: int) -> None:

@@ -35,27 +35,27 @@ from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection
 
 from .background import Background
-from .chronicle import PAST, Chronicle
+from .event_timeline import PAST, EventTimeline
 from .fleet import Fleet
 from .playback import Player, Recording
 from .viewer import Viewer
 
 _log = logging.getLogger(__name__)
 
-MAX_VIEWERS: Final = 32  # maximum number of pages open at the same time: each has a WebSocket
+MAX_VIEWERS: Final = 32  # pages open at the same time, each with a WebSocket
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - wildcard hosts, only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
-_MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before Host is checked
+_MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before the Host header is checked
 _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
-_MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, of which all but the newest are about to expire
-_MAX_CONNECTIONS: Final = 512  # or half of the open files that the process may have
-_PING: Final = 15.0  # s between pings of a WebSocket, which is closed unless the answer arrives before the next one
-_UNUSED_LIFETIME: Final = 15_000  # ms; a page is kept this long without its browser, for example during a short sleep
+_MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket; all but the newest are about to expire
+_MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
+_PING: Final = 15.0  # s between WebSocket pings; without a pong before the next one, the connection is closed
+_UNUSED_LIFETIME: Final = 15_000  # ms that a page is kept without its browser, which may be suspended
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
-    """Options of a page: host, port, further origins that browsers may use, and the background file of the map."""
+class PageOptions:
+    """Options of a page: host, port, additional allowed origins, and the background file of the map."""
 
     host: str
     port: int
@@ -64,42 +64,43 @@ class Where:
 
 
 def serve_live(
-    bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
-) -> None:
-    """Serve the page of a selection until `stop` is set; call `tell` with its URL once it listens.
+    bus: Bus, selection: Selection, options: PageOptions, *, version: str, stop: threading.Event,
+    on_listening: Callable[[str], object],
+) -> None:  # fmt: skip
+    """Serve a page of the selected streams until `stop` is set; call `on_listening` with the URL once it listens.
 
-    Raises ConfigError for an invalid background, ListenError if it cannot listen.
+    Raises ConfigError for an invalid background, ListenError if the address is not available.
     """
     live = LiveFleet(bus, selection, version=version)
-    background = None if where.background is None else Background(where.background)
-    server = WebServer(where, lambda page: Viewer(page, live.fleet, live.chronicle, background=background), live.pages)
+    background = None if options.background is None else Background(options.background)
+    server = WebServer(options, lambda page: Viewer(page, live.fleet, live.timeline, background=background), live.pages)
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
         reading = pool.submit(live.run, stop)  # sets `stop` when it fails
-        tell(server.url)
+        on_listening(server.url)
         server.run(stop)
         reading.result()
 
 
 def serve_recording(
-    paths: Sequence[Path], where: Where, *, stop: threading.Event, tell: Callable[[str], object]
+    paths: Sequence[Path], options: PageOptions, *, stop: threading.Event, on_listening: Callable[[str], object]
 ) -> None:
-    """Serve the page of files until `stop` is set; each viewer has its own playback position.
+    """Serve a page of recordings until `stop` is set; each viewer has its own playback position.
 
-    Raises ConfigError and SourceError if the file cannot be read, and the errors of `serve_live`.
+    Raises ConfigError and SourceError if a file cannot be read, and the errors of `serve_live`.
     """
-    recording, background = Recording(*paths), None if where.background is None else Background(where.background)
+    recording, background = Recording(*paths), None if options.background is None else Background(options.background)
 
     def open_page(document: Document) -> None:
         player = Player(recording)
-        Viewer(document, player.fleet, recording.chronicle, title=recording.name, background=background, player=player)
+        Viewer(document, player.fleet, recording.timeline, title=recording.name, background=background, player=player)
 
-    server = WebServer(where, open_page, {"/healthz": lambda: Page.text("ok")})
-    tell(server.url)
+    server = WebServer(options, open_page, {"/healthz": lambda: Page.text("ok")})
+    on_listening(server.url)
     server.run(stop)
 
 
 class LiveFleet(Exporter):
-    """Exporter that also keeps the fleet and chronicle of a page."""
+    """Exporter that also maintains the fleet and the event timeline of a page."""
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         super().__init__(bus, selection, version=version)
@@ -111,18 +112,18 @@ class LiveFleet(Exporter):
             for event in report.events
             if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
         ]
-        self.chronicle = Chronicle(self.account, before=remembered)
+        self.timeline = EventTimeline(self.account, before=remembered)
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample to the metrics and the fleet."""
+        """Add a sample to the metrics and to the fleet."""
         super().add(sample)
         self.fleet.add(sample, clock.steady())
 
     def poll(self) -> Snapshot:
-        """Poll all vehicles, and update the fleet and the clock of the chronicle."""
+        """Poll all vehicles; update the fleet and the clock of the timeline."""
         snapshot, account = super().poll(), self.account
-        ahead = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
-        self.chronicle.start, self.chronicle.times = ahead, Times(is_live=True, ahead=ahead)
+        ahead = round(clock.to_utc(), 1)  # rounded: each change redraws the time axes
+        self.timeline.start, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
         vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}
         self.fleet.update(snapshot, states, self.log_streams)
@@ -130,46 +131,46 @@ class LiveFleet(Exporter):
 
 
 class WebServer:
-    """Serve the Bokeh page, and text pages by path.
+    """Server of the Bokeh page and of text pages by path.
 
-    Protects against cross-site requests and DNS rebinding by other sites in the same browser: requests must use a host
-    name that such a site cannot control, as for `HttpServer`, or one of `where.origins`.
+    Rejects cross-site requests and DNS rebinding by other sites in the same browser: the Host header must be a name
+    that such a site cannot control, as for `HttpServer`, or one of `options.origins`.
 
-    Raises ListenError when it cannot listen there.
+    Raises ListenError if the address is not available.
     """
 
     def __init__(
-        self, where: Where, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
+        self, options: PageOptions, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
     ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
             logging.getLogger(name).setLevel(logging.ERROR)  # they log a warning for each closed tab
-        host = where.host
+        host = options.host
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
             sessions = self._server.get_sessions("/")
             waiting = [each for each in sessions if not each.connection_count]
-            for each in waiting[:-MAX_VIEWERS]:  # requested by a program that opens no WebSocket
+            for each in waiting[:-MAX_VIEWERS]:  # requested by clients that open no WebSocket
                 each.request_expiration()
             if len(sessions) - len(waiting) >= MAX_VIEWERS or len(waiting) >= _MAX_WAITING:
-                _log_once("limit of open pages reached", limit=MAX_VIEWERS)
+                _log_once("limit of open pages reached (%d): further ones are refused", MAX_VIEWERS)
                 document.add_root(Div(text=f"limit of {MAX_VIEWERS} open pages reached: close one"))
             else:
                 open_page(document)
 
         try:
-            sockets, port = bind_sockets(host, where.port)
+            sockets, port = bind_sockets(host, options.port)
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --http"
-            raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
+            raise ListenError([f"http://{host}:{options.port}"], reason, hint=hint) from exc
         tornado = BokehTornado(
             {"/": Application(FunctionHandler(open_or_refuse))},
-            extra_websocket_origins=["*"], auth_provider=_Names(where),
-            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's own job drops sessions amid a message
+            extra_websocket_origins=["*"], auth_provider=_HostCheck(options),
+            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's own job drops sessions during a message
             unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
             websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
-            extra_patterns=[(path, _Text, {"make": make, "where": where}) for path, make in pages.items()],
+            extra_patterns=[(path, _TextHandler, {"make": make, "options": options}) for path, make in pages.items()],
         )  # fmt: skip
         http = _HttpServer(
             tornado, max_body_size=_MAX_BODY_BYTES, max_buffer_size=2 * _MAX_MESSAGE_BYTES,
@@ -192,7 +193,7 @@ class WebServer:
 
 
 class _HttpServer(HTTPServer):
-    """Closes connections beyond a limit: with no file left, accepting the next one would fail again and again."""
+    """Close connections above a limit: without a free file descriptor, `accept` would fail in a busy loop."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
@@ -202,7 +203,7 @@ class _HttpServer(HTTPServer):
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         self._streams = [each for each in self._streams if not each.closed()]
         if len(self._streams) >= self._limit:
-            _log_once("limit of connections reached", limit=self._limit)
+            _log_once("limit of connections reached (%d): further ones are closed", self._limit)
             stream.close()
             return
         self._streams.append(stream)
@@ -210,52 +211,52 @@ class _HttpServer(HTTPServer):
 
 
 @cache
-def _log_once(text: str, *, limit: int) -> None:
-    _log.warning("%s, further ones are refused: %d", text, limit, extra=about("http"))
+def _log_once(text: str, limit: int) -> None:
+    _log.warning(text, limit, extra=about("http"))
 
 
-class _Names(NullAuth):
-    """Reject requests under foreign host names, before each response; all viewers are the same user."""
+class _HostCheck(NullAuth):
+    """Reject requests with a foreign Host header before each response; all viewers are the same user."""
 
     login_url = "/"  # required by Bokeh, never used
     get_user_async: Any = None
 
-    def __init__(self, where: Where) -> None:
+    def __init__(self, options: PageOptions) -> None:
         async def check(handler: RequestHandler) -> str:
-            _require_name(handler, where)
-            if handler.request.path.endswith("/ws"):  # without a page's token, Bokeh would log a traceback
+            _check_host(handler, options)
+            if handler.request.path.endswith("/ws"):  # without a valid token, Bokeh would log a traceback
                 name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
                 try:
                     is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
-                except Exception:  # noqa: BLE001 - Bokeh raises whatever its decoders raise
+                except Exception:  # noqa: BLE001 - Bokeh does not translate the errors of its decoders
                     is_valid = False
                 if not is_valid:
-                    raise HTTPError(403, reason="no valid token of a page")
+                    raise HTTPError(403, reason="WebSocket without a valid page token")
             return "viewer"
 
         self.get_user_async = check
         super().__init__()
 
 
-def _require_name(handler: RequestHandler, where: Where) -> None:
+def _check_host(handler: RequestHandler, options: PageOptions) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
     origin = headers.get("Origin", f"//{host}").partition("//")[2]  # "Origin: null" has no host
-    is_own = host in where.origins or leads_here(host, local=is_loopback(where.host))
-    if not is_own or origin not in (host, *where.origins):
-        name = origin if is_own else host
-        raise HTTPError(403, reason=f"host name {name[:100]} is not allowed: add it with --origin")
+    is_own = host in options.origins or leads_here(host, local=is_loopback(options.host))
+    if not is_own or origin not in (host, *options.origins):
+        name = (origin if is_own else host)[:100]
+        raise HTTPError(403, reason=f"host name {name} is not allowed: add it with --origin")
     if headers.get("Sec-Fetch-Site") == "cross-site" and headers.get("Sec-Fetch-Dest") != "document":
-        raise HTTPError(403, reason="part of a page of another site")
+        raise HTTPError(403, reason="cross-site request")
 
 
-class _Text(RequestHandler):
-    def initialize(self, make: Callable[[], Page], where: Where) -> None:
-        self._make, self._where = make, where
+class _TextHandler(RequestHandler):
+    def initialize(self, make: Callable[[], Page], options: PageOptions) -> None:
+        self._make, self._options = make, options
 
     def get(self) -> None:
-        if is_loopback(self._where.host):
-            _require_name(self, self._where)
+        if is_loopback(self._options.host):
+            _check_host(self, self._options)
         page = self._make()
         self.set_status(page.status)
         self.set_header("Content-Type", page.content_type)

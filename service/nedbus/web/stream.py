@@ -1,4 +1,4 @@
-"""Stream of a page: its last sample and, for positions, histories at 10 Hz and 1 Hz; no I/O."""
+"""A stream on the page: its last sample and, for positions, histories at 10 Hz and 1 Hz; no I/O."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "err
 """Columns of a history, NaN where the message was not valid.
 
 `time`: ms since the Unix epoch or the start of a recording.
-`doubtful`: 1 while dead reckoning or of unknown validity, else 0.
+`doubtful`: 1 while dead reckoning or if the validity is unknown, else 0.
 `speed`: horizontal [m/s]. The others are in m: `height` above the vehicle's own origin, `error` from the ground truth.
 """
 
@@ -37,11 +37,11 @@ def is_position(address: Address) -> bool:
     return BY_TOPIC.get(address.topic) is DEFAULT
 
 
-class Place(NamedTuple):
+class Position(NamedTuple):
     """A position [m].
 
-    `common`: True if east and north are from the common origin, False if from the vehicle's own.
-    `altitude`: above mean sea level if that is known, else above the vehicle's own origin.
+    `common`: True if relative to the common origin, False if relative to the vehicle's own.
+    `altitude`: above mean sea level if known, else above the vehicle's own origin.
     """
 
     east: float
@@ -51,15 +51,15 @@ class Place(NamedTuple):
 
 
 class History:
-    """Ring buffer of the last points, shape (size, columns); `written` counts all points written so far."""
+    """Ring buffer of the newest `size` points; `written` counts all points written so far."""
 
     def __init__(self, size: int, step: float) -> None:
         self.size, self.step = size, step
         self.written = 0
-        self._points = np.empty((size, len(COLUMNS)))  # uses no memory until written, which only positions are
+        self._points = np.empty((size, len(COLUMNS)))  # uses memory only once written, as for positions
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
-        """Return points `begin` to `end` in order, without those already overwritten; shape (n, columns)."""
+        """Return points `begin` to `end` that are not overwritten yet, oldest first; shape (n, columns)."""
         end = self.written if end is None else end
         return self._points[np.arange(max(begin, end - self.size, 0), end) % self.size]
 
@@ -75,8 +75,8 @@ class Origin:
 
     projection: MapProjection | None = None
 
-    def place(self, message: VehicleLocalPosition, missing: frozenset[str] = frozenset()) -> Place:
-        """Return the position in a message; NaN where it is not valid. Fields that are `missing` are unknown."""
+    def locate(self, message: VehicleLocalPosition, missing: frozenset[str] = frozenset()) -> Position:
+        """Return the position in a message, NaN where invalid; validity flags in `missing` are unknown."""
         position = to_global(message)
         north, east = message.x, message.y
         if position:
@@ -86,27 +86,27 @@ class Origin:
             north = east = math.nan
         altitude = (message.ref_alt if message.z_global else 0.0) - message.z
         has_height = message.z_valid or "z_valid" in missing
-        return Place(east, north, altitude if has_height else math.nan, bool(position))
+        return Position(east, north, altitude if has_height else math.nan, bool(position))
 
 
 class PageStream:
     """Last sample and histories of one stream.
 
-    `last`: the last sample; `time`: its time of arrival [s]; `valid`: the last valid position, None if there was none.
+    `last`: the last sample; `time`: its arrival time [s]; `valid`: the last valid position, if any.
     """
 
     def __init__(self, origin: Origin, long: tuple[int, float] = LONG) -> None:
         self.minute, self.long = History(POINTS, _STEP), History(*long)
         self.last: Sample[Any] | None = None
         self.time = -math.inf
-        self.valid: Place | None = None
+        self.valid: Position | None = None
         self.origin = origin
         self._tracker = ResetTracker()
         self._state: object = None
         self._sampled = self._sampled_long = -math.inf
 
     def add(self, sample: Sample[Any], time: float, truth: PageStream | None = None) -> None:
-        """Add a sample received at `time` [s]; `truth` is the ground truth of its vehicle."""
+        """Add a sample received at `time` [s]; `truth`: the ground truth stream of its vehicle."""
         before, self.last, self.time = self.last, sample, time
         if not is_position(sample.address):
             return
@@ -115,49 +115,49 @@ class PageStream:
             if time - self._sampled < _STEP:
                 return
         elif before is not None:
-            self._tracker.add(before.message)  # the tracker must see the last message before a jump
+            self._tracker.add(before.message)  # the tracker needs the last message before the change
         self._state, self._sampled = state, time
         message, missing = sample.message, sample.provenance.missing
-        track, place = self._tracker.add(message), self.origin.place(message, missing)
+        track, position = self._tracker.add(message), self.origin.locate(message, missing)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
             gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
             self.minute.write(gap)
             self.long.write(gap)
             self._sampled_long = -math.inf
-        if math.isfinite(place.north):
-            self.valid = place
+        if math.isfinite(position.north):
+            self.valid = position
         height = -message.z if message.z_valid or "z_valid" in missing else math.nan
         speed = math.hypot(message.vx, message.vy) if message.v_xy_valid or "v_xy_valid" in missing else math.nan
-        error = _distance(place, message, truth)
+        error = _distance(position, message, truth)
         doubtful = float(message.dead_reckoning or "xy_valid" in missing)
-        point = [time * 1e3, place.east, place.north, height, speed, message.eph, message.epv, error, doubtful]
+        point = [time * 1e3, position.east, position.north, height, speed, message.eph, message.epv, error, doubtful]
         self.minute.write(point)
         if time - self._sampled_long >= self.long.step:
             self._sampled_long = time
             self.long.write(point)
 
-    def places_at(self, times: list[float]) -> list[Place | None]:
-        """Return the last valid position at each time [s]; None before the beginning of the histories."""
+    def positions_at(self, times: list[float]) -> list[Position | None]:
+        """Return the last valid position at each time [s], None before the histories begin."""
         points = np.concatenate([self.long.points(), self.minute.points()])
         points = points[~np.isnan(points[:, 1])]
         points = points[points[:, 0].argsort(kind="stable")]
         numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
         found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
-        return [None if place is None else Place(place[0], place[1], math.nan, True) for place in found]
+        return [None if position is None else Position(position[0], position[1], math.nan, True) for position in found]
 
 
-def _distance(place: Place, message: VehicleLocalPosition, truth: PageStream | None) -> float:
-    """Return the distance to the ground truth at the same time [m], NaN if there is none."""
-    if truth is None or truth.last is None or not math.isfinite(place.north):
+def _distance(position: Position, message: VehicleLocalPosition, truth: PageStream | None) -> float:
+    """Return the distance to the ground truth, extrapolated to the same time [m]; NaN if there is none."""
+    if truth is None or truth.last is None or not math.isfinite(position.north):
         return math.nan
     real = truth.last.message
-    other = truth.origin.place(real)
+    other = truth.origin.locate(real)
     seconds = ((message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)) / 1e6
-    if other.common != place.common or abs(seconds) > _MAX_TRUTH_AGE:
+    if other.common != position.common or abs(seconds) > _MAX_TRUTH_AGE:
         return math.nan
     offsets = [
-        other.east + real.vy * seconds - place.east,
-        other.north + real.vx * seconds - place.north,
-        other.altitude - real.vz * seconds - place.altitude,
+        other.east + real.vy * seconds - position.east,
+        other.north + real.vx * seconds - position.north,
+        other.altitude - real.vz * seconds - position.altitude,
     ]
     return math.hypot(*(offset for offset in offsets if math.isfinite(offset)))

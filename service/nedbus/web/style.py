@@ -1,4 +1,4 @@
-"""Style of the page: dark and light theme, shapes of states, and text templates."""
+"""Style of the page: dark and light theme, state symbols, and text templates."""
 
 import math
 import re
@@ -16,10 +16,10 @@ from .fleet import MAX_STREAMS
 from .stream import is_position
 
 SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "info": "●"}
-"""Text symbol of a grade or of an event's severity."""
+"""Text symbol of a grade or event severity."""
 MARKERS: Final[Mapping[str, str]] = {"bad": "square", "watch": "triangle", "ok": "circle", "info": "circle"}
 """Bokeh marker of the same shape."""
-PALETTE: Final = 8  # number of vehicle colours, all distinct from the colours of states
+PALETTE: Final = 8  # number of vehicle colours; none is a state colour
 
 
 def read_asset(name: str) -> str:
@@ -29,7 +29,7 @@ def read_asset(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """Colours of a page, with its plot theme and CSS; the contrast of text on the ground is at least 4.5."""
+    """Colours of the page, its CSS and its plots; text has a contrast ratio of at least 4.5 (WCAG 2 AA)."""
 
     name: str
     ground: str
@@ -56,7 +56,7 @@ class Style:
 
 @cache
 def panels() -> jinja2.Template:
-    """Return the macros of `panels.html`, which need a style, a chronicle and its `moment`."""
+    """Return the template of `panels.html`; its context is a style, a timeline and the timeline's `moment`."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=to_age, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)

@@ -1,4 +1,4 @@
-"""Plots over time: the event timeline of all vehicles, and values of the selected one."""
+"""Plots over time: the events of all vehicles, and values of the selected one."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -13,21 +13,21 @@ from .column_data import replace, table
 from .stream import COLUMNS, History
 from .style import MARKERS, SHAPES, Style
 
-_MAX_ROWS: Final = 7  # vehicles, or one fewer and the number of the others
+_MAX_ROWS: Final = 7  # vehicles; if there are more, the last row counts the hidden ones
 _MAX_MARKS: Final = 2000
-_MIN_ROWS: Final = 4  # rows of height, to keep the bars of a few vehicles thin
+_MIN_ROWS: Final = 4  # minimum height in rows, which keeps the bars of few vehicles thin
 _PLOTS: Final = {
     "height above own origin [m]": ("height",),
     "horizontal speed [m/s]": ("speed",),
     "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
 }
-_LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} phase of flight  ▬ lasting  ┊ now"
+_LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} phase of flight  ▬ duration  ┊ now"
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _OF_TRUTH: Final = {"height", "speed"}
 
 
 def notable(events: Iterable[Event]) -> list[Event]:
-    """Return the events that are shown: faults and phases of a flight; of more than 2,000 the latest faults."""
+    """Return the events to show: faults and flight phases; if more than 2,000, only the latest faults."""
     shown = [event for event in events if event.severity != "info" or KINDS[event.kind].phase]
     return shown if len(shown) <= _MAX_MARKS else [each for each in shown if each.severity != "info"][-_MAX_MARKS:]
 
@@ -37,8 +37,8 @@ def move(axis: Range1d, begin: float, end: float) -> None:
     axis.update(start=begin * 1e3, end=end * 1e3)
 
 
-class Timeline:
-    """The timeline of one viewer; `shown` has the event of each row of `marks`, whose selection is the tapped one."""
+class TimelinePlot:
+    """The event timeline of one viewer; `shown`: the event of each row of `marks`, which can be tapped."""
 
     def __init__(self, style: Style, clock: Any) -> None:
         self.marks = table("time", "row", "marker", "colour", "words", "vehicle")
@@ -65,7 +65,7 @@ class Timeline:
         self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
         begin: float, end: float, now: float,
     ) -> None:  # fmt: skip
-        """Show the events from `begin` to `end` [s]; `vehicles` in order of importance."""
+        """Show the events from `begin` to `end` [s]; `vehicles`: the most important first."""
         events = notable(event for event in events if begin <= event.time <= end)
         held = [  # bad last, drawn over watch
             (name, span)
@@ -104,7 +104,7 @@ class Timeline:
 
 
 class Plots:
-    """Three plots with a shared time axis; `chosen` has the points of the selected stream."""
+    """Three plots with a shared time axis; `chosen`: the points of the selected stream."""
 
     def __init__(self, style: Style, clock: Any) -> None:
         self.chosen, self._truth = table(*COLUMNS), table(*COLUMNS)
@@ -115,11 +115,11 @@ class Plots:
         self._style, self._clock = style, clock
 
     def draw(self) -> Iterator[figure]:
-        """Yield new plots, each of which takes as long as the map."""
+        """Yield new plots one by one, as each takes as long to draw as the map."""
         return (self._draw(title, names) for title, names in _PLOTS.items())
 
     def update(self, chosen: History | None, truth: History | None) -> None:
-        """Send the new points of the selected stream and its ground truth."""
+        """Add the new points of the selected stream and of its ground truth."""
         for source, history in ((self.chosen, chosen), (self._truth, truth if truth is not chosen else None)):
             shown, seen = self._shown.get(source, (None, 0))
             end = history.written if history is not None else 0  # read once: another thread adds points
@@ -132,7 +132,7 @@ class Plots:
                 source.stream(columns, rollover=history.size)
 
     def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
-        """Mark the events of the vehicle, and shade its conditions; open ones end at `end` [s]."""
+        """Mark the events of the vehicle and shade its conditions; active ones end at `end` [s]."""
         colours = self._style.grades
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [

@@ -20,13 +20,13 @@ from nedbus.events import ALL, Event, state_at
 from nedbus_msgs import Address
 
 from .background import Background
-from .chronicle import PAST, Chronicle
-from .fleet import TRUTH, Fleet, Picture, Row
+from .event_timeline import PAST, EventTimeline
+from .fleet import TRUTH, Fleet, FleetSnapshot, VehicleView
 from .map import FOCUSES, Map
 from .playback import Player
 from .stream import is_position
 from .style import DARK, LIGHT, panels, read_asset
-from .time_plots import Plots, Timeline, move, notable
+from .time_plots import Plots, TimelinePlot, move, notable
 
 _TICK: Final = 100  # ms between updates of the map
 _TEXT_TICKS: Final = 5  # map updates per update of text and plots
@@ -42,12 +42,12 @@ _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s 
 class Viewer:
     """One page in one browser; `update` sends changes of the fleet ten times a second.
 
-    `chronicle`: the events; `player`: the playback of a recording, None for live vehicles.
-    The URL of the page always has the current vehicle, moment, view and theme, and can be shared.
+    `timeline`: the events; `player`: playback of a recording, None for live vehicles.
+    The URL always has the selected vehicle, moment, view and theme, so it can be shared.
     """
 
     def __init__(
-        self, document: Document, fleet: Fleet, chronicle: Chronicle, *, title: str = "nedbus",
+        self, document: Document, fleet: Fleet, timeline: EventTimeline, *, title: str = "nedbus",
         background: Background | None = None, player: Player | None = None,
     ) -> None:  # fmt: skip
         request = getattr(document.session_context, "request", None)  # None without a browser
@@ -58,21 +58,21 @@ class Viewer:
         asked = query.get("time", "")
         self._requested_time = float(asked) if _SECONDS.fullmatch(asked) else None
         self._is_choice = self.chosen is not None
-        self._event: Event | None = None  # selected event of the selected vehicle
-        self._is_open = False  # the table of streams is open
+        self._event: Event | None = None  # the selected event of that vehicle
+        self._is_open = False  # True if the table of streams is open
         self._listed: list[str] = []
         self._faults: list[Event] = []
-        self._fleet, self._chronicle, self._player = fleet, chronicle, player
-        self._whole = player.recording.whole if player is not None else fleet
+        self._fleet, self._timeline, self._player = fleet, timeline, player
+        self._overview = player.recording.overview if player is not None else fleet
         self._style, self._name, self._document = LIGHT if query.get("theme") == "light" else DARK, title, document
         self._ticks = self._sent = 0
         self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0, "clock": ""})
-        self._timeline = Timeline(self._style, self._clock)
+        self._timeline_plot = TimelinePlot(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
         self._undrawn = self._plots.draw()
         self._map = Map(self._style, background)
         self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
-        context = {"style": self._style, "chronicle": chronicle, "moment": chronicle.moment}
+        context = {"style": self._style, "timeline": timeline, "moment": timeline.moment}
         self._panels: Any = panels().make_module(context)
         sheets: list[Any] = [read_asset("text.css")]
         wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
@@ -80,7 +80,7 @@ class Viewer:
         self._text = {name: Div(css_classes=[name], **wide) for name in names}
         self._search = TextInput(placeholder="search vehicle  /", css_classes=["find"], **wide)
         self._grid = column(sizing_mode="stretch_both", css_classes=["plots"], visible=False)
-        # Hidden inputs as channels to the browser: number of the update, last update drawn, click or key, URL.
+        # Hidden inputs exchange values with the browser: update number, last update drawn, action, URL.
         self._update_number, self._drawn, self._message, self._url = (TextInput(visible=False) for _ in range(4))
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
         self._update_number.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
@@ -89,7 +89,7 @@ class Viewer:
         self._search.on_change("value_input", lambda _, __, ___: self._show_now())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
         self._on_tap(self._map.events, lambda: self._map.shown_events, self._show)
-        self._on_tap(self._timeline.marks, lambda: self._timeline.shown, self._show)
+        self._on_tap(self._timeline_plot.marks, lambda: self._timeline_plot.shown, self._show)
         theme = Template(read_asset("theme.json")).substitute(self._style.colours)
         document.title, document.theme = title, Theme(json=json.loads(theme))
         document.config.update(reconnect_session=False, notify_connection_status=False)
@@ -99,29 +99,29 @@ class Viewer:
         document.add_root(self._lay_out(sheets))
         document.add_periodic_callback(self.update, _TICK)
         if player is not None:
-            player.on_jump = self._show_now
+            player.on_seek = self._show_now
 
     def update(self) -> None:
-        """Send changes: the map each time, the rest twice a second; skip this while the browser is behind."""
+        """Send changes: the map each time, the rest twice a second; do nothing while the browser falls behind."""
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]
         if drawn.isdecimal() and self._sent - int(drawn) >= _MAX_AHEAD:
             return
         self._sent += 1
-        if self._drawn.value and (plot := next(self._undrawn, None)):  # one by one, after map and list
+        if self._drawn.value and (plot := next(self._undrawn, None)):  # plots follow one by one after map and list
             self._grid.children = [*self._grid.children, plot]
-        picture = self._fleet.picture
-        if not self._is_choice and picture.rows:  # the most severe, until one is selected
-            self.chosen = picture.rows[0].vehicle
-        chosen = picture.row(self.chosen)
+        snapshot = self._fleet.snapshot
+        if not self._is_choice and snapshot.vehicles:  # the most severe one until the user selects one
+            self.chosen = snapshot.vehicles[0].vehicle
+        chosen = snapshot.vehicle(self.chosen)
         self._grid.visible = bool(self._grid.children) and chosen is not None and is_position(chosen.main.address)
-        self._map.update(picture, self._whole, chosen)
+        self._map.update(snapshot, self._overview, chosen)
         if self._ticks % _TEXT_TICKS == 0:
             self._go_to_requested()
-            moment = picture.time if self.pinned is None else self.pinned
-            self._write_all(picture, chosen, moment)
-            self._plot(picture, chosen, moment)
+            moment = snapshot.time if self.pinned is None else self.pinned
+            self._write_all(snapshot, chosen, moment)
+            self._plot(snapshot, chosen, moment)
         self._ticks += 1
         self._update_number.value = str(self._sent)
 
@@ -138,15 +138,15 @@ class Viewer:
         self.chosen, self._is_choice, self._event = vehicle, True, None
 
     def _go_to(self, seconds: float | None) -> None:
-        """Go to a moment, None for now."""
+        """Show a moment [s], or the current time if None."""
         self._event = None
         if self._player is None:
             self.pinned = seconds
         elif seconds is not None:
-            self._player.jump(seconds)
+            self._player.seek(seconds)
 
     def _go_to_requested(self) -> None:
-        """Go to the moment in the URL once the recording has been read that far."""
+        """Show the moment in the URL once the recording has been read that far."""
         time, player = self._requested_time, self._player
         if time is not None and (player is None or player.recording.is_read or time <= player.recording.length):
             if player is not None:
@@ -154,55 +154,55 @@ class Viewer:
             self._go_to(time)
             self._requested_time = None
 
-    def _write_all(self, picture: Picture, chosen: Row | None, now: float) -> None:
+    def _write_all(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
         panels, player = self._panels, self._player
-        bad = sum(each.grade == "bad" for each in picture.rows)
+        bad = sum(each.grade == "bad" for each in snapshot.vehicles)
         self._document.title = f"({bad} bad) {self._name}" if bad else self._name
-        self._clock.args = {"start": self._chronicle.start, "clock": self._chronicle.unit}
-        clock = self._chronicle.clock(picture.time) if picture.time or player else ""
+        self._clock.args = {"start": self._timeline.start, "clock": self._timeline.unit}
+        clock = self._timeline.clock(snapshot.time) if snapshot.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
-        rows = [each for each in picture.rows if wanted in each.vehicle.lower() or wanted in each.state.text.lower()]
+        rows = [each for each in snapshot.vehicles if wanted in f"{each.vehicle}\n{each.state.text}".lower()]
         self._listed = [each.vehicle for each in rows]
-        story, verdict, then, end = None, None, chosen, player.recording.length if player else picture.time
+        story, verdict, then, end = None, None, chosen, player.recording.length if player else snapshot.time
         if chosen is not None:
             at = self._event if self._event is not None and abs(now - self._event.time) < 1.0 else self.pinned
-            story = self._chronicle.story(chosen.vehicle, now, at, chosen.state.conditions)
+            story = self._timeline.story(chosen.vehicle, now, at, chosen.state.conditions)
             if story is not None:
                 is_now = player is None and self.pinned is None
-                verdict = self._chronicle.verdict(chosen.vehicle, end, None if is_now else story.since)
+                verdict = self._timeline.verdict(chosen.vehicle, end, None if is_now else story.since)
             if self.pinned is not None:
-                then = replace(chosen, state=state_at(self._chronicle.spans.get(chosen.vehicle, ()), now))
-        self._text["head"].text = panels.head(self._name, picture, clock)
+                then = replace(chosen, state=state_at(self._timeline.spans.get(chosen.vehicle, ()), now))
+        self._text["head"].text = panels.head(self._name, snapshot, clock)
         listed = panels.vehicles(rows, self.chosen)
         if player is not None:
-            faults, whole = self._chronicle.faults, self._chronicle.verdict(self.chosen or "", end)
+            faults, whole = self._timeline.faults, self._timeline.verdict(self.chosen or "", end)
             self._faults = [story.spans[0].begin for _, story in faults]
-            listed += panels.faults(faults, whole, end, len(picture.rows) > 1)
+            listed += panels.faults(faults, whole, end, len(snapshot.vehicles) > 1)
         self._text["list"].text = listed
         self._text["why"].text = panels.why(then, story, verdict, end, self.pinned)
         self._text["nums"].text = panels.numbers(chosen)
-        self._text["more"].text = panels.streams(chosen, picture.reports, self._is_open)
+        self._text["more"].text = panels.streams(chosen, snapshot.reports, self._is_open)
         long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
-        self._text["tool"].text = panels.toolbar(self._map, long, self.pinned, picture.rows, projection)
+        self._text["tool"].text = panels.toolbar(self._map, long, self.pinned, snapshot.vehicles, projection)
         query = {
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
             "view": self._map.focus if self._map.focus != "all" else None,
             "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
-        if self._drawn.value:  # the browser is connected, and will not miss it
+        if self._drawn.value:  # only once the browser is connected: it would miss the first change
             self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
 
-    def _plot(self, picture: Picture, chosen: Row | None, now: float) -> None:
+    def _plot(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
         vehicle, is_long_trail = self.chosen or "", self._map.is_long
-        is_long = is_long_trail or now < picture.time - _MINUTE
+        is_long = is_long_trail or now < snapshot.time - _MINUTE
         main = truth = None
         if chosen is not None and is_position(chosen.main.address):
-            streams = self._whole.streams if is_long else self._fleet.streams
+            streams = self._overview.streams if is_long else self._fleet.streams
             kept = streams.get(chosen.main.address), streams.get(Address(vehicle, TRUTH))
             main, truth = (None if each is None else each.long if is_long else each.minute for each in kept)
         self._plots.update(main, truth)
-        begin, end = (0.0, self._player.recording.length) if self._player else (picture.time - PAST, picture.time)
+        begin, end = (0.0, self._player.recording.length) if self._player else (snapshot.time - PAST, snapshot.time)
         if self.pinned is not None:
             move(self._plots.range, now - _AROUND, now + _AROUND)
         elif is_long_trail:
@@ -210,34 +210,34 @@ class Viewer:
         else:
             first = max(begin, now - _MINUTE)
             move(self._plots.range, first, min(first + _MINUTE, max(end, 1.0)))
-        if self._player is None:  # the timeline of live vehicles begins with the first event
-            first = next((event.time for event in self._chronicle.events if event.time > begin), now)
+        if self._player is None:  # live, the timeline begins with the first event
+            first = next((event.time for event in self._timeline.events if event.time > begin), now)
             begin = max(begin, min(first, now - _MINUTE) - 1.0)
         events = self._events_of_chosen()
-        self._plots.mark(events, self._chronicle.spans.get(vehicle, ()), end)
-        order = [*filter(None, [vehicle]), *(each.vehicle for each in picture.rows if each.vehicle != vehicle)]
-        self._timeline.update(self._chronicle.events, self._chronicle.spans, order, begin=begin, end=end, now=now)
+        self._plots.mark(events, self._timeline.spans.get(vehicle, ()), end)
+        order = [*filter(None, [vehicle]), *(each.vehicle for each in snapshot.vehicles if each.vehicle != vehicle)]
+        self._timeline_plot.update(self._timeline.events, self._timeline.spans, order, begin=begin, end=end, now=now)
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:
-            move(self._timeline.range, begin, max(end, begin + 1.0))
+            move(self._timeline_plot.range, begin, max(end, begin + 1.0))
         if self._player is not None:
-            self._text["marks"].text = self._panels.strip(self._timeline.shown, self._player.recording.length)
+            self._text["marks"].text = self._panels.strip(self._timeline_plot.shown, self._player.recording.length)
         since = 0.0 if is_long_trail else now - _MINUTE
-        self._map.mark([event for event in events if since < event.time <= now + 1.0], chosen, self._whole)
+        self._map.mark([event for event in events if since < event.time <= now + 1.0], chosen, self._overview)
 
     def _events_of_chosen(self) -> list[Event]:
-        return notable(event for event in self._chronicle.events if event.vehicle == self.chosen)
+        return notable(event for event in self._timeline.events if event.vehicle == self.chosen)
 
     def _act(self, message: str) -> None:
-        """Perform the action of a click or key, as sent by `actions.js`; ignore anything else."""
+        """Perform an action sent by `actions.js` on a click or key; ignore malformed messages."""
         action = value = ""
         with suppress(ValueError, TypeError):
             action, value, _ = map(str, json.loads(message[:_MAX_MESSAGE]))
         (name, _, option), player = action.partition(":"), self._player
         match name:
-            case "vehicle" if self._fleet.picture.row(value) is not None:
+            case "vehicle" if self._fleet.snapshot.vehicle(value) is not None:
                 self._choose(value)
             case "event" | "fault" if value.isdecimal():
-                for event in (self._timeline.shown if name == "event" else self._faults)[int(value) :][:1]:
+                for event in (self._timeline_plot.shown if name == "event" else self._faults)[int(value) :][:1]:
                     self._show(event)
             case "focus" if option in FOCUSES:
                 self._map.focus = option
@@ -256,7 +256,7 @@ class Viewer:
             case "next" | "previous":
                 self._show_next(is_later=name == "next")
             case "play" | "left" | "right" | "LEFT" | "RIGHT" if player is not None:
-                player.toggle() if name == "play" else player.jump(player.time + _STEPS[name])
+                player.toggle() if name == "play" else player.seek(player.time + _STEPS[name])
         self._show_now()
 
     def _choose_next(self, step: int) -> None:
@@ -273,7 +273,7 @@ class Viewer:
             self._show(event)
 
     def _on_tap(self, source: ColumnDataSource, shown: Callable[[], list[Any]], show: Callable[[Any], object]) -> None:
-        """Call `show` for a tapped row, then clear the selection, so that the row can be tapped again."""
+        """Call `show` for each tapped row; clear the selection, otherwise a second tap would not be reported."""
 
         def tap(_: str, __: object, rows: list[int]) -> None:
             if rows and 0 <= rows[0] < len(shown()):
@@ -286,7 +286,7 @@ class Viewer:
     def _lay_out(self, sheets: list[Any]) -> LayoutDOM:
         text = self._text
         parts: list[LayoutDOM] = [text["head"], self._search, text["list"], text["why"], text["tool"]]
-        parts += [self._map.figure, self._timeline.figure, text["nums"], self._grid, text["more"]]
+        parts += [self._map.figure, self._timeline_plot.figure, text["nums"], self._grid, text["more"]]
         if self._player is not None:
             *controls, slider = self._player.controls
             for control in self._player.controls:

@@ -1,1 +1,1 @@
-"""ROS 2 and Foxglove."""
+"""Tests of the bridges to ROS 2 and Foxglove."""

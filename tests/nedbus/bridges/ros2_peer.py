@@ -1,6 +1,6 @@
-"""A ROS 2 node by zenoh-ros2-sdk, in a process of its own: `talk` publishes rows, `listen` prints what it receives.
+"""A ROS 2 node by zenoh-ros2-sdk for a subprocess: `talk` publishes rows, `listen` prints received messages.
 
-It is independent of nedbus: the definition of the type and the rows are in the JSON file of its second argument.
+It is independent of nedbus: type definition and rows are in the JSON file named by its second argument.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 os.environ["ZENOH_CONFIG_OVERRIDE"] = (
-    # A peer, as every ROS 2 node by rmw_zenoh; it must not lose what this test sends without a pause.
+    # A peer, like every ROS 2 node with rmw_zenoh; BLOCK, as the test publishes without a pause.
     'transport/shared_memory/enabled=false;qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]'
 )
 
@@ -28,17 +28,17 @@ PAIRS = ("delta_xy", "delta_vxy")
 
 
 def talk(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any) -> None:
-    """Publish each row, once somebody subscribes."""
+    """Publish each row once there is a subscriber."""
     publisher = ROS2Publisher(topic=topic, msg_type=TYPE, msg_definition=definition, **options)
     while not publisher.pub.matching_status.matching:
         time.sleep(0.01)
     for row in rows:
         publisher.publish(**{name: np.array(v, np.float32) if name in PAIRS else v for name, v in row.items()})
-    threading.Event().wait()  # whoever started this ends it
+    threading.Event().wait()  # until the parent process kills this one
 
 
 def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any) -> None:
-    """Print one message for each row, then the topics that ROS 2 lists."""
+    """Print as many messages as there are rows, then the topics that ROS 2 lists."""
     done = threading.Event()
     left = len(rows)
 
@@ -67,4 +67,4 @@ def write(value: object) -> None:
 if __name__ == "__main__":
     role, given = sys.argv[1:]
     {"talk": talk, "listen": listen}[role](**json.loads(Path(given).read_text()))
-    os._exit(0)  # its session is never closed, and would keep the process
+    os._exit(0)  # the SDK never closes its session, which would keep the process alive

@@ -1,4 +1,4 @@
-"""Foxglove: a real WebSocket client that speaks its protocol shows live vehicles."""
+"""Foxglove server, tested by a WebSocket client that implements the Foxglove protocol."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from tests.peers.ports import free_port
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
-X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"  # before the doubles 1, 2 and 3 of a message of protobuf
+X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"  # protobuf tags of the double fields 1, 2 and 3
 HALF = math.sqrt(0.5)
 ORIGIN = {"xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 400.0}
 
 
 class Client:
-    """Do what the Foxglove app does: get the list of channels, subscribe, receive binary frames."""
+    """A minimal Foxglove client: it receives the list of channels, subscribes, and receives binary frames."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
         self.channels: dict[int, dict[str, Any]] = {}
-        self.data: dict[str, tuple[int, bytes]] = {}  # the newest time and payload of each topic
+        self.data: dict[str, tuple[int, bytes]] = {}  # newest time and payload of each topic
         self.info = self.receive()
 
     def receive(self, seconds: float = DEADLINE) -> dict[str, Any]:
@@ -52,7 +52,9 @@ class Client:
                 for number in content["channelIds"]:
                     del self.channels[number]
             elif content["op"] == "status" and "Unknown channel" in content["message"]:
-                self._subscribe([int(content["message"].split()[-1])])  # the SDK advertises it before it knows it
+                self._subscribe(
+                    [int(content["message"].split()[-1])]
+                )  # the SDK advertises a channel before it accepts subscriptions to it
             return content
         if frame[0] == 1:
             number, when = struct.unpack_from("<IQ", frame, 1)
@@ -88,8 +90,8 @@ def connected(url: str) -> Iterator[Client]:
         yield Client(socket)
 
 
-def test_vehicles_appear_and_every_field_can_be_plotted(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """Channels come with vehicles and go with them; a plot's data is the message, with its definition."""
+def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """Channels appear and disappear with their vehicles; their data is the message in CDR, with its definition."""
     url = f"ws://127.0.0.1:{free_port()}"
     process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
@@ -113,10 +115,8 @@ def test_vehicles_appear_and_every_field_can_be_plotted(run_nedbus: Start, endpo
         client.until(lambda: topic not in client.topics)
 
 
-def test_what_is_said_once_is_shown_to_the_first_who_subscribes(
-    run_nedbus: Start, endpoint: str, bus: nedbus.Bus
-) -> None:
-    """A home comes once, and brings its channel: nobody can have subscribed to that before."""
+def test_message_without_rate_reaches_the_first_subscriber(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A home position is sent once and creates its channel, so it is kept for the first subscriber."""
     url = f"ws://127.0.0.1:{free_port()}"
     process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
@@ -128,8 +128,8 @@ def test_what_is_said_once_is_shown_to_the_first_who_subscribes(
         client.until(lambda: topic in client.data)
 
 
-def test_poses_and_locations(bus: nedbus.Bus) -> None:
-    """ENU poses with their frames, and positions on the map, as protobuf of Foxglove's own schemas."""
+def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
+    """Poses in ENU, frames and locations use Foxglove's protobuf schemas."""
     here = message(1, x=3.0, y=4.0, z=-5.0, heading=0.0, xy_valid=True, eph=1.0, epv=1.0, **ORIGIN)
     there = here.model_copy(update={"ref_lat": 47.001, "ref_alt": 410.0})
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
@@ -167,10 +167,10 @@ def test_poses_and_locations(bus: nedbus.Bus) -> None:
         ((math.nan,) * 4, 0, math.pi / 2, (1, 0, 0), (0, 1, 0)),
     ],
 )
-def test_orientation_is_the_attitude_while_it_is_fresh(
+def test_orientation_is_a_recent_attitude_else_the_heading(
     q: tuple[float, ...], age: int, heading: float, forward: tuple[int, ...], left: tuple[int, ...]
 ) -> None:
-    """Axes of the vehicle in ENU: q turns FRD to NED; it is used within 0.5 s of the position, else the heading is."""
+    """The attitude q, which rotates FRD to NED, is used within 0.5 s of the position, else the heading."""
     attitude = VehicleAttitude.model_validate({"timestamp": 10_000_000 - age, "q": q})
     x, y, z, w = orientation_of(message(10_000_000, heading=heading), attitude)
     assert (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)) == pytest.approx(forward, abs=1e-6)
@@ -178,7 +178,7 @@ def test_orientation_is_the_attitude_while_it_is_fresh(
 
 
 def test_pose_has_position_and_attitude(bus: nedbus.Bus) -> None:
-    """The pose turns with vehicle_attitude of its vehicle, and not with that of another or of the ground truth."""
+    """The pose uses the vehicle_attitude of its vehicle, not that of another vehicle or the ground truth."""
     level, rolled = (VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)))
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
         server.show(Sample(rolled, Address("1", "vehicle_attitude"), received=1))
@@ -197,7 +197,7 @@ def test_pose_has_position_and_attitude(bus: nedbus.Bus) -> None:
 
 
 def test_port_in_use_is_reported(bus: nedbus.Bus, endpoint: str) -> None:
-    """Two servers cannot have one port."""
+    """A port in use is an error with exit code 1 and a remedy."""
     with FoxgloveServer(bus, port=0) as server:
         ended = run_command("foxglove", "-c", endpoint, "--http", server.url.removeprefix("ws://"))
     assert ended.exit_code == 1

@@ -1,4 +1,4 @@
-"""The filter of late samples, with fake clocks that have nothing in common."""
+"""The filter for late samples, with unrelated fake clocks for publisher and host."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tests.flights.messages import message
 
 ONE = Address("1", "vehicle_local_position")
 SECOND = 10**9
-NOW = 1_790_000_000 * SECOND  # what a vehicle's clock shows
+NOW = 1_790_000_000 * SECOND  # ns, the vehicle's clock
 
 
 def sample(sent: int | None, *, by: int = 7, address: Address = ONE, retained: bool = False) -> nedbus.Sample:
-    """Return a sample with this timestamp of its publisher [ns]."""
+    """Return a sample with this publisher timestamp [ns]."""
     stamp = None
     if sent is not None:
         moment = dt.datetime.fromtimestamp(sent // SECOND, dt.UTC)
@@ -28,13 +28,13 @@ def sample(sent: int | None, *, by: int = 7, address: Address = ONE, retained: b
 
 
 def admitted(late: LateFilter, *times: tuple[float, float]) -> list[bool]:
-    """Return the admitted samples, each given by the times at which it was sent and received [s]."""
+    """Return whether each sample is admitted, given the times at which it was sent and received [s]."""
     return [late.admits(sample(NOW + round(sent * SECOND)), arrived=round(arrived * SECOND)) for sent, arrived in times]
 
 
 @pytest.mark.parametrize("ahead", [-86_400 * 365 * 20, -1.5, 0.0, 1.5, 86_400])
-def test_difference_of_two_clocks_does_not_matter(ahead: float) -> None:
-    """Samples of a vehicle are current even if its clock is wrong by seconds or years."""
+def test_constant_clock_offset_is_ignored(ahead: float) -> None:
+    """Samples are current even if the vehicle's clock is wrong by seconds or years."""
     late = LateFilter()
     assert all(admitted(late, *((ahead + each / 100, each / 100) for each in range(500))))
     assert late.report() is None
@@ -45,15 +45,15 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
     late = LateFilter()
     assert all(admitted(late, *((each / 100, each / 100) for each in range(200))))
     burst = admitted(late, *((2 + each / 100, 12 + each / 2000) for each in range(1000)))
-    assert burst == sorted(burst), "once current, always current"
+    assert burst == sorted(burst), "after the first current sample all are current"
     assert 900 <= burst.count(False) <= 960
     assert all(admitted(late, *((13 + each / 100, 13 + each / 100) for each in range(200))))
     assert late.report() == f"{ONE}: {burst.count(False)} old messages held back, up to 10.0 s late"
     assert late.report() is None
 
 
-def test_slow_recovery_is_held_back_as_well() -> None:
-    """A slow link catches up slowly; old samples are still held back."""
+def test_slowly_recovered_samples_are_held_back() -> None:
+    """Over a slow link the backlog shrinks slowly; its samples are held back all the same."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))
@@ -61,16 +61,16 @@ def test_slow_recovery_is_held_back_as_well() -> None:
     assert 2_650 <= slow.count(False) <= 2_750
 
 
-def test_last_value_from_before_is_held_back() -> None:
-    """The age of the last message of a silent vehicle is unknown; its next message is current."""
+def test_retained_sample_is_held_back() -> None:
+    """A retained message is held back, as its age is unknown; the next message is current."""
     late = LateFilter()
     assert not late.admits(sample(NOW, retained=True), arrived=50 * SECOND)
     assert admitted(late, (3600.0, 3650.0)) == [True]
     assert late.report() == f"{ONE}: 1 old message held back"
 
 
-def test_clock_that_is_set_back_by_another_implementation() -> None:
-    """A lateness that lasts two minutes is a clock difference."""
+def test_clock_set_back_is_accepted_within_two_minutes() -> None:
+    """A lateness that persists for two minutes is treated as a clock offset."""
     late = LateFilter()
     admitted(late, *((each / 10, each / 10) for each in range(20)))
     steps = admitted(late, *((each / 10 - 3600, each / 10) for each in range(20, 2_000)))
@@ -78,8 +78,8 @@ def test_clock_that_is_set_back_by_another_implementation() -> None:
     assert 0 < steps.count(False) <= 2 * DRIFT / SECOND * 10
 
 
-def test_clock_that_is_set_back_stands_in_zenohs_timestamps() -> None:
-    """Zenoh's timestamps never go back: they stand still for an hour and then continue; all samples are current."""
+def test_stalled_zenoh_timestamps_are_current() -> None:
+    """Zenoh's timestamps never decrease: if a clock is set back they stall, and all samples are current."""
     late = LateFilter()
     admitted(late, *((each / 100, each / 100) for each in range(200)))
     assert all(admitted(late, *((1.99, each / 100) for each in range(200, 2_000))))
@@ -87,8 +87,8 @@ def test_clock_that_is_set_back_stands_in_zenohs_timestamps() -> None:
     assert admitted(late, (22.0, 45.0)) == [False]
 
 
-def test_clocks_that_drift_apart() -> None:
-    """The fastest sample counts for two minutes, so a drift of 100 us per second does not make samples late."""
+def test_clock_drift_does_not_make_samples_late() -> None:
+    """The fastest sample is the reference for two minutes at most, so a drift of 100 us per second is tolerated."""
     late = LateFilter()
     assert admitted(late, (0.0, 0.0), (60.1, 61.0), (61.0, 62.5)) == [True, True, False]
     late = LateFilter()
@@ -96,8 +96,8 @@ def test_clocks_that_drift_apart() -> None:
     assert 10 * late._limit < DRIFT
 
 
-def test_new_publisher_has_a_clock_of_its_own() -> None:
-    """A vehicle that restarts with a clock of 1970 is current at once; withdrawn publishers are forgotten."""
+def test_restarted_publisher_has_a_new_clock() -> None:
+    """A vehicle that restarts with a clock from 1970 is current at once; a forgotten one, too."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     assert late.admits(sample(SECOND, by=8), arrived=SECOND)
@@ -106,14 +106,14 @@ def test_new_publisher_has_a_clock_of_its_own() -> None:
 
 
 def test_sample_without_a_timestamp_is_current() -> None:
-    """Its age is unknown."""
+    """A sample without a timestamp is admitted, as its age cannot be measured."""
     late = LateFilter()
     assert late.admits(sample(None), arrived=0)
     assert late.admits(sample(None), arrived=3600 * SECOND)
 
 
-def test_others_are_named_in_short() -> None:
-    """There is one log line for any number of vehicles."""
+def test_report_names_one_address_and_counts_the_others() -> None:
+    """A report is one line for any number of vehicles."""
     late = LateFilter()
     for name in "abc":
         assert not late.admits(sample(NOW, address=Address(name, ONE.topic), retained=True), arrived=0)

@@ -1,4 +1,4 @@
-"""ROS 2 over rmw_zenoh, in both directions, against an independent client: zenoh-ros2-sdk."""
+"""ROS 2 over rmw_zenoh in both directions, against an independent client, zenoh-ros2-sdk."""
 
 from __future__ import annotations
 
@@ -53,19 +53,19 @@ RunBridge = Callable[..., None]
 
 
 def flight() -> list[VehicleLocalPosition]:
-    """Return estimates of a flight: numbers of all kinds, NaN, infinities, a reset."""
+    """Return estimates of a simulated flight, with NaN, infinities and a reset."""
     messages = (each for each in open_replay("sim:?seed=3&duration=20").messages if each.address.topic == VLP)
     return [upgrade(each.fields) for each in islice(messages, 0, None, 20)]
 
 
 def definition(layout: str) -> str:
-    """Return the message definition as a .msg file of px4_msgs has it."""
+    """Return the .msg definition of px4_msgs for a layout."""
     return "".join(f"{LAYOUTS[layout].types[name]!s} {name}\n" for name in LAYOUTS[layout].fields)
 
 
 @pytest.fixture
 def run_bridge(endpoint: str, timings: Timings, caplog: pytest.LogCaptureFixture) -> Iterator[RunBridge]:
-    """Run a bridge in a thread, which looks for changes twenty times a second, and on a bus of its own."""
+    """Run bridges in threads, each with its own bus, that poll 20 times per second."""
     caplog.set_level("INFO")
     timings.bridge_poll = 0.05
     stop = threading.Event()
@@ -88,13 +88,13 @@ def plain_session(endpoint: str) -> AbstractContextManager[Session]:
 
 
 def tokens(raw: Session, kind: str) -> list[str]:
-    """Return the liveliness tokens of ROS 2 of this kind in domain 0: NN of nodes, MP of publishers."""
+    """Return the ROS 2 liveliness tokens of a kind in domain 0: NN of nodes, MP of publishers."""
     return [str(reply.ok.key_expr) for reply in raw.liveliness().get(f"@ros2_lv/0/*/*/*/{kind}/**") if reply.ok]
 
 
 @pytest.fixture
 def peer(start: Start, endpoint: str, tmp_path: Path) -> Peer:
-    """Start the other side: a role, a layout, and what the role needs."""
+    """Start the ROS 2 node of ros2_peer.py in a role, with a layout and the options of the role."""
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
 
     def start_peer(role: str, layout: str, **options: object) -> Process:
@@ -107,12 +107,12 @@ def peer(start: Start, endpoint: str, tmp_path: Path) -> Peer:
 
 
 def as_json(fields: dict[str, object]) -> str:
-    """Return fields so that NaN equals NaN, and pairs are lists."""
+    """Return fields as JSON, in which NaN equals NaN."""
     return json.dumps(fields, sort_keys=True)
 
 
-def test_ros_2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus) -> None:
-    """A message of a ROS 2 node arrives field for field, with the layout found by its hash."""
+def test_message_of_a_ros2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus) -> None:
+    """Messages of a ROS 2 node arrive field by field; the layout is found by its type hash."""
     rows = [downgrade(each, "1.14") for each in flight()]
     with bus.subscribe(mode="every") as subscription:
         run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
@@ -125,10 +125,10 @@ def test_ros_2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bu
 
 
 @pytest.mark.parametrize("layout", ["1.14", "1.16"])
-def test_ros_2_node_receives_and_lists(
+def test_ros2_node_receives_messages_and_lists_topics(
     run_bridge: RunBridge, peer: Peer, raw: Session, bus: nedbus.Bus, layout: str
 ) -> None:
-    """A message of the bridge arrives at a ROS 2 node field for field, and its topics are listed."""
+    """Messages of the bridge arrive at a ROS 2 node field by field, and the node lists their topics."""
     messages = flight()
     expected = [downgrade(each, layout) for each in messages]
     publisher = bus.publisher(VLP, vehicle="7")
@@ -148,8 +148,8 @@ def test_ros_2_node_receives_and_lists(
     assert ["/px4_7/fmu/out/estimator_local_position_1", [ROS2_TYPE]] in listed
 
 
-def test_bridge_writes_what_px4_writes(run_bridge: RunBridge, bus: nedbus.Bus, raw: Session) -> None:
-    """Key, payload and attachment are those of PX4's own module: its subscribers see no difference."""
+def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, raw: Session) -> None:
+    """Key, payload, attachment and liveliness tokens have the format of PX4's Zenoh module."""
     publisher = bus.publisher(VLP, vehicle="1")
     run_bridge()
     subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(100))
@@ -163,19 +163,19 @@ def test_bridge_writes_what_px4_writes(run_bridge: RunBridge, bus: nedbus.Bus, r
     assert (first.sequence, second.sequence, first.gid == second.gid) == (1, 2, True)
     assert second.time > first.time > 1_700_000_000_000_000_000
     (token,) = tokens(raw, "MP")
-    assert first.gid == gid_of_token(token), "what `ros2 topic info -v` shows"
+    assert first.gid == gid_of_token(token), "the gid that `ros2 topic info -v` shows"
     assert len(tokens(raw, "NN")) == 1
 
 
 @pytest.mark.logs
-@pytest.mark.skipif(not TWELVE.exists(), reason=f"no log of a PX4: {TWELVE} is not there")
+@pytest.mark.skipif(not TWELVE.exists(), reason=f"no PX4 log at {TWELVE}")
 @pytest.mark.parametrize("release", ["1.13", "1.15", "main"])
-def test_every_message_has_its_layout_of_the_release(
+def test_messages_have_the_layout_of_the_release(
     run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture, release: str
 ) -> None:
-    """Of all that a real PX4 logged: the key has the hash of that release, and the CDR the fields; names are PX4's.
+    """Key, type hash and CDR fields of every topic in a real log are those of the selected release.
 
-    What the release does not have is said once. Of what has no rate the last one is published, however old it is.
+    Messages that the release lacks are logged once. Of streams without a rate, the last message is published.
     """
     last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE}").messages}
     messages = {each: upgrade_with(BY_TOPIC[each.topic], fields) for each, fields in last.items()}
@@ -209,10 +209,10 @@ def test_every_message_has_its_layout_of_the_release(
         assert caplog.text.count(f"{address} is not published to ROS 2: PX4 {release} has no such message") == 1
 
 
-def test_home_of_a_vehicle_that_appears_reaches_ros_2(
+def test_first_home_position_of_a_new_vehicle_is_bridged(
     run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is said once, before the bridge can know of it; of what nobody selected nothing is said."""
+    """A home position sent before the bridge knows its address is published; unselected addresses are not logged."""
     subscriber = raw.declare_subscriber("0/**", zenoh.handlers.FifoChannel(1000))
     run_bridge(selection=Selection(ANY, "1"))
     wait_for_reader(raw, "nedbus/1/home_position")
@@ -225,16 +225,16 @@ def test_home_of_a_vehicle_that_appears_reaches_ros_2(
     assert "wheel_encoders" not in caplog.text
 
 
-def test_last_value_does_not_reach_ros_2(
+def test_retained_message_is_not_bridged(
     run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Messages from before the bridge began are held back, and from then on a vehicle is published whole."""
+    """A message from before the bridge started is held back; every later one is published."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     wait_for(bus.latest, what="the last value")
     subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1000))
     run_bridge()
-    wait_for(lambda: "->" in caplog.text and "1 old message held back" in caplog.text, what="both")
+    wait_for(lambda: "->" in caplog.text and "1 old message held back" in caplog.text, what="the topic and the report")
     wait_for_reader(raw, f"nedbus/1/{VLP}")
     for timestamp in range(2, 402):
         publisher.publish(message(timestamp))
@@ -243,10 +243,10 @@ def test_last_value_does_not_reach_ros_2(
     assert times == list(range(2, 402))
 
 
-def test_vehicle_that_is_back_brings_nothing_late(
+def test_late_messages_of_a_returning_vehicle_are_held_back(
     run_bridge: RunBridge, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """After a router's restart a vehicle may be gone for a moment: what is recovered then is no current estimate."""
+    """A vehicle may be gone for a moment after a router restart: messages recovered then are held back."""
     timings.lateness = 0.2
     address = Address("1", VLP)
     subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
@@ -266,21 +266,21 @@ def test_vehicle_that_is_back_brings_nothing_late(
     token = raw.liveliness().declare_token(address.alive_key("1a"))
     wait_for(lambda: caplog.text.count("-> /fmu/out/") == 2, what="the vehicle to be back")
     late = first + dt.timedelta(milliseconds=1)
-    wait_for(lambda: raw.new_timestamp().get_time() - late > dt.timedelta(seconds=0.2), what="it to be late")
+    wait_for(lambda: raw.new_timestamp().get_time() - late > dt.timedelta(seconds=0.2), what="the timestamp to be late")
     put(2, late)
     wait_for(lambda: "1 old message held back, up to" in caplog.text, what="the report")
     current = count(3)
-    with repeating(lambda: put(next(current), raw.new_timestamp().get_time())):  # on a busy machine some are late
+    with repeating(lambda: put(next(current), raw.new_timestamp().get_time())):  # on a busy host some are late
         assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] != 2
     token.undeclare()
 
 
-@pytest.mark.slow  # an outage of some seconds; what is too late is decided in test_late_filter.py
-def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path) -> None:
-    """After an outage the bridge recovers what it missed, and says how much it held back of it: it is no estimate."""
+@pytest.mark.slow  # an outage of some seconds; test_late_filter.py tests the decisions
+def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -> None:
+    """After an outage the bridge holds back the late messages that it recovers, and logs their number."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
-    published: list[float] = []  # when each timestamp was, from 0 on
+    published: list[float] = []  # publish time of each timestamp, from 0 on
     stop = threading.Event()
     with nedbus.connect(endpoint) as vehicle, plain_session(endpoint) as node:
         publisher = vehicle.publisher(VLP, vehicle="1")
@@ -306,11 +306,9 @@ def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path
             first = len(published)
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
-            wait_for(
-                lambda: " s late: ROS 2 would take them for the current estimate" in bridge.err, what="the recovery"
-            )
+            wait_for(lambda: " s late: ROS 2 nodes would use them as current" in bridge.err, what="the recovery")
             last = len(published)
-            wait_for(lambda: has_received(last), what="what is current")
+            wait_for(lambda: has_received(last), what="a current message")
         flight.result()
     router.close()
     missed = [timestamp for timestamp in range(first, last) if published[timestamp] < back - 1.1]
@@ -327,40 +325,40 @@ def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path
         (f"RIHS01_{'0123456789abcdef' * 4}/long/and/longer", "5f06fa6078c5c222f899e17f78d4257a"),
     ],
 )
-def test_gid_is_that_of_rmw_zenoh(type_hash: str, gid: str) -> None:
-    """These were computed by rmw_zenoh's own code (simplified_xxhash3.cpp), for both of its paths."""
+def test_gid_matches_rmw_zenoh(type_hash: str, gid: str) -> None:
+    """The gids were computed by rmw_zenoh's code (simplified_xxhash3.cpp), for short and long inputs."""
     key = TopicKey(0, f"fmu/out/{VLP}", "px4_msgs::msg::dds_::VehicleLocalPosition_", type_hash)
     token = key.token("MP", "0123456789abcdef" * 2, "nedbus_4711", 1)
     assert gid_of_token(token).hex() == gid
 
 
-def test_topic_of_another_node_is_left_to_it(
+def test_topic_of_another_node_is_not_published_twice(
     run_bridge: RunBridge,
     bus: nedbus.Bus,
     raw: Session,
     timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A topic that a PX4 publishes itself is not published twice; the same one in another layout is a translation."""
+    """A topic that PX4 publishes itself is not published, except in another layout, which is a translation."""
     timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
-    left, published = f"left to node px4_0001, which already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
+    refused, published = f"is not published: node px4_0001 already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
     run_bridge(layout="1.14")
-    wait_for(lambda: left in caplog.text, what="the warning")
+    wait_for(lambda: refused in caplog.text, what="the warning")
     assert published not in caplog.text
     run_bridge(layout="1.16")
     wait_for(lambda: published in caplog.text, what="the translation")
     token.undeclare()
     wait_for(lambda: caplog.text.count(published) == 2, what="the topic to be taken over")
     back = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
-    wait_for(lambda: caplog.text.count(left) == 2, what="the topic to be released")
+    wait_for(lambda: caplog.text.count(refused) == 2, what="the topic to be released")
     back.undeclare()
 
 
-def test_topics_come_and_go_with_their_vehicles(run_bridge: RunBridge, bus: nedbus.Bus, raw: Session) -> None:
-    """ROS 2 lists what is there now."""
+def test_topics_follow_their_vehicles(run_bridge: RunBridge, bus: nedbus.Bus, raw: Session) -> None:
+    """ROS 2 lists the topics of a vehicle only while it is published."""
 
     def topics() -> set[str]:
         return {token.split("/")[9] for token in tokens(raw, "MP")}
@@ -373,10 +371,10 @@ def test_topics_come_and_go_with_their_vehicles(run_bridge: RunBridge, bus: nedb
     wait_for(lambda: not topics(), what="the topic to go")
 
 
-def test_loop_is_rejected(
+def test_bridge_loop_is_ignored(
     run_bridge: RunBridge, endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A source that listens to ROS 2 ignores what a bridge of its own network published to ROS 2."""
+    """A source that receives from ROS 2 ignores messages that a bridge of the same bus published."""
     publisher = bus.publisher(VLP, vehicle="1", source="sim")
     run_bridge()
     with Listener("px4-zenoh:?vehicle=copy", routers=(endpoint,)) as listener:
@@ -390,15 +388,17 @@ def test_loop_is_rejected(
         assert (listener.messages, listener.rejections) == ([], [])
 
 
-def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
-    """The command: one instance alone, another domain, two vehicles of one topic, and the keys of ROS 2 Humble."""
+def test_command_bridges_one_instance_for_humble(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session
+) -> None:
+    """`nedbus ros2` bridges a single instance, in another domain, with the keys of Humble, and reports a conflict."""
     publishers = [bus.publisher("estimator_local_position", vehicle="a-b", instance=number) for number in (0, 1)]
     bus.publisher("estimator_local_position", vehicle="a_b", instance=0)
     key = f"3/a_b/fmu/out/estimator_local_position_0/{dds_type(ROS2_TYPE)}/TypeHashNotSupported"
     subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
     options = ("--humble", "--layout", "1.14", "--domain", "3", "-t", "estimator_local_position", "-i", "0")
     bridge = run_nedbus("ros2", "-c", endpoint, *options)
-    wait_for(lambda: "set --namespace" in bridge.err, what="both")
+    wait_for(lambda: "set --namespace" in bridge.err, what="the conflict")
     wait_for_reader(raw, "nedbus/a_b/estimator_local_position/0")
     for publisher in publishers:
         publisher.publish(message(7))
@@ -408,8 +408,8 @@ def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.B
     assert bridge.wait() == 0
 
 
-def test_router_that_hides_ros_2_is_named(timings: Timings, tmp_path: Path) -> None:
-    """A router whose access control has no rule for ROS 2 denies in silence: the bridge finds out, and ends."""
+def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path) -> None:
+    """A router whose access control denies ROS 2 keys does so silently: the bridge detects it and stops."""
     timings.token_visible = 0.2
     endpoint, file = free_endpoint(), tmp_path / "router.json5"
     rules = [{"id": "no", "permission": "deny", "messages": ["liveliness_token"], "key_exprs": ["@ros2_lv/**"]}]
@@ -435,10 +435,10 @@ def test_router_that_hides_ros_2_is_named(timings: Timings, tmp_path: Path) -> N
         (["--namespace", "7up"], 2, "VEHICLE:NAMESPACE"),
     ],
 )
-def test_invalid_option_is_one_line(
+def test_invalid_option_is_a_one_line_error(
     run_nedbus: Start, endpoint: str, arguments: list[str], exit_code: int, text: str
 ) -> None:
-    """Exit 2 for an option that is invalid, 1 for a router of ROS 2 that does not answer; one line with the reason."""
+    """An invalid option exits with 2, a router that does not answer with 1; both print one line."""
     bridge = run_nedbus("ros2", "-c", endpoint, *arguments)
     assert bridge.wait() == exit_code
     assert text in bridge.err

@@ -1,4 +1,4 @@
-"""The choice of streams that the bridge publishes to ROS 2, without a network and with a fake clock."""
+"""Arbitration of ROS 2 topics, without a network and with a fake clock."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def actions(
 
 
 def test_topic_has_a_namespace_by_vehicle() -> None:
-    """Vehicle 1 has no namespace; otherwise a configured one wins over the vehicle's name in ROS 2 form."""
+    """Vehicle 1 has no namespace; others have the configured one, else one made from the vehicle's name."""
     arbiter = make({"named": "/fleet/a/", "bare": ""})
     estimator = Address("wing-2", "estimator_local_position", 1)
     assert arbiter.topic_of(estimator) == "wing_2/fmu/out/estimator_local_position_1"
@@ -44,7 +44,7 @@ def test_namespace_invalid_in_ros_2_is_rejected(namespace: str) -> None:
 
 
 def test_address_is_published_once_and_withdrawn_when_gone() -> None:
-    """Only changes produce decisions; a sample may arrive before or after the token."""
+    """Only changes return decisions: an address is published once, and withdrawn once it is gone."""
     arbiter = make()
     assert not arbiter.publishes(ONE)
     assert arbiter.update([ONE], {}, now=0.0) == [Decision("publish", ONE, TOPIC)]
@@ -56,8 +56,8 @@ def test_address_is_published_once_and_withdrawn_when_gone() -> None:
 
 
 @pytest.mark.parametrize("published", [False, True])
-def test_topic_of_another_node_is_left_to_it(published: bool) -> None:
-    """The bridge does not publish a topic of another node, such as PX4 itself, or stops; the node is reported once."""
+def test_topic_of_another_node_is_not_published(published: bool) -> None:
+    """A topic that another node publishes, such as PX4 itself, is not published, and reported once."""
     arbiter = make()
     arbiter.update([ONE] if published else [], {}, now=0.0)
     assert arbiter.publishes(ONE) is published
@@ -66,8 +66,8 @@ def test_topic_of_another_node_is_left_to_it(published: bool) -> None:
     assert not arbiter.publishes(ONE)
 
 
-def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
-    """The delay starts when the node was last seen, so a node that restarts keeps its topic."""
+def test_topic_is_taken_over_after_a_delay() -> None:
+    """The delay starts when the other node was last seen, so a node that restarts keeps its topic."""
     arbiter = make()
     for now in (0.0, 4.0):
         arbiter.update([ONE], {ONE: "px4"}, now=now)
@@ -76,16 +76,16 @@ def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
     assert actions(arbiter, [ONE], {ONE: "px4"}, now=20.0) == [("defer", TOPIC)]
 
 
-def test_vehicle_that_was_gone_is_published_at_once() -> None:
-    """An address that left the bus is forgotten, so its return is not delayed."""
+def test_returning_vehicle_is_published_without_delay() -> None:
+    """An address that left the bus is forgotten, so its return is published at once."""
     arbiter = make()
     arbiter.update([ONE], {ONE: "px4"}, now=0.0)
     arbiter.update([], {}, now=1.0)
     assert actions(arbiter, [ONE], now=2.0) == [("publish", TOPIC)]
 
 
-def test_two_addresses_of_one_topic_conflict() -> None:
-    """The first address in order gets the topic; the other one is reported once, and follows when that is gone."""
+def test_addresses_with_the_same_topic_conflict() -> None:
+    """The first address gets the topic; the second one is reported once, and published when the first is gone."""
     arbiter = make()
     first, second = Address("a-b", VLP), Address("a_b", VLP)
     topic = f"a_b/fmu/out/{VLP}"
@@ -96,7 +96,7 @@ def test_two_addresses_of_one_topic_conflict() -> None:
     assert arbiter.update([first, second], {}, now=1.0) == []
     assert (arbiter.publishes(first), arbiter.publishes(second)) == (True, False)
     assert actions(arbiter, [second], now=2.0) == [("withdraw", topic), ("publish", topic)]
-    # An address that comes later does not displace one that is published, whatever their order.
+    # A later address does not displace a published one, whatever their order.
     assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
     assert actions(arbiter, [first, second], {second: "px4"}, now=4.0) == [("defer", topic)]
     assert actions(arbiter, [first, second], now=5.0) == [("publish", topic)]

@@ -72,7 +72,7 @@ class World:
             "addresses": len(self.output.addresses + self.output.stale),
             "streams": len(self.reader.measure()),
             "page": len(self.fleet.streams),
-            "rows": len(self.fleet.picture.rows),
+            "rows": len(self.fleet.snapshot.vehicles),
         }
 
 

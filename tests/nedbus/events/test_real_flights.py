@@ -18,7 +18,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
-from nedbus.sources import FileAccount
+from nedbus.sources import FileEvents
 from tests.flights import ulogs
 from tests.flights.ulogs import LOGS
 from tests.nedbus.events import events_table
@@ -41,7 +41,7 @@ def path_of(name: str) -> Path:
     return next(LOGS.parent.rglob(f"{name}.ulg"))
 
 
-def account_of(name: str) -> FileAccount:
+def account_of(name: str) -> FileEvents:
     return ulogs.account_of(path_of(name))
 
 

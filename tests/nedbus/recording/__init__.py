@@ -1,1 +1,1 @@
-"""Recordings, arrays, plots, and events of logs."""
+"""Tests of recordings and logs: files, arrays, alignment and plots."""

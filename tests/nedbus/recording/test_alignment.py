@@ -1,4 +1,4 @@
-"""Several streams as one table by time, and the UTC that a flight tells."""
+"""Time alignment of streams, and the UTC offset of a flight."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
 from tests.flights.ulogs import UlogWriter
 
-BOOT = 1_700_000_000_000_000  # us, of a vehicle in 2023
+BOOT = 1_700_000_000_000_000  # us; Unix time of the boot, in 2023
 
 
 def array_of(topic: str, *fields: Mapping[str, object]) -> MessageArray:
-    """Return messages of a topic with these fields."""
+    """Return an array of messages of a topic."""
     definition: Definition[Message] = definition_of(topic)
     return arrays_of(definition).of([definition.model.model_validate(dict(each)) for each in fields])
 
@@ -55,8 +55,8 @@ POSITIONS = array_of(VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": flo
 HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0})
 
 
-def test_last_value_is_never_from_the_future() -> None:
-    """Each row has the last message that is not later, and its age; before the first one there is none."""
+def test_last_uses_no_future_message() -> None:
+    """With method "last" a row has the last message at or before it, and its age; before the first one NaN."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME})
     assert table["timestamp"].tolist() == POSITIONS["timestamp"].tolist()
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4]
@@ -69,15 +69,15 @@ def test_last_value_is_never_from_the_future() -> None:
     assert np.isnan(exactly["home_position.age"][1])
 
 
-def test_nearest_may_be_from_the_future() -> None:
-    """The nearest message, with a negative age where it is later; of two equally near ones the earlier."""
+def test_nearest_may_use_a_future_message() -> None:
+    """With method "nearest" a later message has a negative age; of two equally near ones the earlier is used."""
     table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
     assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
     assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
 
 
-def test_floats_are_interpolated() -> None:
-    """Floats move evenly, and everything else stays as it last was: integers, flags, and what is not known."""
+def test_linear_interpolates_only_floats() -> None:
+    """With method "linear" floats are interpolated; integers, flags, NaN and infinities keep the last value."""
     messages = array_of(
         VLP,
         {"timestamp": 1_000_000, "x": 1.0, "ref_lon": 179.0, "vx": math.nan, "vxy_max": math.inf, "ref_timestamp": 2},
@@ -101,8 +101,8 @@ def test_floats_are_interpolated() -> None:
         ("cog_rad", 0.2, 6.2, 6.2 + (2 * math.pi - 6.0) / 2),
     ],
 )
-def test_angles_go_the_shorter_way(field: str, first: float, second: float, middle: float) -> None:
-    """An angle between two is on the shorter way, within the range that its field has: from -pi, or from 0."""
+def test_angles_are_interpolated_the_shorter_way(field: str, first: float, second: float, middle: float) -> None:
+    """An angle is interpolated the shorter way, and stays in the range of its field: from -pi, or from 0."""
     messages = array_of("vehicle_gps_position", {"timestamp": 1, field: first}, {"timestamp": 3, field: second})
     [value] = nedbus.align({"vehicle_gps_position": messages}, on=[2], method="linear")[f"vehicle_gps_position.{field}"]
     assert math.remainder(value - middle, math.tau) == pytest.approx(0, abs=1e-6)
@@ -111,7 +111,7 @@ def test_angles_go_the_shorter_way(field: str, first: float, second: float, midd
 
 
 def test_quaternions_are_interpolated_by_slerp() -> None:
-    """The rotation is even and the norm 1, also where the sign flips; equal ones and unknown ones are no trouble."""
+    """Quaternions rotate at a constant rate with norm 1, even if the sign flips; equal ones and NaN are handled."""
     turns = [yaw(0.0), tuple(-each for each in yaw(2.0)), yaw(2.0), (math.nan,) * 4]
     messages = array_of("vehicle_attitude", *({"timestamp": 4 * n, "q": q} for n, q in enumerate(turns)))
     table = nedbus.align({"vehicle_attitude": messages}, on=[0, 1, 2, 3, 4, 6, 10], method="linear")
@@ -122,15 +122,15 @@ def test_quaternions_are_interpolated_by_slerp() -> None:
     assert np.isnan(q[6]).all()
 
 
-def test_nothing_is_interpolated_over_a_reset() -> None:
-    """Where a reset counter changes, the values stay as they were before it."""
+def test_floats_are_not_interpolated_across_a_reset() -> None:
+    """Between two messages with different reset counters the last value is kept."""
     fields = ({"timestamp": 0, "x": 0.0}, {"timestamp": 4, "x": 50.0, "xy_reset_counter": 1})
     table = nedbus.align({VLP: array_of(VLP, *fields)}, on=[0, 2, 3, 4], method="linear")
     assert table[f"{VLP}.x"].tolist() == [0, 0, 0, 50]
 
 
-def test_fields_choose_the_columns() -> None:
-    """A field names a column, or those of all streams; the times stay, and an unknown field raises."""
+def test_fields_select_the_columns() -> None:
+    """A field selects a column, or that of every stream; time columns are always present; an unknown field raises."""
     flight = {VLP: POSITIONS, "home_position": HOME}
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
     assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
@@ -140,18 +140,18 @@ def test_fields_choose_the_columns() -> None:
 
 
 def test_rate_covers_the_flight() -> None:
-    """A rate gives even times from the first message of all to the last one; too many rows are an error."""
+    """A rate returns evenly spaced rows from the first to the last message; invalid rates and too many rows raise."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME}, on=20)
     assert table["timestamp"].tolist() == list(range(1_000_000, 1_400_001, 50_000))
     late = array_of("home_position", {"timestamp": 2**63})
     for rate in (20, 0, -1, math.nan, math.inf, "*", None, [-1], [[1]], ["a"], np.int64(0)):
         with pytest.raises(ArgumentError, match=r"^on "):
-            nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate)  # type: ignore[arg-type] # these are the mistakes
+            nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate)  # type: ignore[arg-type] # invalid on purpose
 
 
 @pytest.mark.parametrize("form", ["ULG", "MCAP"])
-def test_rows_begin_with_the_recording(tmp_path: Path, form: str) -> None:
-    """PX4 logs the last message of a topic with its old time: no rows are empty until something was recorded."""
+def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
+    """PX4 logs the last message of a slow topic with its old time: this adds no empty rows at the start."""
     log = tmp_path / "a.ULG"
     times = range(300_000_000, 310_000_000, 20_000)
     writer = UlogWriter()
@@ -172,8 +172,8 @@ def test_rows_begin_with_the_recording(tmp_path: Path, form: str) -> None:
     assert set(table["home_position.x"]) == {7.0}
 
 
-def test_streams_on_two_clocks_are_an_error() -> None:
-    """The error names the streams at both ends, and what to do."""
+def test_streams_on_different_clocks_raise() -> None:
+    """Streams with Unix time and time since boot raise; the error names both and the remedy."""
     unix = array_of(VLP, {"timestamp": BOOT}, {"timestamp": BOOT + 1_000_000})
     with pytest.raises(
         ArgumentError, match=f"home_position begins at 1 s, {VLP} ends at 1700000001 s: expected topics on one"
@@ -181,8 +181,8 @@ def test_streams_on_two_clocks_are_an_error() -> None:
         nedbus.align({VLP: unix, "home_position": HOME}, on=50)
 
 
-def test_odd_streams_are_aligned(tmp_path: Path) -> None:
-    """Empty ones, messages of one time, and some out of order; several boots are an error that says what to do."""
+def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
+    """Empty streams, equal and unordered timestamps are aligned; several boots and invalid arguments raise."""
     nothing = HOME[:0]
     table = nedbus.align({VLP: POSITIONS, "home_position": nothing})
     assert np.isnan(table["home_position.age"]).all()
@@ -197,15 +197,15 @@ def test_odd_streams_are_aligned(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=f"^{VLP}: timestamps restart: align the messages of each boot"):
         nedbus.align({VLP: again})
     with pytest.raises(ArgumentError, match="method 'spline' is not valid: expected one of last, nearest, linear"):
-        nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # that is the mistake
+        nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # invalid on purpose
     with pytest.raises(AddressError, match=f"topic 'home_position' is not among these arrays: expected one of {VLP}"):
         nedbus.align({VLP: POSITIONS}, topics=["home_position"])
     with pytest.raises(ArgumentError, match="expected pandas or polars"):
-        nedbus.align({VLP: POSITIONS}, dataframe="foo")  # type: ignore[call-overload] # that is the mistake
+        nedbus.align({VLP: POSITIONS}, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
 
 
-def test_file_is_read_by_streams(tmp_path: Path) -> None:
-    """A list is a dict by stream, of one vehicle; a table has what is selected, and the stream of its rows."""
+def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
+    """`read` returns a dict by stream, for one vehicle; `align` has the selected streams and that of its rows."""
     batteries = [array_of("battery_status", {"timestamp": 1_200_000, "voltage_v": volts}) for volts in (16.0, 12.0)]
     streams = {
         VLP: POSITIONS,
@@ -238,8 +238,8 @@ def test_file_is_read_by_streams(tmp_path: Path) -> None:
         nedbus.utc_of(tmp_path / "two.mcap")
 
 
-def test_tables_are_frames_with_nulls(tmp_path: Path) -> None:
-    """A value that is not there yet, or not at all, is null; arrays have a column per element; times are UTC."""
+def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
+    """Values before the first message are null, arrays have a column per element, and `utc` has a time zone."""
     pytest.importorskip("pandas")
     pl = pytest.importorskip("polars")
     gps = array_of("sensor_gps", {"timestamp": 1_100_000, "time_utc_usec": BOOT + 1_100_000, "satellites_used": 9})
@@ -257,17 +257,17 @@ def test_tables_are_frames_with_nulls(tmp_path: Path) -> None:
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
 
 
-def test_utc_is_told_or_absent() -> None:
-    """A receiver tells it, else a companion with a date after 2000; zeros, other clocks and disagreement do not."""
+def test_utc_source_is_gnss_then_companion_else_none() -> None:
+    """UTC comes from GNSS, else from a companion after 2000; zeros, other clocks and disagreement do not count."""
     times = range(1_000_000, 11_000_000, 1_000_000)
-    told = array_of(
+    gnss = array_of(
         "sensor_gps",
         *({"timestamp": t, "timestamp_time_relative": -200, "time_utc_usec": BOOT + t - 200 + t % 7} for t in times),
     )
     silent = array_of("sensor_gps", *({"timestamp": t} for t in times))
     companion = array_of("timesync_status", *({"timestamp": t, "estimated_offset": -BOOT - 5} for t in times))
     monotonic = array_of("timesync_status", *({"timestamp": t, "estimated_offset": -12_345} for t in times))
-    found = nedbus.utc_of({"sensor_gps/0": told, "timesync_status": companion})
+    found = nedbus.utc_of({"sensor_gps/0": gnss, "timesync_status": companion})
     assert found is not None
     assert (found.source, found.count) == ("sensor_gps/0", 10)
     assert 0 <= found.offset_us - BOOT <= found.spread_us <= 6
@@ -276,21 +276,21 @@ def test_utc_is_told_or_absent() -> None:
         "timesync_status", BOOT + 5, 10, 0
     )
     assert nedbus.utc_of({"sensor_gps/0": silent, "timesync_status": monotonic}) is None
-    rebooted = told.copy()
+    rebooted = gnss.copy()
     rebooted["time_utc_usec"][5:] += 3_600_000_000
     assert nedbus.utc_of({"sensor_gps/0": rebooted}) is None
     assert nedbus.utc_of({}) is None
-    without = [name for name in told.dtype.names or () if name != "timestamp_time_relative"]
-    assert nedbus.utc_of({"sensor_gnss_relative": told[without]}) is not None
+    without = [name for name in gnss.dtype.names or () if name != "timestamp_time_relative"]
+    assert nedbus.utc_of({"sensor_gnss_relative": gnss[without]}) is not None
 
 
-def test_samples_tell_utc(bus: nedbus.Bus) -> None:
-    """The last sample of a live vehicle is enough: the UTC of any of its samples, and its source; None without."""
+def test_utc_of_live_samples(bus: nedbus.Bus) -> None:
+    """The last samples of a live vehicle are enough to derive its UTC; without a date it is None."""
     for vehicle, utc in (("7", 1_700_000_000_000_000), ("8", 0)):
         gps = bus.publisher("sensor_gps", vehicle=vehicle, instance=1)
         gps.publish({"timestamp": 5_000_000, "time_utc_usec": utc})
         bus.publisher("vehicle_attitude", vehicle=vehicle).publish({"timestamp": 6_000_000})
-    told = nedbus.utc_of(bus.latest("*", vehicle="7"))
-    assert told is not None
-    assert (told.source, str(told.at(6_000_000))) == ("sensor_gps/1", "2023-11-14 22:13:21+00:00")
+    found = nedbus.utc_of(bus.latest("*", vehicle="7"))
+    assert found is not None
+    assert (found.source, str(found.at(6_000_000))) == ("sensor_gps/1", "2023-11-14 22:13:21+00:00")
     assert nedbus.utc_of(bus.latest("*", vehicle="8")) is None

@@ -1,4 +1,4 @@
-"""Files of other MCAP writers and of `ros2 bag record`, and files that are not recordings: read whole, or refused."""
+"""Files of other MCAP writers and `ros2 bag record`, which are read completely, and files of other kinds."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def write_bag(
     encoding: str = "ros2msg",
     change: Callable[[bytes], bytes] = bytes,
 ) -> Path:
-    """Write positions with x = 0, 1, ..., as `ros2 bag record` does; `change`: what to do to each payload."""
+    """Write positions with x = 0, 1, ..., as `ros2 bag record` does; `change`: modifies each payload."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
@@ -54,7 +54,7 @@ def write_bag(
 
 
 def assert_whole(path: Path, *, warnings: tuple[str, ...] = ()) -> None:
-    """Check that all of ten positions are read as an array and replayed."""
+    """Assert that all ten positions are read as an array, and replayed."""
     assert nedbus.read(path)["x"].tolist() == list(range(10))
     run = open_replay(f"mcap:{path}")
     assert [each.fields["x"] for each in run.messages if not each.error] == list(range(10))
@@ -63,13 +63,13 @@ def assert_whole(path: Path, *, warnings: tuple[str, ...] = ()) -> None:
 
 
 def add_in_middle(payload: bytes) -> bytes:
-    """Add 3.5 after `timestamp_sample`, and what keeps the fields behind it aligned: two floats."""
+    """Add two floats after `timestamp_sample`, which keeps the later fields aligned."""
     return payload[:20] + WIND + WIND + payload[20:]
 
 
 @pytest.mark.parametrize("where", ["end", "middle"])
-def test_own_fields_of_a_bag_are_left_out_and_named(tmp_path: Path, where: str) -> None:
-    """Fields that the file's own definition has besides those of PX4 cost no message, wherever they are."""
+def test_fields_unknown_to_px4_are_left_out_and_named(tmp_path: Path, where: str) -> None:
+    """Additional fields in the file's definition are skipped, wherever they are; no message is lost."""
     text, own = message_definition("1.16"), "float32 wind_north\nfloat32 wind_east\n"
     if where == "end":
         path = write_bag(
@@ -80,14 +80,14 @@ def test_own_fields_of_a_bag_are_left_out_and_named(tmp_path: Path, where: str) 
         rest, text = second.split("\n", 1)
         text = f"{first}uint64 timestamp_sample{rest}\n{own}{text}"
         path = write_bag(tmp_path / "a.mcap", definition=text, change=add_in_middle)
-    left_out = f"{TOPIC}: wind_east, wind_north left out: not in any VehicleLocalPosition that nedbus knows"
+    left_out = f"{TOPIC}: wind_east, wind_north left out: unknown to nedbus in VehicleLocalPosition"
     assert_whole(path, warnings=(left_out,))
 
 
-def test_definition_of_another_message_is_refused(tmp_path: Path) -> None:
-    """A definition that lacks fields of every release, or has them with other types, names these fields."""
+def test_definition_of_no_release_raises(tmp_path: Path) -> None:
+    """A definition that lacks required fields, or has them with other types, raises; the error names the fields."""
     text = message_definition("1.16").replace("float32 x ", "float64 x ").replace("float32 y ", "float32 y2 ")
-    with pytest.raises(SourceError, match=r"its definition of x, y is not that of any PX4 release"):
+    with pytest.raises(SourceError, match=r"its definition of x, y matches no PX4 release"):
         nedbus.read(write_bag(tmp_path / "a.mcap", definition=text))
 
 
@@ -128,16 +128,16 @@ SLOW_FORMS = [pytest.param(form, marks=pytest.mark.slow) for form in (Compressio
 
 
 @pytest.mark.parametrize("form", [None, CompressionType.ZSTD, *SLOW_FORMS])
-def test_every_variant_of_mcap_is_read_whole(
+def test_all_variants_of_mcap_are_read_completely(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: CompressionType | None
 ) -> None:
-    """As many messages as the mcap package reads, for all combinations of the features that its writers may leave out.
+    """For all combinations of optional features, the reader finds as many messages as the mcap package.
 
-    Records with bytes behind their known fields, as later versions of the format may have, are among them.
+    This includes records with bytes after their known fields, as later versions of the format may have.
     """
     path = tmp_path / "a.mcap"
     has_padding = False
-    # The package skips bytes behind known fields only outside of chunks, and a footer is found by its length.
+    # The package skips bytes after known fields only outside of chunks, and finds a footer by its length.
     exact = {Opcode.MESSAGE, Opcode.FOOTER} | ({Opcode.SCHEMA, Opcode.CHANNEL} if form else set())
     finish: Callable[[RecordBuilder], None] = RecordBuilder.finish_record
 
@@ -166,8 +166,8 @@ def test_every_variant_of_mcap_is_read_whole(
 
 
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
-def test_flipped_bits_outside_of_chunks_are_reported_or_harmless(tmp_path: Path, every: int) -> None:
-    """The heads of records and the indexes behind chunks have no checksum: no flipped bit there makes up a message."""
+def test_bit_flip_outside_chunks_creates_no_message(tmp_path: Path, every: int) -> None:
+    """Record headers and message indexes have no CRC; a bit flip there is reported or harmless."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         for number in range(2):
@@ -197,7 +197,7 @@ def test_flipped_bits_outside_of_chunks_are_reported_or_harmless(tmp_path: Path,
             assert reader.damaged or read == original, (place, bit)
 
 
-def lfs(path: Path) -> None:
+def git_lfs_pointer(path: Path) -> None:
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:12\n")
 
 
@@ -212,16 +212,16 @@ def bag_in_sqlite(path: Path) -> None:
     [
         (lambda path: path.write_bytes(b"ULogKey\x01" + bytes(100)), "an encrypted log: decrypt it"),
         (lambda path: path.write_bytes(b"PK\x03\x04" + bytes(100)), "a zip archive: unpack it"),
-        (lambda path: path.write_bytes(b"\x1f\x8b" + bytes(100)), "compressed by gzip: unpack it"),
+        (lambda path: path.write_bytes(b"\x1f\x8b" + bytes(100)), "a gzip file: unpack it"),
         (lambda path: path.write_bytes(b""), "an empty file"),
-        (lfs, "a pointer of Git LFS .* 'git lfs pull'"),
-        (bag_in_sqlite, "a bag in SQLite: convert it to MCAP with 'ros2 bag convert'"),
+        (git_lfs_pointer, "a Git LFS pointer .* 'git lfs pull'"),
+        (bag_in_sqlite, "an SQLite bag: convert it to MCAP with 'ros2 bag convert'"),
     ],
 )
-def test_files_of_other_kinds_are_named(
+def test_file_of_another_kind_raises_with_remedy(
     tmp_path: Path, make: Callable[[Path], object], reason: str, suffix: str
 ) -> None:
-    """A file that is no flight is named, with what to do, by its content and by every command that reads files."""
+    """Other kinds of files are recognized by content in every command, and the error names the remedy."""
     path = tmp_path / f"a{suffix}"
     make(path)
     with pytest.raises(SourceError, match=reason):
@@ -243,28 +243,30 @@ def test_files_of_other_kinds_are_named(
         ("ros2msg", "uint64 timestamp\nstring name\n", "line 2, column 1"),
     ],
 )
-def test_refused_recording_names_the_reason(tmp_path: Path, encoding: str, definition: str, reason: str) -> None:
-    """A recording of which no message can be read says why, as an array and as a replay."""
+def test_recording_without_readable_messages_raises(
+    tmp_path: Path, encoding: str, definition: str, reason: str
+) -> None:
+    """A recording without a readable message raises with the reason, in `read` and in a replay."""
     path = write_bag(tmp_path / "a.mcap", encoding=encoding, definition=definition)
     for read in (nedbus.read, lambda path: open_replay(f"mcap:{path}")):
         with pytest.raises(SourceError, match=f"{TOPIC}: {reason}"):
             read(path)
 
 
-def test_bags_of_compressed_messages_are_read(tmp_path: Path) -> None:
-    """`ros2 bag record --compression-mode message` packs each payload."""
+def test_bag_with_compressed_messages_is_read(tmp_path: Path) -> None:
+    """`ros2 bag record --compression-mode message` compresses each payload."""
     assert_whole(write_bag(tmp_path / "a.mcap", change=zstandard.compress))
 
 
-def test_compressed_message_has_a_limit(tmp_path: Path) -> None:
-    """A message of 64 MiB in a few kilobytes is not unpacked, but rejected."""
+def test_message_that_expands_above_the_limit_is_rejected(tmp_path: Path) -> None:
+    """A message of 64 MiB in a few kilobytes is rejected without decompressing it."""
     path = write_bag(tmp_path / "a.mcap", change=lambda _: zstandard.compress(bytes(2**26)))
     assert [bool(each.error) for each in open_replay(f"mcap:{path}").messages] == [True] * 10
 
 
 @pytest.mark.parametrize("suffix", ["", ".zstd"])
-def test_split_bags_are_one_recording(tmp_path: Path, suffix: str) -> None:
-    """A folder with the files of one bag is read in order; a file of its metadata that is absent is named."""
+def test_split_bag_is_one_recording(tmp_path: Path, suffix: str) -> None:
+    """The files of a bag folder are read in order; a file that is listed in the metadata but missing is reported."""
     folder = tmp_path / "bag"
     folder.mkdir()
     for number, part in enumerate([range(4), range(4, 9), range(9, 10)]):
@@ -278,21 +280,21 @@ def test_split_bags_are_one_recording(tmp_path: Path, suffix: str) -> None:
     assert run_command("events", str(folder)).exit_code == 0
     (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}    - bag_11.mcap\n")
     assert open_replay(f"mcap:{folder}").damage == (
-        f"{folder}: messages lost to damage: bag_11.mcap of this bag is not there"
+        f"{folder}: messages lost to damage: bag_11.mcap of this bag is missing"
     )
 
 
-def test_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
-    """A folder has to have MCAP files; one with a bag in SQLite says what to do."""
-    with pytest.raises(SourceError, match=r"no \.mcap file is in this folder"):
+def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
+    """A folder without MCAP files raises; for an SQLite bag the error names the remedy."""
+    with pytest.raises(SourceError, match=r"no \.mcap file in this folder"):
         nedbus.read(tmp_path)
     bag_in_sqlite(tmp_path / "a_0.db3")
-    with pytest.raises(SourceError, match="a bag in SQLite: convert it"):
+    with pytest.raises(SourceError, match="an SQLite bag: convert it"):
         nedbus.read(tmp_path)
 
 
-def test_compressed_recordings_are_read(tmp_path: Path) -> None:
-    """`--compression-mode file` packs a whole file; what is before damage in it is read."""
+def test_compressed_recording_is_read(tmp_path: Path) -> None:
+    """`--compression-mode file` compresses a whole file; everything before damage is read, up to a size limit."""
     path = tmp_path / "a.mcap.zstd"
     data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
     path.write_bytes(data)
@@ -313,7 +315,7 @@ def test_compressed_recordings_are_read(tmp_path: Path) -> None:
         "29_own_field_appended.mcap", "29b_own_field_middle.mcap",
     ],
 )  # fmt: skip
-def test_files_of_users_are_read_whole(name: str) -> None:
-    """Ten messages each, x = 0..9, by rosbags and mcap."""
+def test_reported_files_are_read_completely(name: str) -> None:
+    """Files written by rosbags and mcap have ten messages each, x = 0 to 9."""
     assert nedbus.read(CASES / name)["x"].tolist() == list(range(10))
     assert nedbus.read(CASES / name, VLP)["timestamp"].size == 10

@@ -1,4 +1,4 @@
-"""Plots of flights: the scale, the resets of height, and the events that are marked."""
+"""Plots of flights: axis limits, resets, marked events, and clocks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SMALL = [path for path in REAL if path.stat().st_size <= 2_600_000]
 
 
 def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, MessageArray]:
-    """Return a flight of 10 Hz that begins 1 s after boot: north at 1 m/s, climbing at 0.5 m/s, all of it valid."""
+    """Return a valid flight at 10 Hz from 1 s after boot: north at 1 m/s, climbing at 0.5 m/s."""
     array = to_array([message(1)] * count)
     array["timestamp"] = 1_000_000 + 100_000 * np.arange(count)
     array["x"], array["y"], array["z"] = 0.1 * np.arange(count), 0.0, -0.05 * np.arange(count)
@@ -39,27 +39,29 @@ def flight_of(count: int = 100, *, vehicle: str = "7") -> tuple[Address, Message
 def drawn(
     streams: Sequence[tuple[Address, MessageArray]], events: Sequence[Event] = (), times: Times | None = None
 ) -> dict[str, Any]:
-    """Return the parts of a plot, by name."""
-    plot = pytest.importorskip("nedbus.recording.plot", exc_type=ImportError)  # takes a second, for Matplotlib
+    """Return the axes of a plot, by name."""
+    plot = pytest.importorskip(
+        "nedbus.recording.plot", exc_type=ImportError
+    )  # imported late: Matplotlib takes a second
     figure = plot.draw_figure(streams, title="a flight", events=events, times=times or Times())
     figure.draw_without_rendering()
     return {str(axes.get_label()): axes for axes in figure.axes}
 
 
 def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) -> Event:
-    """Return an event, whose account began with the flight."""
+    """Return an event of the flight of `flight_of`."""
     return Event("7", kind, change, severity, fields.pop("text", kind.replace("_", " ")), boot - 1.0, boot, **fields)
 
 
-def told_by(path: Path) -> list[Event]:
-    """Return the events of a log, and the begin of what held all the time."""
+def events_of(path: Path) -> list[Event]:
+    """Return the events of a log, including the start of its initial conditions."""
     account = account_of(path).account
     held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
     return [*held, *account.events_since(0)[0]]
 
 
 def marks_of(axes: Any, marker: str) -> list[tuple[float, float]]:
-    """Return where marks of one shape are."""
+    """Return the positions of marks of one shape."""
     lines = (line for line in axes.lines if line.get_marker() == marker)
     return [(float(x), float(y)) for line in lines for x, y in zip(*line.get_data(), strict=True)]
 
@@ -80,8 +82,8 @@ def bars_of(axes: Any) -> dict[str, list[tuple[float, float]]]:
 
 
 @pytest.mark.parametrize("others", [[], [flight_of(vehicle="8")]], ids=["one", "with another"])
-def test_invalid_estimate_is_thin_and_out_of_the_scale(others: list[tuple[Address, MessageArray]]) -> None:
-    """A position, height or speed that is not valid is drawn thin, and takes no part in limits. Messages made up."""
+def test_invalid_estimate_is_thin_and_does_not_affect_the_limits(others: list[tuple[Address, MessageArray]]) -> None:
+    """Invalid positions, altitudes and speeds are drawn thin and do not affect the axis limits."""
     address, array = flight_of()
     array["xy_valid"][50:80] = array["z_valid"][50:80] = array["v_xy_valid"][50:80] = False
     for name, value in (("x", 500.0), ("y", -900.0), ("z", -700.0), ("vx", 80.0)):
@@ -100,8 +102,8 @@ def test_invalid_estimate_is_thin_and_out_of_the_scale(others: list[tuple[Addres
         assert np.array_equal(np.isfinite(np.asarray(thick.get_ydata())), array["xy_valid"]), name
 
 
-def test_estimate_that_is_never_valid_is_in_the_scale() -> None:
-    """Where nothing is valid the limits are those of what is drawn. Messages made up."""
+def test_estimate_that_is_never_valid_sets_the_limits() -> None:
+    """If no message is valid, the invalid ones determine the axis limits."""
     address, array = flight_of()
     array["xy_valid"] = array["z_valid"] = array["v_xy_valid"] = False
     array["x"] *= 100
@@ -111,8 +113,8 @@ def test_estimate_that_is_never_valid_is_in_the_scale() -> None:
     assert parts["speed"].get_ylim()[0] < 1.0 < parts["speed"].get_ylim()[1]
 
 
-def test_height_shows_its_own_resets() -> None:
-    """Only resets of z and vz are lines in the plot of height; the rows below have all. Messages made up."""
+def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
+    """The altitude plot has lines for resets of z and vz; the rows below show all resets."""
     address, array = flight_of()
     for number, counter in enumerate(("xy", "z", "vxy", "vz", "heading"), 1):
         array[f"{counter}_reset_counter"][10 * number :] = 1
@@ -127,7 +129,7 @@ def test_height_shows_its_own_resets() -> None:
 
 
 def test_events_are_marked_by_severity() -> None:
-    """A condition is a bar from begin to end, the shape of a mark is its severity; ticks are info. Events made up."""
+    """A condition is a bar from start to end; the shape of a mark is its severity."""
     lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix 3D to none")
     events = [
         event_of("mode", "once", "info", 2.0, names=("Hold", "Mission")),
@@ -138,7 +140,7 @@ def test_events_are_marked_by_severity() -> None:
         event_of("gps_fix_lost", "end", "info", 8.0),
         event_of("reset", "once", "watch", 8.5, text="reset of xy by 3.0 m"),
         event_of("xy_invalid", "end", "info", 9.0, names=("xy_valid",)),
-        event_of("battery", "begin", "bad", 90_000.0),  # of a damaged timestamp
+        event_of("battery", "begin", "bad", 90_000.0),  # from a damaged timestamp
     ]
     parts = drawn([flight_of()], events)
     assert bars_of(parts["events"]) == {
@@ -161,7 +163,7 @@ def test_events_are_marked_by_severity() -> None:
     labels = [text.get_text() for text in parts["track"].get_legend().get_texts()]
     assert labels == [f"7/{VLP}", "watch event", "bad event"]
     others = drawn([flight_of(vehicle="8")], events)
-    assert "events" not in others, "events of a vehicle that is not drawn"
+    assert "events" not in others, "events of a vehicle that is not plotted"
     assert not marks_of(others["track"], "x")
 
 
@@ -174,7 +176,7 @@ def test_events_are_marked_by_severity() -> None:
     ],
 )
 def test_time_axis_names_its_clock(offsets: dict[str, float], ticks: list[str], label: str) -> None:
-    """Ticks are round times of the clock that `why` and `events` use, UTC or seconds since boot. Messages made up."""
+    """Ticks are round times on the clock of `why` and `events`: UTC or seconds since boot."""
     event = event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",))
     parts = drawn([flight_of()], [event], Times(offsets=offsets))
     assert parts["speed"].get_xlabel() == parts["events"].get_xlabel() == label
@@ -189,14 +191,14 @@ def test_time_axis_names_its_clock(offsets: dict[str, float], ticks: list[str], 
     assert times.find(shown[nearest], event) - event.time == pytest.approx(nearest - place)
 
 
-def test_time_axis_of_different_clocks_is_since_boot() -> None:
-    """Vehicles that booted at different times share an axis only since boot. Messages made up."""
+def test_time_axis_of_vehicles_with_different_boots_is_since_boot() -> None:
+    """Vehicles whose UTC offsets differ are plotted over seconds since boot."""
     parts = drawn([flight_of(), flight_of(vehicle="8")], times=Times(offsets={"7": 1.7e9, "8": 1.7e9 + 30}))
     assert parts["speed"].get_xlabel() == "time [s since boot]"
 
 
-def test_bar_ends_when_all_flags_are_over() -> None:
-    """A begin of two flags that end one after the other has one mark, and one bar until the last. Events made up."""
+def test_bar_ends_with_the_last_of_several_flags() -> None:
+    """Two flags that begin together have one mark, and one bar until the last of them ends."""
     events = [
         event_of("failsafe_flag", "begin", "watch", 3.0, names=("a", "b")),
         event_of("failsafe_flag", "end", "info", 5.0, names=("a",)),
@@ -205,8 +207,8 @@ def test_bar_ends_when_all_flags_are_over() -> None:
     assert bars_of(drawn([flight_of()], events)["events"]) == {"failsafe flag": [(2.0, 6.0)]}
 
 
-def test_events_of_several_vehicles_have_their_own_rows() -> None:
-    """With events of two vehicles each row names its own, at the times of its own clock. Events made up."""
+def test_events_of_each_vehicle_have_their_own_rows() -> None:
+    """With two vehicles each row names its vehicle, and has the times of that vehicle's clock."""
     events = [
         event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",)),
         Event("8", "failsafe", "begin", "bad", "failsafe", 99.0, 6.0, names=("failsafe",)),
@@ -217,8 +219,8 @@ def test_events_of_several_vehicles_have_their_own_rows() -> None:
 
 
 @pytest.mark.slow
-def test_command_marks_events(tmp_path: Path) -> None:
-    """`nedbus plot` marks what happens in the loss of GPS of a simulated flight, recorded; no file but that."""
+def test_plot_command_marks_events(tmp_path: Path) -> None:
+    """`nedbus plot` marks the events of a simulated loss of GPS."""
     flight = tmp_path / "flight.mcap"
     convert_replay("sim:?duration=80&topics=VehicleLocalPosition,SensorGps,VehicleStatus,EstimatorStatusFlags", flight)
     with pytest.importorskip("matplotlib").rc_context({"svg.fonttype": "none"}):
@@ -231,10 +233,10 @@ def test_command_marks_events(tmp_path: Path) -> None:
 @pytest.mark.logs
 @pytest.mark.skipif(not REAL, reason="no real logs")
 @pytest.mark.parametrize("path", [*SMALL, *LARGE], ids=lambda path: path.stem)
-def test_texts_of_real_flights_do_not_overlap(path: Path) -> None:
-    """In each row of events, texts and marks are beside each other, within the plot. Real: the logs of PX4."""
+def test_labels_of_real_flights_do_not_overlap(path: Path) -> None:
+    """In each row of events, labels and marks neither overlap nor extend beyond the axes."""
     streams = [(Address("1", VLP), nedbus.read(path))]
-    events = told_by(path)
+    events = events_of(path)
     parts = drawn(streams, events)
     axes = parts["events"]
     frame = axes.get_window_extent()
@@ -260,11 +262,11 @@ def test_texts_of_real_flights_do_not_overlap(path: Path) -> None:
 @pytest.mark.logs
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL, reason="no real logs")
-def test_real_loss_of_gps_is_marked() -> None:
-    """The loss of GPS of a real simulation of PX4: what was not valid is bad, from 32.3 s to 48.1 s. Real: its log."""
+def test_real_gps_loss_is_marked() -> None:
+    """In a log of PX4's simulator, the bars of the GPS loss match the flags, from 32.3 s to 48.1 s."""
     path = LOGS.parent / "px4" / "twelve_messages.ulg"
     array = nedbus.read(path)
-    parts = drawn([(Address("1", VLP), array)], told_by(path))
+    parts = drawn([(Address("1", VLP), array)], events_of(path))
     bars = bars_of(parts["events"])
     assert bars["xy invalid"] == bars["v xy invalid"]
     [(begin, end)] = bars["xy invalid"]

@@ -1,4 +1,4 @@
-"""Logs and recordings as arrays, as data frames and as plots."""
+"""Logs and recordings as arrays, data frames and plots, and the scripts of the docs."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from tests.peers.command_line import run_command
 
 from .test_alignment import array_of, write
 
-# pandas, polars and matplotlib take a second, which only these tests need: they are imported there.
+# pandas, polars and matplotlib take a second to import, so only the tests that need them do.
 
 DOCS = Path(__file__).parents[3] / "docs"
-COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")  # of the streams of a plot, in order
+COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")  # of the streams in a plot, in order
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +48,8 @@ def flight(recorded: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(recorded, tmp_path))
 
 
-def test_recording_is_an_array(flight: Path) -> None:
-    """Every message, in order, with PX4's own types."""
+def test_recording_is_read_as_an_array(flight: Path) -> None:
+    """The array has every message in order, with PX4's field types."""
     array = nedbus.read(flight)
     messages = open_replay("sim:?duration=20").messages
     expected = [upgrade(each.fields) for each in messages if each.address.topic == VLP]
@@ -60,8 +60,8 @@ def test_recording_is_an_array(flight: Path) -> None:
     assert nedbus.read(flight, vehicle=1).tobytes() == array.tobytes()
 
 
-def test_frames_have_named_columns(flight: Path) -> None:
-    """A data frame of either package has all columns, with the same values and types."""
+def test_data_frames_have_all_columns(flight: Path) -> None:
+    """Data frames of pandas and polars have all columns, with the values and types of the array."""
     pd, pl = pytest.importorskip("pandas"), pytest.importorskip("polars")
     array = nedbus.read(flight)
     panda = nedbus.read(flight, dataframe="pandas")
@@ -77,7 +77,7 @@ def test_frames_have_named_columns(flight: Path) -> None:
 
 
 def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
-    """A selection that matches several streams or none is an error that names the available ones."""
+    """A selection that matches no stream or several raises; the error lists the available ones."""
     with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match: set instance to one of 1/"):
         nedbus.read(flight, "estimator_local_position")
     has = f"expected one of 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
@@ -89,8 +89,8 @@ def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
         nedbus.read(tmp_path / "none.ulg")
 
 
-def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
-    """The property in which several streams differ has to be named; a topic of another vehicle alone is to blame."""
+def test_ambiguous_selection_names_the_missing_argument(tmp_path: Path) -> None:
+    """The error names the argument that is missing or wrong: vehicle, topic or instance."""
     path = tmp_path / "a.mcap"
     addresses = [Address(str(vehicle), VLP) for vehicle in range(1, 14)]
     addresses += [Address("99", "estimator_local_position", instance) for instance in (0, 1)]
@@ -110,8 +110,8 @@ def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
         nedbus.read(path, vehicle="99")
 
 
-def test_large_recording_is_not_loaded_whole(tmp_path: Path) -> None:
-    """Reading one stream of many takes the memory of that stream, not that of the file."""
+def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
+    """Reading one stream needs memory for that stream, not for the whole file."""
     path = tmp_path / "large.mcap"
     rng = np.random.default_rng(0)
     noise = to_array([message(0)] * 1000)
@@ -137,10 +137,10 @@ def test_large_recording_is_not_loaded_whole(tmp_path: Path) -> None:
     assert peak < 1_100_000, f"{peak} bytes for {path.stat().st_size}"
 
 
-def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without pandas, or without mcap, the error names the package to install; a misspelt frame is none."""
+def test_missing_package_error_has_the_pip_command(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pandas or mcap the error has the pip command; an unknown data frame library raises."""
     with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
-        nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # that is the mistake
+        nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed: pip install pandas"):
         nedbus.read(flight, dataframe="pandas")
@@ -160,7 +160,7 @@ def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.Mo
     ],
 )
 def test_flight_is_plotted(flight: Path, arguments: list[str], streams: int) -> None:
-    """Each selected stream is in the picture beside the flight: as a track, and as bars of its flags."""
+    """`nedbus plot` writes an image next to the flight, with a track and flags for each selected stream."""
     plot = run_command("plot", str(flight), *arguments)
     assert plot.exit_code == 0, plot.err
     picture = flight.with_suffix(".png")
@@ -168,32 +168,32 @@ def test_flight_is_plotted(flight: Path, arguments: list[str], streams: int) -> 
     pixels = pytest.importorskip("matplotlib.image").imread(picture)[..., :3]
     height, width, _ = pixels.shape
     assert width == 1440
-    # Six flags and the resets of heading of each stream have their own lines of text, and so has each kind of event.
+    # Each stream has seven rows, six flags and heading resets; each kind of event has one, too.
     assert height > 960 if streams == 1 else height >= 120 * (6.0 + 0.16 * 7 * streams)
     track, flags = pixels[:480, : width * 2 // 5], pixels[720:]
     for color in COLORS[:streams]:
         assert count_pixels(flags, color) > 1000, color
         assert count_pixels(track, color) > 40, color
     assert count_pixels(track, COLORS[streams - 1]) > 250  # the last track covers the others
-    for color in COLORS[max(2, streams) :]:  # the second one is also that of dead reckoning
+    for color in COLORS[max(2, streams) :]:  # the second one is also used for dead reckoning
         assert count_pixels(pixels, color) == 0, color
 
 
 def count_pixels(pixels: np.ndarray, color: str) -> int:
-    """Return how many pixels have this color, but for rounding."""
+    """Return the number of pixels with this color, up to rounding."""
     wanted = np.frombuffer(bytes.fromhex(color[1:]), np.uint8) / 255
     return int(np.count_nonzero(np.abs(pixels - wanted).max(axis=-1) < 0.02))
 
 
 def texts_of(streams: list[tuple[Address, np.ndarray]], path: Path, *, title: str = "") -> list[str]:
-    """Draw, and return the texts in the picture."""
+    """Plot to an SVG file, and return its texts."""
     with pytest.importorskip("matplotlib").rc_context({"path.simplify": False, "svg.fonttype": "none"}):
         recording.draw(streams, path, title=title)
     return re.findall(r"<text[^>]*>([^<]*)</text>", path.read_text())
 
 
-def test_plot_shows_every_valid_message(tmp_path: Path) -> None:
-    """The track goes through every valid position, east to the right and north up; flags and resets have their rows."""
+def test_track_has_every_valid_position(tmp_path: Path) -> None:
+    """The track has every valid position, east to the right, north up; flags and resets have rows."""
     angles = np.linspace(0, 5, 60)
     array = to_array([message(1)] * 60)
     array["timestamp"] = 1_000_000 + 10_000 * np.arange(60)
@@ -222,8 +222,8 @@ def test_plot_shows_every_valid_message(tmp_path: Path) -> None:
     assert second == pytest.approx(first * 0.24 / 0.2, rel=1e-4)
 
 
-def test_plot_leaves_out_what_the_flight_does_not_have(tmp_path: Path) -> None:
-    """Flags and resets that a log lacks have no row, and the picture says so."""
+def test_plot_names_missing_flags(tmp_path: Path) -> None:
+    """Flags and resets that a log lacks have no row; a note in the plot lists them."""
     path = tmp_path / "a.ulg"
     writer = UlogWriter(layout="1.13")
     writer.define([VLP], without=["heading_reset_counter"])
@@ -236,8 +236,8 @@ def test_plot_leaves_out_what_the_flight_does_not_have(tmp_path: Path) -> None:
     assert f"not in 1/{VLP}: dead_reckoning, heading_reset_counter" in texts
 
 
-def test_plot_of_nothing_valid_is_explained(tmp_path: Path) -> None:
-    """It is drawn, and its titles explain the thin lines; any name of a file is drawn, and none as a formula."""
+def test_plot_without_valid_messages_has_titles_and_any_file_name(tmp_path: Path) -> None:
+    """Invalid messages are plotted with explanatory titles; a file name is not interpreted as math text."""
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
     texts = texts_of([(Address("1", VLP), array)], tmp_path / "a.svg", title=name)
@@ -246,7 +246,7 @@ def test_plot_of_nothing_valid_is_explained(tmp_path: Path) -> None:
 
 
 def test_missing_fields_are_named(tmp_path: Path) -> None:
-    """`read` tells a field that a log lacks from a fact: by `missing_of`, and as null in frames."""
+    """Fields that a log lacks are named by `missing_of`, and null in data frames."""
     writer = UlogWriter(layout="1.13")
     writer.define([VLP])
     for number in range(5):
@@ -271,8 +271,8 @@ def test_missing_fields_are_named(tmp_path: Path) -> None:
     assert not bear["x"].has_nulls()
 
 
-def test_missing_fields_of_some_messages_are_null_there(tmp_path: Path) -> None:
-    """A recording of two sources of one vehicle: what one lacks is null in its messages only."""
+def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
+    """With two sources of one vehicle, a field that one lacks is null only in its messages."""
     path = tmp_path / "a.mcap"
     array = to_array([message(1, eph=1.0), message(2, eph=2.0)])
     without = Provenance("mavlink", frozenset({"dead_reckoning", "delta_xy", "eph"}))
@@ -286,8 +286,8 @@ def test_missing_fields_of_some_messages_are_null_there(tmp_path: Path) -> None:
     assert bear["eph"].to_list() == [1.0, None]
 
 
-def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The names in docs/data.md and docs/recordings.md are in `nedbus`, and the scripts about files run."""
+def test_names_and_scripts_in_the_docs_work(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names in docs/data.md and docs/recordings.md exist in `nedbus`, and the scripts of the latter run."""
     data, recordings = ((DOCS / name).read_text() for name in ("data.md", "recordings.md"))
     names = set(re.findall(r"\bnedbus\.([A-Za-z]\w*)", re.sub(r"nedbus\.toml", "", data + recordings)))
     names |= set(re.findall(r"`(\w+_to_\w+)`", data))
@@ -307,14 +307,14 @@ def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch)
     pd = pytest.importorskip("pandas")
     scope: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", recordings, re.DOTALL):
-        exec(block, scope)  # noqa: S102 - our own page
+        exec(block, scope)  # noqa: S102 - our own docs
     assert isinstance(scope["estimates"], pd.DataFrame)
     assert pd.read_csv(flight.with_name("flight.csv"))["x"].tolist() == [2.5]
     assert 0.0 < float(str(scope["rms"])) < 30.0
 
 
-def test_messages_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A recording with positions on the topic of attitudes: they are not read as attitudes, and the log says why."""
+def test_messages_of_another_type_are_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Positions on the topic of attitudes are not read as attitudes; the reason is logged."""
     path, addresses = tmp_path / "a.mcap", [Address("1", "vehicle_attitude"), Address("1", VLP)]
     with RecordingWriter(path) as writer:
         streams = [(address, Provenance("sim")) for address in addresses]
@@ -324,8 +324,8 @@ def test_messages_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.Lo
     assert "its messages are VehicleLocalPosition, but vehicle_attitude has VehicleAttitude" in caplog.text
 
 
-def test_recording_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many topics are wanted."""
+def test_reading_several_topics_reads_the_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file is read in one pass for any number of topics."""
     path = tmp_path / "flight.mcap"
     convert_replay("sim:?duration=20", path)
     passes: list[object] = []
@@ -341,8 +341,10 @@ def test_recording_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("sampled", [True, False])
-def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, sampled: bool) -> None:
-    """The script of the page finds 5 m, whatever the delay, the rates, and the origins of the two topics."""
+def test_ground_truth_recipe_measures_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, sampled: bool
+) -> None:
+    """The script in docs/recordings.md finds an error of 5 m for topics with different delay, rate and origin."""
     origin = MapProjection(47.0, 8.0)
     latitude, longitude = origin.reproject(100.0, -50.0)
     streams: dict[str, list[VehicleLocalPosition]] = {VLP: [], f"{VLP}_groundtruth": []}
@@ -364,7 +366,7 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
     [recipe] = [block for block in blocks if "rms" in block]
     scope: dict[str, object] = {"nedbus": nedbus}
-    exec(recipe, scope)  # noqa: S102 - our own page
+    exec(recipe, scope)  # noqa: S102 - our own docs
     assert scope["rms"] == pytest.approx(5.0, abs=0.01)
 
 
@@ -376,14 +378,14 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             2,
             "vehicle '9' is not in flight.mcap: expected one of 1/battery_status/0, 1/est",
         ),
-        ("flight.mcap -o a.foo", 2, "a.foo: not a picture format: the name must end with .png or .svg or .pdf"),
-        ("flight.mcap -o /dev/full", 2, "/dev/full: not a picture format: the name must end with .png or .svg or .pdf"),
+        ("flight.mcap -o a.foo", 2, "a.foo: not an image format: the name must end with .png or .svg or .pdf"),
+        ("flight.mcap -o /dev/full", 2, "/dev/full: not an image format: the name must end with .png or .svg or .pdf"),
         ("flight.mcap -o /nowhere/a.png", 1, "cannot be written"),
         ("invalid.mcap", 1, "the selected streams have no valid message"),
     ],
 )
-def test_plot_that_cannot_be_drawn_is_an_error(flight: Path, arguments: str, exit_code: int, reason: str) -> None:
-    """A stream that is not in the file is exit code 2; a missing folder, or no valid message, is exit code 1."""
+def test_impossible_plot_exits_with_an_error(flight: Path, arguments: str, exit_code: int, reason: str) -> None:
+    """An unknown stream or suffix exits with 2, a missing folder or a stream without valid messages with 1."""
     array = to_array([message(1), message(2)])
     array["xy_valid"] = True
     with RecordingWriter(flight.with_name("invalid.mcap")) as writer:

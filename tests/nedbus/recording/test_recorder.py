@@ -1,4 +1,4 @@
-"""Recordings: read by independent readers, complete after a power cut, and replayed to the bit."""
+"""Recordings: independent readers, crash safety, exact replay, and conversion."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ADDRESS = Address("7", VLP)
 
 
 def read_independently(path: Path) -> list[tuple[str, int, int, Any]]:
-    """Read with the mcap package, and decode by the definition in the file: no code of this project."""
+    """Read with the mcap package and decode with rosbags by the definition in the file, without code of nedbus."""
     store = get_typestore(Stores.EMPTY)
     found = []
     with path.open("rb") as file:
@@ -61,8 +61,8 @@ def write(writer: RecordingWriter, *messages: VehicleLocalPosition) -> None:
     writer.write(to_array(messages), DEFAULT, repeat((ADDRESS, Provenance())), logged=times, published=times)
 
 
-def test_independent_readers_get_named_fields(tmp_path: Path) -> None:
-    """The mcap package and a decoder made from the definition in the file return every field as it was."""
+def test_independent_reader_decodes_every_field(tmp_path: Path) -> None:
+    """The mcap package, and a decoder built from the definition in the file, return every field unchanged."""
     fields = {"x": 0.1, "vxy_max": math.inf, "delta_xy": (1.0, math.nan), "xy_reset_counter": 255}
     sent = message(5, ref_lat=47.397742123456789, **fields)
     with RecordingWriter(tmp_path / "a.mcap") as writer:
@@ -75,10 +75,10 @@ def test_independent_readers_get_named_fields(tmp_path: Path) -> None:
         assert repr(there) == repr(value), name
 
 
-def test_recording_is_replayed_to_the_bit(
+def test_replay_of_a_recording_is_bit_exact(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session, tmp_path: Path
 ) -> None:
-    """Recorded from the bus and replayed from the file: the same messages, and the same fields not provided."""
+    """A recording replays the same messages as those on the bus, with the same missing fields."""
     messages = list(open_replay("sim:?duration=1&topics=VehicleLocalPosition").messages)
     path = tmp_path / "flight.mcap"
     publishers = {
@@ -112,10 +112,10 @@ def test_recording_is_replayed_to_the_bit(
 
 
 @pytest.mark.slow
-def test_power_cut_costs_a_second_at_most(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """After kill -9 the file opens with an independent reader, and ends within a second of the last message.
+def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """After kill -9 an independent reader can read the file, which lacks at most the last second.
 
-    A busy machine may hold up the recorder for longer than that, but hardly at each of five moments.
+    A busy host may delay the recorder for longer, but hardly in each of five attempts.
     """
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
     costs: list[int] = []
@@ -135,10 +135,10 @@ def test_power_cut_costs_a_second_at_most(run_nedbus: Start, endpoint: str, tmp_
     assert costs[-1] < 1_500_000
 
 
-def test_file_is_complete_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From its opening on any reader finds all that was flushed, and a valid end, as after kill -9; it is on the disk.
+def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the start on, any reader finds all flushed messages and a valid end of file.
 
-    That is what fsync is for: no test can cut the power.
+    A test cannot cut the power; it checks that fsync was called.
     """
     path = tmp_path / "a.mcap"
     synced = []
@@ -158,7 +158,7 @@ def test_file_is_complete_after_every_flush(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_truncated_file_is_read_up_to_the_cut(tmp_path: Path) -> None:
-    """Wherever a file is cut, the whole messages before the cut are read."""
+    """Wherever a file is cut, all complete messages before the cut are read."""
     path, truncated = tmp_path / "a.mcap", tmp_path / "truncated.mcap"
     with RecordingWriter(path) as writer:
         for count in range(1, 11):
@@ -190,12 +190,12 @@ def empty_recording() -> bytes:
         (b"not mcap", "not a readable MCAP file"),
         (b"\x89MCAP0\r\n" + bytes(100), "no message can be read"),
         (bytes(10_000), "not a readable MCAP file"),
-        (empty_recording(), "no messages of PX4 topics: nothing in it is of px4_msgs"),
+        (empty_recording(), "no messages of PX4 topics: no channel has a type of px4_msgs"),
         (None, "no such file"),
     ],
 )
-def test_file_without_a_position_is_an_error(tmp_path: Path, content: bytes | None, reason: str) -> None:
-    """A file that is no recording, or one without local positions, has nothing to replay."""
+def test_file_without_messages_raises(tmp_path: Path, content: bytes | None, reason: str) -> None:
+    """A file that is not a recording, or has no messages of PX4 topics, raises."""
     path = tmp_path / "a.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -204,10 +204,10 @@ def test_file_without_a_position_is_an_error(tmp_path: Path, content: bytes | No
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_bags_of_ros2_are_replayed(tmp_path: Path, layout: str) -> None:
-    """Files of `ros2 bag record`: without vehicle metadata, in any layout of px4_msgs, beside other topics.
+def test_ros2_bag_is_replayed(tmp_path: Path, layout: str) -> None:
+    """A file of `ros2 bag record` in any layout of px4_msgs is replayed; other topics are ignored.
 
-    A channel whose encoding is not supported is left out, with a warning.
+    A channel with an unsupported encoding is skipped with a warning.
     """
     path = tmp_path / "bag.mcap"
     definition = "uint8 CONSTANT=1\n" + message_definition(layout) + "\n" + "=" * 80 + "\nMSG: other/Type\nuint8 z\n"
@@ -217,7 +217,7 @@ def test_bags_of_ros2_are_replayed(tmp_path: Path, layout: str) -> None:
         writer.start("ros2")
         schema = writer.register_schema(ROS2_TYPE, "ros2msg", definition.encode())
         other = writer.register_schema("std_msgs/msg/Empty", "ros2msg", b"")
-        topics = ("/fmu/out/vehicle_local_position", "/px4_1/fmu/out/estimator_local_position_1", "/somebody")
+        topics = ("/fmu/out/vehicle_local_position", "/px4_1/fmu/out/estimator_local_position_1", "/other")
         for topic in topics:
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, 1, encode_cdr(downgrade(sent, layout), layout=layout), 1)
@@ -234,7 +234,7 @@ def test_bags_of_ros2_are_replayed(tmp_path: Path, layout: str) -> None:
 
 @pytest.mark.parametrize("arguments", [["record", "-o", "there/a.mcap"], ["convert", "flight.mcap", "there/a.mcap"]])
 def test_existing_file_is_not_replaced(endpoint: str, arguments: list[str]) -> None:
-    """A recording of the same name stays as it is, and nothing else is left."""
+    """An existing file stays unchanged, and no other file is left behind."""
     convert_replay("sim:?duration=1", Path("flight.mcap"))
     path = Path("there/a.mcap")
     path.parent.mkdir()
@@ -247,8 +247,8 @@ def test_existing_file_is_not_replaced(endpoint: str, arguments: list[str]) -> N
 
 
 @contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Let no file become larger than this, as on a disk that is full."""
+def file_size_limit(size: int) -> Iterator[None]:
+    """Limit the size of all files, to simulate a full disk."""
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
     try:
@@ -257,8 +257,8 @@ def largest_file(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
 
 
-def test_full_disk_ends_cleanly(tmp_path: Path) -> None:
-    """A full disk raises OutputError, and all that was flushed can be read."""
+def test_full_disk_raises_and_keeps_flushed_messages(tmp_path: Path) -> None:
+    """A full disk raises OutputError; all flushed messages can be read."""
     path = tmp_path / "full.mcap"
     flushed = 0
 
@@ -271,7 +271,7 @@ def test_full_disk_ends_cleanly(tmp_path: Path) -> None:
                 writer.flush()
                 flushed = count + 100
 
-    with largest_file(50_000), pytest.raises(OutputError, match=r"full\.mcap cannot be written \(file too large\)"):
+    with file_size_limit(50_000), pytest.raises(OutputError, match=r"full\.mcap cannot be written \(file too large\)"):
         fill()
     assert flushed
     assert len(read_independently(path)) == flushed
@@ -286,11 +286,11 @@ def test_full_disk_ends_cleanly(tmp_path: Path) -> None:
         (300, ["pki", "ca", "full/new"], "new/ca cannot be written: file too large"),
     ],
 )
-def test_full_disk_leaves_nothing_behind(size: int, arguments: list[str], reason: str) -> None:
-    """convert, plot and pki say what failed, exit with 1, and leave no half file: no empty key above all."""
+def test_full_disk_leaves_no_partial_file(size: int, arguments: list[str], reason: str) -> None:
+    """On a full disk convert, plot and pki exit with 1, name the file, and leave no partial file or key."""
     convert_replay("sim:?duration=2", Path("flight.mcap"))
     Path("full").mkdir()
-    with largest_file(size):
+    with file_size_limit(size):
         ended = run_command(*arguments)
     assert ended.exit_code == 1, ended.err
     assert reason in ended.err
@@ -298,7 +298,7 @@ def test_full_disk_leaves_nothing_behind(size: int, arguments: list[str], reason
 
 
 def dues(path: Path, *logged: float) -> list[float]:
-    """Return when the messages of a recording are due that were recorded at these seconds, stamped as it likes."""
+    """Return the replay times of messages recorded at these times [s], with unrelated publish times."""
     with RecordingWriter(path) as writer:
         for number, time in enumerate(logged):
             address = Address(str(number % 2), VLP)
@@ -311,22 +311,22 @@ def dues(path: Path, *logged: float) -> list[float]:
 @pytest.mark.parametrize(
     ("logged", "due"),
     [
-        ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour: side by side
-        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # the last value of three hours ago comes first
-        ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 1, 2]),  # a stray time
-        ([5, 6, 5.5, 7], [0, 0.5, 1, 2]),  # one that was written late
-        ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set
+        ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour
+        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # a retained message of three hours ago
+        ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 1, 2]),  # an outlier
+        ([5, 6, 5.5, 7], [0, 0.5, 1, 2]),  # a message that was written late
+        ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set back
     ],
 )
-def test_replay_follows_the_times_of_recording(tmp_path: Path, logged: list[float], due: list[float]) -> None:
-    """Publishers' clocks do not matter, gaps of more than a minute are not waited for, nor once it is converted."""
+def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float], due: list[float]) -> None:
+    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, also after conversion."""
     assert dues(tmp_path / "a.mcap", *logged) == due
     convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
     assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == due
 
 
-def test_record_ends_with_ctrl_c(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
-    """Ctrl-C ends a recording: exit code 0, a finished file, and a line with the counts."""
+def test_ctrl_c_finishes_the_recording(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+    """Ctrl-C finishes the file, prints the counts, and exits with 0."""
     path = tmp_path / "a.mcap"
     recorder = run_nedbus("record", VLP, "-c", endpoint, "-o", str(path), measured=False)
     wait_for(path.exists, what="the file")
@@ -345,8 +345,8 @@ def test_record_ends_with_ctrl_c(run_nedbus: Start, endpoint: str, bus: nedbus.B
     assert f"{len(found)} messages" in recorder.err
 
 
-def test_deleted_recording_is_an_error(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """A recording that is deleted while it is written ends at the next flush, with what is lost, and exit code 1."""
+def test_deleting_the_recording_exits_with_an_error(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """If the file is deleted, recording stops at the next flush with exit code 1."""
     path = tmp_path / "a.mcap"
     recorder = run_nedbus("record", "-c", endpoint, "-o", str(path))
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
@@ -358,8 +358,8 @@ def test_deleted_recording_is_an_error(run_nedbus: Start, endpoint: str, tmp_pat
     assert " messages" not in recorder.err
 
 
-def test_moved_recording_goes_on(tmp_path: Path) -> None:
-    """A recording that is given another name is written to its end."""
+def test_moved_recording_is_continued(tmp_path: Path) -> None:
+    """A file that is renamed during the recording is complete."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         path.rename(tmp_path / "b.mcap")
@@ -368,12 +368,12 @@ def test_moved_recording_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ended", ["by its duration", "by Ctrl-C"])
-def test_recording_nothing_is_said(
+def test_recording_without_messages_warns_and_removes_the_file(
     endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings, ended: str
 ) -> None:
-    """A vehicle that is not there: stderr says after 2 s that nothing came, and at the end that no file is left.
+    """Without messages a notice is printed after 2 s; at the end the empty file is removed, with exit code 1.
 
-    The recorder begins after the notice, so that its duration cannot end before.
+    The recorder starts after the notice, as its duration might end before.
     """
     path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
 
@@ -416,10 +416,10 @@ NAME = "not a recording: its name must end with .mcap"
         ("convert flight.ulg a.mcap", 1, "no such file"),
     ],
 )
-def test_mistake_is_one_line(endpoint: str, arguments: str, exit_code: int, reason: str) -> None:
-    """A wrong argument is exit code 2, a file that cannot be read is exit code 1; there is one line, and no file.
+def test_invalid_argument_is_a_one_line_error(endpoint: str, arguments: str, exit_code: int, reason: str) -> None:
+    """An invalid argument exits with 2, an unreadable file with 1; one line is printed, and no file is written.
 
-    MCAP is written under no other name.
+    Names of recordings must end with .mcap.
     """
     write_log(Path("a.ulg"), [1, 2])
     ended = run_command(*arguments.split(), NEDBUS_CONNECT=endpoint)
@@ -430,8 +430,8 @@ def test_mistake_is_one_line(endpoint: str, arguments: str, exit_code: int, reas
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_log_is_converted_whole(tmp_path: Path, layout: str) -> None:
-    """The recording of a log has the same messages, and the same fields not provided."""
+def test_converted_log_is_complete(tmp_path: Path, layout: str) -> None:
+    """The recording of a log has the same messages, with the same missing fields."""
     log, path, writer = tmp_path / "a.ulg", tmp_path / "flight.mcap", UlogWriter(layout=layout)
     writer.define([VLP, "estimator_local_position"], without=["tilt_var", "eph"])
     for number in range(10):
@@ -451,10 +451,10 @@ def test_log_is_converted_whole(tmp_path: Path, layout: str) -> None:
     assert len(read_independently(path)) == 30
 
 
-def test_strange_messages_are_converted_or_counted(tmp_path: Path) -> None:
-    """An impossible timestamp is kept in the message; the file's own time is limited to 64 bits of ns.
+def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
+    """An impossible timestamp is kept in the message; the log time is limited to 64 bits of nanoseconds.
 
-    A message that violates the rules is left out of the recording, and counted. A long conversion reports its progress.
+    An invalid message is left out and counted. A long conversion reports its progress.
     """
     path = tmp_path / "a.mcap"
     done: list[int] = []
@@ -467,8 +467,8 @@ def test_strange_messages_are_converted_or_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".ulg"])
-def test_pipe_is_refused_in_a_sentence(tmp_path: Path, suffix: str) -> None:
-    """A FIFO would be waited for, for ever: it is refused, and so is a folder."""
+def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
+    """A FIFO, which would block forever, raises, and so does a folder."""
     pipe = tmp_path / f"pipe{suffix}"
     os.mkfifo(pipe)
     plot = run_command("plot", str(pipe))
@@ -480,15 +480,15 @@ def test_pipe_is_refused_in_a_sentence(tmp_path: Path, suffix: str) -> None:
         nedbus.read(folder)
 
 
-def test_private_records_are_skipped(tmp_path: Path) -> None:
-    """Records that MCAP leaves to applications, and those of a later version, are no damage where they may be."""
+def test_private_and_unknown_records_are_skipped(tmp_path: Path) -> None:
+    """Application-specific records, and those of later MCAP versions, are not reported as damage."""
     path, extended = tmp_path / "a.mcap", tmp_path / "b.mcap"
     convert_replay(f"ulog:{write_log(tmp_path / 'a.ulg', range(0, 10_000_000, 1000))}", path)
     content, at, parts = path.read_bytes(), 8, list[bytes]()
     while content[at] != 15:  # the end of the data section
         end = at + 9 + int.from_bytes(content[at + 1 : at + 9], "little")
         parts.append(content[at:end])
-        if content[end] not in (7, 8):  # behind a chunk and its index
+        if content[end] not in (7, 8):  # after a chunk and its index
             parts.append(b"\x90\x05" + bytes(7) + b"hello\x30\x03" + bytes(7) + b"new")
         at = end
     extended.write_bytes(content[:8] + b"".join(parts) + content[at:])
@@ -498,8 +498,8 @@ def test_private_records_are_skipped(tmp_path: Path) -> None:
         assert not [warning for warning in reader.warnings if "skipped" in warning]
 
 
-def test_texts_are_read_back_exactly_and_shown_by_tools_of_ros_2(tmp_path: Path) -> None:
-    """A recording has log_message, and the same as Log of ROS 2 for Foxglove, which is not read as a message."""
+def test_px4_texts_are_recorded_as_ros2_log_too(tmp_path: Path) -> None:
+    """`log_message` is recorded a second time as ROS 2's Log, which nedbus ignores when it reads the file."""
     path, texts = tmp_path / "a.mcap", ["Takeoff detected", "12 \u00b5s", ""]
     written = [LogMessage(timestamp=number, severity=2 * number, text=text) for number, text in enumerate(texts)]
     with RecordingWriter(path) as writer:

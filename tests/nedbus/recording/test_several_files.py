@@ -1,4 +1,4 @@
-"""Several files at once: logs of a swarm on one axis of UTC, each vehicle with a name of its own."""
+"""Several files at once: logs of a swarm aligned in UTC, each vehicle with a unique name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import read_account
+from nedbus.sources import read_file_events
 from nedbus.web.playback import Recording
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
@@ -28,7 +28,7 @@ CASES = Path(__file__).parents[4] / "shared/cases"
 def write_flight(
     path: Path, *, boot: float, start: float, seconds: float = 10, utc: bool = True, bad: float = 99
 ) -> Path:
-    """Write a log of vehicle 1, with boot and start in seconds after EPOCH; after `bad` seconds xy is invalid."""
+    """Write a log of vehicle 1; `boot`, `start`: seconds after EPOCH; `bad`: seconds after which xy is invalid."""
     writer = UlogWriter()
     if utc:
         key = b"uint64_t boot_time_utc_us"
@@ -43,7 +43,7 @@ def write_flight(
 
 @pytest.fixture
 def swarm(tmp_path: Path) -> list[str]:
-    """Write three logs of one time, with other boots; the third ends earlier, and the second has a fault."""
+    """Write three concurrent logs with different boots; the second has a fault, and the third ends earlier."""
     return [
         str(write_flight(tmp_path / "a 1.ulg", boot=0, start=60)),
         str(write_flight(tmp_path / "b.ulg", boot=30, start=60, bad=5)),
@@ -51,12 +51,12 @@ def swarm(tmp_path: Path) -> list[str]:
     ]
 
 
-def test_events_of_several_files_are_on_one_axis(swarm: list[str]) -> None:
-    """Events have the UTC and the name of their vehicle, and a vehicle whose file ends first is not silent."""
+def test_events_of_several_files_share_utc(swarm: list[str]) -> None:
+    """Events have UTC and unique vehicle names; a vehicle whose file ends first does not count as silent."""
     shown = run_command("events", "--json", *swarm)
     assert shown.exit_code == 0, shown.err
     for path, name in zip(swarm, ("a_1", "b", "c"), strict=True):
-        assert f"{path}: vehicle 1 is {name} here, as several files have a vehicle 1" in shown.err.splitlines()
+        assert f"{path}: vehicle 1 is named {name} here, as several files have a vehicle 1" in shown.err.splitlines()
     found = [json.loads(line) for line in shown.out.splitlines()]
     assert {(each["vehicle"], each["time"]) for each in found} == {("b", "2025-10-09T08:54:25.000+00:00")}
     assert run_command("events", "-v", "a_1", *swarm).out == ""
@@ -64,8 +64,8 @@ def test_events_of_several_files_are_on_one_axis(swarm: list[str]) -> None:
     assert "b: not usable: xy and vxy not valid from 08:54:25.0" in why.out, why.err
 
 
-def test_commands_of_the_page_run(swarm: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The commands of docs/recordings.md are those of this swarm."""
+def test_commands_in_the_docs_run(swarm: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The swarm commands in docs/recordings.md exit with 0."""
     monkeypatch.chdir(tmp_path)
     for path, name in zip(swarm, "ab", strict=False):
         Path(path).rename(f"swarm_{name}.ulg")
@@ -75,28 +75,28 @@ def test_commands_of_the_page_run(swarm: list[str], monkeypatch: pytest.MonkeyPa
         assert ended.exit_code == 0, ended.err
 
 
-def test_flights_of_one_vehicle_years_apart_are_read_at_once(tmp_path: Path) -> None:
-    """The time between two files costs nothing."""
+def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
+    """The gap between two flights of a vehicle does not matter."""
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
     second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
-    account = read_account(first, second)
+    account = read_file_events(first, second)
     assert [event.vehicle for event in account.account.events_since(0)[0]] == ["a", "a", "b", "b"]
     assert math.isclose(account.end, 3e8 - 60 + 9.9, abs_tol=0.01)
 
 
-def test_file_without_utc_has_no_place_among_others(tmp_path: Path, swarm: list[str]) -> None:
-    """It is named; alone it can be read."""
+def test_file_without_utc_raises_among_several(tmp_path: Path, swarm: list[str]) -> None:
+    """A file without UTC is named in the error; alone it can be read."""
     path = write_flight(tmp_path / "d.ulg", boot=0, start=60, utc=False)
     ended = run_command("events", *swarm, str(path))
     assert ended.exit_code == 1
     assert f"nedbus: {path}: no message gives UTC" in ended.err
-    with pytest.raises(SourceError, match=r"d\.ulg: no message gives UTC"):
+    with pytest.raises(SourceError, match=r"d\.ulg: no message provides UTC"):
         nedbus.read([*swarm, path], [VLP])
     assert run_command("events", str(path)).exit_code == 0
 
 
 def test_several_files_are_read_and_aligned_in_utc(swarm: list[str]) -> None:
-    """Streams are named by vehicle, with Unix times; a row of the table has what each vehicle did at that moment."""
+    """Streams have the vehicle in their name and Unix timestamps; rows are aligned across vehicles."""
     streams = nedbus.read(swarm, [VLP])
     assert [*streams] == [f"{name}/{VLP}" for name in ("a_1", "b", "c")]
     assert [each["timestamp"][0] - EPOCH for each in streams.values()] == [60_000_000, 60_000_000, 58_000_000]
@@ -114,21 +114,21 @@ def test_several_files_are_read_and_aligned_in_utc(swarm: list[str]) -> None:
 
 
 def test_page_shows_several_files(swarm: list[str]) -> None:
-    """A playback has the vehicles of all files, each at its time."""
+    """A playback has the vehicles of all files, aligned in UTC."""
     recording = Recording(*map(Path, swarm))
     wait_for(lambda: recording.is_read, what="the files")
     assert recording.name == "a 1.ulg, b.ulg, c.ulg"
-    assert recording.chronicle.start is not None
-    assert math.isclose(recording.chronicle.start, EPOCH / 1e6 + 58, abs_tol=0.01)
+    assert recording.timeline.start is not None
+    assert math.isclose(recording.timeline.start, EPOCH / 1e6 + 58, abs_tol=0.01)
     assert {address.vehicle for address, _ in recording.entries} == {"a_1", "b", "c"}
     assert math.isclose(recording.length, 11.9, abs_tol=0.01)
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
-def test_swarm_of_users_flies_at_one_time() -> None:
-    """All three fly from 08:54:20 to 08:54:30 UTC; their boots differ, and two have the same system id."""
+def test_reported_swarm_is_aligned() -> None:
+    """Three vehicles with different boots, two with the same system id, all fly from 08:54:20 to 08:54:30 UTC."""
     paths = [CASES / f"swarm_{name}.ulg" for name in "abc"]
     streams = nedbus.read(paths, [VLP])
     assert [*streams] == [f"{name}/{VLP}" for name in ("swarm_a", "swarm_b", "3")]
     assert {int(each["timestamp"][0]) for each in streams.values()} == {EPOCH + 60_000_000}
-    assert 9.9 < read_account(*paths).end < 10.1
+    assert 9.9 < read_file_events(*paths).end < 10.1

@@ -1,4 +1,4 @@
-"""Small files made after the reports of users, each with its right value by an independent tool."""
+"""Small files that reproduce user reports, with expected values from independent tools."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import FileAccount, parse_source, read_account
+from nedbus.sources import FileEvents, parse_source, read_file_events
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
@@ -33,21 +33,21 @@ def count(name: str) -> dict[str, int]:
 
 
 def dues(name: str) -> tuple[float, float]:
-    """Return when a replay is due with its first position, and with its last one [s]."""
+    """Return the replay times of the first and the last position [s]."""
     found = [each.due for each in open_replay(f"ulog:{CASES / name}").messages if each.address.topic == VLP]
     return round(found[0], 2), round(found[-1], 2)
 
 
 def events(name: str) -> set[tuple[str, str]]:
-    """Return the kind and the severity of all events."""
+    """Return kind and severity of all events."""
     return {(each.kind, each.severity) for each in account(name).account.events}
 
 
-def account(name: str) -> FileAccount:
-    return read_account(CASES / name)
+def account(name: str) -> FileEvents:
+    return read_file_events(CASES / name)
 
 
-RIGHT: Final[list[tuple[Callable[[str], object], str, object]]] = [
+EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
     (utc, "08_boot_time_utc_us.ulg", "2025-09-08 13:31:04"),
     (utc, "28_uxrce_timesync_unix.mcap", "2025-10-09 08:53:19"),  # .997
     (count, "15_logging_dropout_5s.ulg", {VLP: 500}),
@@ -65,23 +65,23 @@ RIGHT: Final[list[tuple[Callable[[str], object], str, object]]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("value", "name", "right"), RIGHT)
-def test_value_is_right(value: Callable[[str], object], name: str, right: object) -> None:
-    """By pyulog, rosbags, and the times of the files' own records."""
-    assert value(name) == right
+@pytest.mark.parametrize(("value", "name", "expected"), EXPECTED)
+def test_value_matches_independent_tools(value: Callable[[str], object], name: str, expected: object) -> None:
+    """The expected values were determined with pyulog, rosbags, and from the records of the files."""
+    assert value(name) == expected
 
 
-def test_old_log_is_not_damaged(tmp_path: Path) -> None:
-    """A log without ver_sw_release is converted whole, with nothing to warn of."""
+def test_log_without_release_is_converted_without_warning(tmp_path: Path) -> None:
+    """A log without ver_sw_release is converted completely, without warnings."""
     log = CASES / "17_old_log_without_release.ulg"
     assert run_command("convert", str(log), str(tmp_path / "a.mcap")).exit_code == 0
     assert account("17_old_log_without_release.ulg").warnings == ()
 
 
-def test_cause_is_the_end_of_the_fake_position() -> None:
-    """The position is invalid from 154.3 on: the fake position ended at 154.1, and nothing was fused before 160.4."""
-    told = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
-    (invalid,) = (line for line in told if "BAD    xy not valid" in line)
+def test_end_of_fake_position_is_the_cause() -> None:
+    """Fake position fusion ends at 154.1 s, no other begins before 160.4 s: the position is invalid from 154.3 s."""
+    lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
+    (invalid,) = (line for line in lines if "BAD    xy not valid" in line)
     assert invalid.startswith("   154.300")
     assert "no horizontal aiding: fake position ended, nothing else is fused (200 ms before)" in invalid
 
@@ -94,8 +94,8 @@ def test_cause_is_the_end_of_the_fake_position() -> None:
         ("24b_no_definition.mcap", "no definition of px4_msgs/msg/VehicleLocalPosition"),
     ],
 )
-def test_refusal_names_the_reason(name: str, reason: str) -> None:
-    """Whatever cannot be read is named, with what to do."""
+def test_unreadable_file_raises_with_the_reason(name: str, reason: str) -> None:
+    """The error for a file that cannot be read has the reason."""
     with pytest.raises(SourceError, match=reason):
         nedbus.read(CASES / name)
 
@@ -103,8 +103,8 @@ def test_refusal_names_the_reason(name: str, reason: str) -> None:
 @pytest.mark.parametrize(
     "name", ["Bom", "BomCrlf", "DefaultValue", "FormFeed", "Latin1", "LineSep", "Nel", "StringConst"]
 )
-def test_definitions_are_read(name: str) -> None:
-    """The .msg files that rosbags reads, and those with a BOM, which it refuses."""
+def test_msg_file_variants_are_read(name: str) -> None:
+    """The .msg files that rosbags reads are read, and those with a BOM, which it refuses."""
     source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(vehicle="1")
     ((definition,),) = (each.values() for each in source._given.values())
     assert [*definition.types][:3] == ["timestamp", "angle", "mode"]

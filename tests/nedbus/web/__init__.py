@@ -1,1 +1,1 @@
-"""The page in the browser."""
+"""Tests of the web page."""

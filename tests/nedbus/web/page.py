@@ -1,4 +1,4 @@
-"""The page in the browser, for tests: a fleet with a clock, what a viewer is shown, and its server in a thread."""
+"""Fixtures for tests of the web page: a simulated fleet, the document of a viewer, and a server in a thread."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from nedbus.client import LogStreamStatus, Monitor, Sample, stream_state
 from nedbus.events import Account
 from nedbus.monitoring import Snapshot
 from nedbus.recording import RecordingWriter
-from nedbus.web import Where, serve_live
-from nedbus.web.chronicle import Chronicle
-from nedbus.web.fleet import Fleet, Line, Picture, Row
+from nedbus.web import PageOptions, serve_live
+from nedbus.web.event_timeline import EventTimeline
+from nedbus.web.fleet import Fleet, FleetSnapshot, StreamView, VehicleView
 from nedbus.web.stream import PageStream
 from nedbus.web.viewer import Viewer
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Provenance, Selection
@@ -39,7 +39,7 @@ from tests.waits import DEADLINE, repeating
 WING: Final = Address("wing", VLP)
 QUAD: Final = Address("quad", VLP)
 NOON: Final = 1_700_000_000.0
-"""Seconds since the epoch: 22:13:20 UTC."""
+"""Seconds since the Unix epoch: 22:13:20 UTC."""
 _ROW: Final = re.compile(
     r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-selected="(?P<chosen>\w+)">'
     r'<span class="(?P<grade>\w+)">.*?<span class="\w+">(?P<text>[^<]*)</span>'
@@ -48,47 +48,48 @@ _ROW: Final = re.compile(
 )
 
 
-class Sky:
-    """A fleet, its health and what happened to it, at a time that the test sets; what a page shows, but for a bus."""
+class SimulatedFleet:
+    """Everything that a live page shows, without a bus: a fleet, its health and its events, with a fake clock."""
 
     def __init__(self) -> None:
         self.fleet = Fleet()
         self.monitor = Monitor()
         self.account = Account()
-        self.chronicle = Chronicle(self.account)
+        self.timeline = EventTimeline(self.account)
         self.time = NOON
 
     def add(self, address: Address = WING, **fields: object) -> None:
-        """Receive a message now; fields are of the position, or of any other message."""
+        """Receive a message now; `fields`: of the position, or of the message of another topic."""
         stamp = round((self.time - NOON) * 1e6) + 1_000_000
         other = BY_TOPIC[address.topic]
         if other is DEFAULT:
-            heard = message(stamp, **{name: value for name, value in {**VALID, **fields}.items() if value is not None})
+            given = {name: value for name, value in {**VALID, **fields}.items() if value is not None}
+            received = message(stamp, **given)
         else:
             known = {name: value for name, value in fields.items() if name in other.model.model_fields}
-            heard = other.model.model_validate({"timestamp": stamp, **known})
-        sample = Sample(heard, address, round(self.time * 1e9))
+            received = other.model.model_validate({"timestamp": stamp, **known})
+        sample = Sample(received, address, round(self.time * 1e9))
         self.monitor.add(sample, received=sample.received)
-        self.account.add(address, heard, self.time)
+        self.account.add(address, received, self.time)
         self.fleet.add(sample, self.time)
 
     def fly(self, seconds: float, *addresses: Address, rate: int = 10, **fields: object) -> None:
-        """Receive messages for a while."""
+        """Receive messages of these addresses for a number of seconds."""
         for _ in range(round(seconds * rate)):
             self.time += 1 / rate
             for address in addresses or (WING,):
                 self.add(address, **fields)
 
-    def look(
+    def poll(
         self,
         *,
         alive: list[Address] | None = None,
         link: str = "",
-        own: str = "",
+        behind: str = "",
         is_behind: bool = False,
         logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
-    ) -> Picture:
-        """Look at all vehicles now, as the page does twice a second."""
+    ) -> FleetSnapshot:
+        """Update the snapshot as the exporter does twice a second."""
         healths = self.monitor.snapshot(round(self.time * 1e9))
         publishers = None if alive is None else Counter(alive)
         arrival = {
@@ -99,33 +100,33 @@ class Sky:
         }
         self.account.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
-        self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=own), states, logs)
-        return self.fleet.picture
+        self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=behind), states, logs)
+        return self.fleet.snapshot
 
-    def row(self, vehicle: str = "wing", **known: Any) -> Row:
-        row = self.look(**known).row(vehicle)
+    def vehicle(self, vehicle: str = "wing", **options: Any) -> VehicleView:
+        row = self.poll(**options).vehicle(vehicle)
         assert row is not None
         return row
 
-    def line(self, address: Address = WING, **known: Any) -> Line:
-        return next(line for line in self.row(address.vehicle, **known).lines if line.address == address)
+    def view(self, address: Address = WING, **options: Any) -> StreamView:
+        return next(view for view in self.vehicle(address.vehicle, **options).streams if view.address == address)
 
     def stream(self, address: Address = WING) -> PageStream:
         return self.fleet.streams[address]
 
 
 @pytest.fixture
-def sky() -> Sky:
-    return Sky()
+def sim() -> SimulatedFleet:
+    return SimulatedFleet()
 
 
-def addresses_of(picture: Picture) -> list[Address]:
-    """Return the addresses of all streams that are shown."""
-    return sorted(line.address for row in picture.rows for line in row.lines)
+def addresses_of(snapshot: FleetSnapshot) -> list[Address]:
+    """Return the addresses of all streams in a snapshot."""
+    return sorted(view.address for row in snapshot.vehicles for view in row.streams)
 
 
 def write_flight(folder: Path, topics: Mapping[str, Callable[[float], Mapping[str, object]]], *, seconds: int) -> Path:
-    """Record vehicle "wing" at 10 Hz, with the fields that each topic has then."""
+    """Record vehicle "wing" at 10 Hz; `topics`: the fields of each topic as a function of time [s]."""
     file = folder / "flight.mcap"
     with RecordingWriter(file) as writer:
         for time in range(0, seconds * 1_000_000, 100_000):  # µs
@@ -144,30 +145,30 @@ def models_of(document: Document, kind: type[Model]) -> list[Any]:
     return list(document.select({"type": kind}))
 
 
-class Shown:
-    """The document of a viewer as a person reads it; `asked`: the query string of its address."""
+class RenderedPage:
+    """The document of a viewer as the user sees it; `query`: the query string of its URL."""
 
-    def __init__(self, fleet: Fleet, world: Chronicle, *, asked: str = "", **options: Any) -> None:
+    def __init__(self, fleet: Fleet, timeline: EventTimeline, *, query: str = "", **options: Any) -> None:
         self.document = Document()
-        arguments = {name: [value.encode()] for name, value in parse_qsl(asked.removeprefix("?"))}
+        arguments = {name: [value.encode()] for name, value in parse_qsl(query.removeprefix("?"))}
         request = SimpleNamespace(request=SimpleNamespace(arguments=arguments))
-        self.document._session_context = lambda: request  # type: ignore[assignment]  # what a browser asked for
-        self.viewer = Viewer(self.document, fleet, world, **options)
+        self.document._session_context = lambda: request  # type: ignore[assignment]  # the request of a browser
+        self.viewer = Viewer(self.document, fleet, timeline, **options)
         self._numbers = count()
 
     def update(self) -> None:
-        """Send all that is new to a browser that draws all of it."""
+        """Send all changes to a browser that draws each update."""
         for _ in range(10):
             self.viewer.update()
             self.viewer._drawn.value = str(self.viewer._sent)
 
-    def say(self, action: object, value: object = "") -> None:
-        """Do what the script of the page does at a click or a key."""
-        self.say_raw(json.dumps([action, value, next(self._numbers)]))
+    def send(self, action: object, value: object = "") -> None:
+        """Send an action as `actions.js` does on a click or key."""
+        self.send_raw(json.dumps([action, value, next(self._numbers)]))
 
-    def say_raw(self, said: str) -> None:
-        """Let a browser say anything."""
-        self.viewer._message.value = said
+    def send_raw(self, message: str) -> None:
+        """Send any text as the value of the hidden input."""
+        self.viewer._message.value = message
         self.update()
 
     def search(self, text: str) -> None:
@@ -175,7 +176,7 @@ class Shown:
         self.update()
 
     def part(self, name: str) -> str:
-        """Return the text of one part of the page, as HTML."""
+        """Return the HTML of one panel of the page."""
         return next(str(div.text) for div in models_of(self.document, Div) if name in div.css_classes)
 
     @property
@@ -187,13 +188,13 @@ class Shown:
         return self.viewer.chosen
 
     @property
-    def address(self) -> str:
-        """The query string of the address that the browser shows."""
+    def url_query(self) -> str:
+        """The query string of the URL in the browser."""
         return str(self.viewer._url.value)
 
     @property
     def listed(self) -> dict[str, dict[str, str]]:
-        """The rows of the list by vehicle, in its order."""
+        """The rows of the list by vehicle, in the order shown."""
         found = (match.groupdict() for match in _ROW.finditer(self.part("list")))
         return {row["vehicle"]: {name: unescape(text) for name, text in row.items()} for row in found}
 
@@ -218,17 +219,17 @@ class Shown:
 
     @property
     def plotted(self) -> dict[str, Any]:
-        """The points of the chosen vehicle in the plots."""
+        """The points of the selected vehicle in the plots."""
         return dict(self.viewer._plots.chosen.data)
 
     @property
-    def moments(self) -> tuple[float, float]:
-        """From when to when the plots are [s]."""
+    def plot_range(self) -> tuple[float, float]:
+        """Begin and end of the plots' time axis [s]."""
         span: Any = self.viewer._plots.range
         return span.start / 1e3, span.end / 1e3
 
     def rows(self, column: str) -> list[dict[str, Any]]:
-        """Return the rows of what has a column of this name."""
+        """Return the rows of the first data source that has this column."""
         data = self.source(column).data
         return [dict(zip(data, values, strict=True)) for values in zip(*data.values(), strict=True)]
 
@@ -238,14 +239,14 @@ class Shown:
 
 
 def flying(publisher: nedbus.Publisher, fields: Mapping[str, object]) -> AbstractContextManager[None]:
-    """Publish fifty times a second, whatever the fields are then."""
+    """Publish at 50 Hz with the current contents of `fields`."""
     numbers = count(1)
     return repeating(lambda: publisher.publish(message(20_000 * next(numbers), **fields)))
 
 
 @contextmanager
 def in_thread(serve: Callable[[threading.Event, Callable[[str], object]], object]) -> Iterator[str]:
-    """Run what serves a page until an event is set, and give its address."""
+    """Run `serve` in a thread until the context exits; yield the URL of the page."""
     stop = threading.Event()
     urls: queue.SimpleQueue[str] = queue.SimpleQueue()
     server = threading.Thread(target=serve, args=[stop, urls.put])
@@ -258,12 +259,13 @@ def in_thread(serve: Callable[[threading.Event, Callable[[str], object]], object
 
 
 @contextmanager
-def serving_live(endpoint: str, where: Where | None = None) -> Iterator[str]:
-    """Serve the page of live vehicles, as `nedbus web` does."""
+def serving_live(endpoint: str, options: PageOptions | None = None) -> Iterator[str]:
+    """Serve the page of live vehicles as `nedbus web` does."""
     with nedbus.connect(endpoint) as bus:
 
-        def serve(stop: threading.Event, tell: Callable[[str], object]) -> None:
-            serve_live(bus, Selection(), where or Where("127.0.0.1", 0), version="0", stop=stop, tell=tell)
+        def serve(stop: threading.Event, on_listening: Callable[[str], object]) -> None:
+            page = options or PageOptions("127.0.0.1", 0)
+            serve_live(bus, Selection(), page, version="0", stop=stop, on_listening=on_listening)
 
         with in_thread(serve) as url:
             yield url

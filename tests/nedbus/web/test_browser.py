@@ -1,4 +1,4 @@
-"""The page in a real browser: what a person sees of vehicles, of a lost server, and of what a hostile peer sends."""
+"""The page in a real browser: layout, actions, reconnection, and hostile input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from playwright.sync_api import Browser
 
 import nedbus
 from nedbus.transport import Session
-from nedbus.web import Where
+from nedbus.web import PageOptions
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP, message
 from tests.nedbus.web.page import flying, serving_live, write_flight
@@ -27,7 +27,7 @@ __all__ = ["browser"]  # a fixture
 
 HOSTILE = "<img src=x onerror=window.hacked=1><script>window.hacked=1</script>"
 
-# A browser takes its time where other programs use the processor.
+# A browser is slow on a busy host.
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 Open = Callable[..., Tab]
@@ -37,7 +37,7 @@ Fly = Callable[..., dict[str, object]]
 
 @pytest.fixture
 def web(run_nedbus: Start) -> Web:
-    """Start `nedbus web` on a port, and wait until it serves its page."""
+    """Start `nedbus web` on a port, and wait until it serves the page."""
 
     def serve(port: int, *arguments: str) -> Process:
         process = run_nedbus("web", "--http", f"127.0.0.1:{port}", *arguments)
@@ -50,26 +50,26 @@ def web(run_nedbus: Start) -> Web:
 
 @pytest.fixture
 def url(endpoint: str) -> Iterator[str]:
-    """Serve the page of the router of this test."""
+    """Serve the page of this test's router."""
     with serving_live(endpoint) as url:
         yield url
 
 
 @pytest.fixture
 def tab(browser: Browser) -> Iterator[Open]:
-    """Open tabs that may neither ask another host for anything nor complain."""
+    """Open tabs; they must neither contact another host nor log errors."""
     with open_tabs(browser) as make:
         yield make
 
 
 @pytest.fixture
 def fly(bus: nedbus.Bus) -> Iterator[Fly]:
-    """Let a vehicle publish; its fields may be changed."""
-    with ExitStack() as flying_:
+    """Start a vehicle that publishes; the returned fields may be changed."""
+    with ExitStack() as vehicles:
 
         def begin(name: str, **fields: object) -> dict[str, object]:
             fields = {**VALID, **fields}
-            flying_.enter_context(flying(bus.publisher(VLP, vehicle=name), fields))
+            vehicles.enter_context(flying(bus.publisher(VLP, vehicle=name), fields))
             return fields
 
         yield begin
@@ -87,19 +87,19 @@ def until_order(page: Tab, *vehicles: str) -> None:
     until(lambda: [row["vehicle"] for row in page.listed] == list(vehicles), f"the order {vehicles}")
 
 
-# What is shown
+# Display
 
 
-def test_simulated_flight_fills_the_page(url: str, tab: Open, run_nedbus: Start, endpoint: str) -> None:
-    """Every part is filled from a flight: counts, the row, the map with its track, numbers, and plots with the truth.
+def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Start, endpoint: str) -> None:
+    """Counts, row, map with track, numbers, and plots with ground truth are filled by a simulated flight.
 
-    `nedbus serve` flies its simulator, whose second EKF is none of the vehicle's.
+    The simulator's second EKF instance does not affect them.
     """
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?vehicle=wing")
     page = tab(width=1280, height=800)
     page.open(url)
     until(lambda: list(page.states) == ["wing"], "the vehicle")
-    until(lambda: "1 ok" in page.part("head"), "it to be well")
+    until(lambda: "1 ok" in page.part("head"), "the vehicle to be ok")
     assert page.page.title() == "nedbus"
     until(lambda: page.chosen == ["wing"], "the vehicle")
     assert page.asked == {}
@@ -108,7 +108,7 @@ def test_simulated_flight_fills_the_page(url: str, tab: Open, run_nedbus: Start,
     until(lambda: len(page.source("speed").get("time", ())) > 10, "the plots")
     before = page.source("speed")["time"][-1]
     until(lambda: page.source("speed")["time"][-1] > before, "new points")
-    until(lambda: "NaN" not in page.source("speed")["error"][-3:], "the distance to the truth")
+    until(lambda: "NaN" not in page.source("speed")["error"][-3:], "the error to the ground truth")
     page.wait_for_text("messages/s")
     page.wait_for_text("origin 47.39")
     assert "-" not in page.part("nums").split("\n")
@@ -120,7 +120,7 @@ def test_simulated_flight_fills_the_page(url: str, tab: Open, run_nedbus: Start,
 
 
 def points(tracks: dict[str, list[Any]], kind: str) -> list[tuple[float, float]]:
-    """Return the points of all tracks of a kind that are drawn."""
+    """Return the drawn points of all tracks of a line type."""
     pairs = zip(tracks.get("east", []), tracks.get(kind, []), strict=True)
     return [(east, north) for east, north in pairs if "NaN" not in (east, north)]
 
@@ -130,7 +130,7 @@ SIZES = ((390, 844), (1280, 800), (1920, 1080))
 
 @pytest.fixture
 def fifty(bus: nedbus.Bus) -> Iterator[None]:
-    """Fly 50 vehicles at one message a second each; some of them are not well."""
+    """Publish 50 vehicles at 1 Hz each; three of them have faults."""
     flags: dict[int, dict[str, object]] = {7: {"xy_valid": False}, 23: {"dead_reckoning": True}, 42: {"z_valid": False}}
     publishers = [bus.publisher(VLP, vehicle=f"uav-{number}") for number in range(1, 51)]
     ticks = count(1)
@@ -148,11 +148,11 @@ def fifty(bus: nedbus.Bus) -> Iterator[None]:
 
 @pytest.mark.usefixtures("fifty")
 @pytest.mark.parametrize("theme", ["dark", "light"])
-def test_page_fits_every_screen(url: str, tab: Open, theme: str) -> None:
-    """With 50 vehicles, on a phone, a laptop and a wide screen, dark and light: nothing is cut off, or on another.
+def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: str) -> None:
+    """With 50 vehicles, in both themes, no panel is empty, cut off, or covers another one.
 
-    All parts have something in them, all text has a contrast of 4.5, and labels on the map do not lie on each other.
-    The worst vehicles are first in the list, and counted in the title.
+    Text has a contrast ratio of 4.5, map labels do not overlap, and the worst vehicles are first in the list and
+    counted in the title.
     """
     page = tab(width=SIZES[0][0], height=SIZES[0][1])
     page.open(f"{url}/?theme={theme}")
@@ -162,12 +162,12 @@ def test_page_fits_every_screen(url: str, tab: Open, theme: str) -> None:
     others = [f"uav-{number}" for number in range(1, 51) if number not in (7, 23, 42)]
     assert names == ["uav-7", "uav-42", "uav-23", *others]
     page.page.locator(VEHICLE).first.click()
-    until(lambda: page.chosen == ["uav-7"] and "xy not valid from" in page.part("why"), "its sentence")
+    until(lambda: page.chosen == ["uav-7"] and "xy not valid from" in page.part("why"), "its verdict")
     page.page.locator("[data-do=streams]").click()
     for width, height in SIZES:
         page.page.set_viewport_size({"width": width, "height": height})
         wait_for_none(page.misplaced, f"{width}x{height}, {theme}")
-        wait_for_none(lambda: on_each_other(page), f"labels at {width}x{height}, {theme}")
+        wait_for_none(lambda: overlapping_labels(page), f"labels at {width}x{height}, {theme}")
         assert "uav-7" in [label[0] for label in page.labels()]
     texts = page.contrasts("head", "list", "why", "nums", "tool", "more")
     assert {name for name, _, _ in texts} == {"head", "list", "why", "nums", "tool", "more"}
@@ -175,8 +175,8 @@ def test_page_fits_every_screen(url: str, tab: Open, theme: str) -> None:
     assert [each for each in texts if each[2] < 4.5] == []
 
 
-def test_nothing_is_cut_off_without_a_hint(web: Web, tab: Open, tmp_path: Path) -> None:
-    """Modes are whole, the table of streams is, and a card that goes on below has a bright edge."""
+def test_cut_off_text_has_a_visible_hint(web: Web, tab: Open, tmp_path: Path) -> None:
+    """Modes and the table of streams are not cut off; a scrollable card has a bright bottom edge."""
     others = "vehicle_attitude", "home_position", "vehicle_land_detected", "vehicle_global_position"
     topics: dict[str, Callable[[float], Mapping[str, object]]] = {
         "vehicle_status": lambda _: {"nav_state": 14, "arming_state": 2},
@@ -194,14 +194,14 @@ def test_nothing_is_cut_off_without_a_hint(web: Web, tab: Open, tmp_path: Path) 
     page.page.set_viewport_size({"width": 1280, "height": 800})
     page.page.locator("[data-do=streams]").click()
     until(lambda: len(page.cells("td")) == 36, "the streams")
-    until(lambda: not page.cells("div.more")[0].is_cut, "room for them")
+    until(lambda: not page.cells("div.more")[0].is_cut, "the table to fit")
     page.page.set_viewport_size({"width": 1280, "height": 330})
-    until(lambda: page.cells("div.why")[0].is_cut, "a card that goes on")
+    until(lambda: page.cells("div.why")[0].is_cut, "a card to scroll")
     assert "local" in page.cells("div.why")[0].layers
 
 
 def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
-    """Wait until there is no problem, and tell those that stay."""
+    """Wait until there are no problems; fail with those that remain."""
     last: list[str] = []
 
     def are_none() -> bool:
@@ -214,8 +214,8 @@ def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
         pytest.fail(f"{what}: {'; '.join(last)}")
 
 
-def on_each_other(page: Tab) -> list[str]:
-    """Return the labels on the map that lie on each other."""
+def overlapping_labels(page: Tab) -> list[str]:
+    """Return the overlapping labels on the map."""
     labels = page.labels()
     return [
         f"{one[0]} on {other[0]}"
@@ -225,13 +225,13 @@ def on_each_other(page: Tab) -> list[str]:
     ] or ([] if len(labels) > 2 else ["too few labels"])
 
 
-def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str, tmp_path: Path) -> None:
-    """Text of a peer in a reason, or in a GeoJSON file, is shown as text and makes no element."""
+def test_hostile_text_is_escaped(fly: Fly, tab: Open, raw: Session, endpoint: str, tmp_path: Path) -> None:
+    """HTML in a peer's rejection reason or in a GeoJSON file is shown as text and creates no element."""
     field = tmp_path / f"{HOSTILE[:24].replace('/', '')}.geojson"
     line = {"type": "LineString", "coordinates": [[8.545, 47.397], [8.546, 47.398]]}
     field.write_text(json.dumps({"type": "Feature", "properties": {"name": HOSTILE}, "geometry": line, "id": HOSTILE}))
     fly("wing", xy_global=True, ref_lat=47.397, ref_lon=8.545)
-    with serving_live(endpoint, Where("127.0.0.1", 0, background=field)) as url:
+    with serving_live(endpoint, PageOptions("127.0.0.1", 0, background=field)) as url:
         page = tab()
         page.open(url)
         key = Address("wing", VLP).rejected_key()
@@ -255,11 +255,10 @@ def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str
 # Viewers
 
 
-def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, raw: Session) -> None:
-    """Two pages follow the same fleet; a click in the list, a tap on a marker, or a key chooses a vehicle there alone.
+def test_viewers_are_independent(url: str, tab: Open, fly: Fly, raw: Session) -> None:
+    """Two pages show the same fleet; a click, tap or key selects a vehicle or a moment in that page only.
 
-    What happened before can be looked at, in one page as well. Whatever a browser does to its document, the other page
-    goes on as it was, and nothing is sent to the network.
+    Whatever a browser changes in its document, the other page is not affected, and nothing is sent to the bus.
     """
     fly("a")
     other = fly("b", x=30.0, y=30.0)
@@ -269,41 +268,41 @@ def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, raw: Sessi
         until_states(page, a="ok", b="ok")
         until(lambda page=page: page.chosen == ["a"], "the first vehicle")  # type: ignore[misc]  # bound here
     first.page.locator(VEHICLE, has_text="b").click()
-    until(lambda: first.chosen == ["b"], "the choice")
+    until(lambda: first.chosen == ["b"], "the selection")
     until(lambda: "30.0 m" in first.part("nums"), "the numbers of b")
     other["xy_valid"] = False
     until_order(second, "b", "a")
-    until(lambda: second.chosen == ["b"], "the worst, where nobody has chosen")
+    until(lambda: second.chosen == ["b"], "the worst, selected by default")
     second.page.locator(f"{VEHICLE}[data-with=a]").click()
-    until(lambda: second.chosen == ["a"], "the choice there")
+    until(lambda: second.chosen == ["a"], "the selection")
     until_states(first, a="ok", b="xy not valid")
     assert first.page.title() == "(1 bad) nedbus"
 
     def tap() -> bool:
-        second.tap(30, 30)  # which a map that is drawn anew in that moment does not notice
+        second.tap(30, 30)  # a map that is being redrawn ignores it
         with suppress(AssertionError):
-            wait_for(lambda: second.chosen == ["b"], what="the choice", seconds=3)
+            wait_for(lambda: second.chosen == ["b"], what="the selection", seconds=3)
         return second.chosen == ["b"]
 
-    until(tap, "the choice by a tap")
+    until(tap, "the selection by a tap")
     second.page.keyboard.press("j")
-    until(lambda: second.chosen == ["a"], "the choice by a key")
-    until(lambda: "xy not valid from" in first.part("why"), "the sentence")
+    until(lambda: second.chosen == ["a"], "the selection by a key")
+    until(lambda: "xy not valid from" in first.part("why"), "the verdict")
     other["xy_valid"] = True
-    until(lambda: " to " in first.part("why"), "the end of it")
+    until(lambda: " to " in first.part("why"), "the end of the condition")
     first.page.keyboard.press("p")
     first.page.get_by_text("back to now").wait_for()
-    until(lambda: set(first.asked) == {"vehicle", "time"}, "the address")
+    until(lambda: set(first.asked) == {"vehicle", "time"}, "the URL")
     third = tab(width=1280, height=800)
     third.open(first.url)
     third.page.get_by_text("back to now").wait_for()
     until(lambda: (third.asked, third.chosen) == (first.asked, ["b"]), "the same moment")
     third.page.close()
     first.page.get_by_text("back to now").click()
-    until(lambda: first.asked == {"vehicle": "b"}, "the present")
-    until(lambda: second.asked == {"vehicle": "a"}, "the other page to be as it was")
-    heard: set[str] = set()
-    watcher = raw.declare_subscriber("**", lambda sample: heard.add(str(sample.key_expr)))
+    until(lambda: first.asked == {"vehicle": "b"}, "the current time")
+    until(lambda: second.asked == {"vehicle": "a"}, "the other page to be unchanged")
+    received: set[str] = set()
+    watcher = raw.declare_subscriber("**", lambda sample: received.add(str(sample.key_expr)))
     assert second.page.evaluate(
         """() => {
           for (const model of Bokeh.documents[0].all_models) {
@@ -319,14 +318,14 @@ def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, raw: Sessi
         until(lambda page=page: page.states.get("b") == "xy not valid", "the state")  # type: ignore[misc]  # as above
     assert not first.shows("changed here")
     watcher.undeclare()
-    assert heard == {f"nedbus/{name}/{VLP}" for name in "ab"}
+    assert received == {f"nedbus/{name}/{VLP}" for name in "ab"}
 
 
 # Failures
 
 
-def test_page_outlives_its_server(web: Web, browser: Browser, fly: Fly, endpoint: str) -> None:
-    """When `nedbus web` is killed the page says so in red, and goes on by itself when it is back."""
+def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly: Fly, endpoint: str) -> None:
+    """When `nedbus web` is killed, the page shows a red bar, and reloads once the server is back."""
     fly("wing")
     port = free_port()
     process = web(port, "-c", endpoint)
@@ -339,14 +338,14 @@ def test_page_outlives_its_server(web: Web, browser: Browser, fly: Fly, endpoint
         web(port, "-c", endpoint)
         until(lambda: not page.shows("nedbus web has not responded since"), "the page to load again")
         until_states(page, wing="ok")
-        assert all("ERR_CONNECTION" in said or "WebSocket" in said or "bokeh" in said for said in page.complaints)
+        assert all("ERR_CONNECTION" in error or "WebSocket" in error or "bokeh" in error for error in page.complaints)
 
 
-# A recording
+# Recordings
 
 
-def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
-    """A recording has a slider that runs, a pause, a speed, jumps, and events: the page shows what was then."""
+def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_path: Path) -> None:
+    """Slider, pause, speed, seeking, keys and events work, and the page shows the state at the playback position."""
     port = free_port()
     web(port, str(write_flight(tmp_path, {VLP: lambda time: {"x": time, "xy_valid": time < 60}}, seconds=120)))
     page = tab(width=1280, height=800)
@@ -357,41 +356,41 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
         slider = "[...Bokeh.documents[0].all_models].find(model => model.type == 'Slider')"
         return float(page.page.evaluate(f"{slider}?.value ?? 0"))
 
-    until(lambda: time() > 1, "the time to run")
+    until(lambda: time() > 1, "playback")
     page.page.get_by_text("pause", exact=True).click()
     page.page.get_by_text("play", exact=True).wait_for()
     until(lambda: len(page.marks) == 1, "the vehicle")
     wait_for_none(page.misplaced, "the layout")
 
-    def jump(share: float) -> None:
-        # It is deaf for 0.3 s after each click.
+    def seek(fraction: float) -> None:
+        # The slider ignores input for 0.3 s after each click.
         bar = page.page.locator(".noUi-target:not(.noUi-state-tap) .noUi-base")
         box = bar.bounding_box()
         assert box is not None
-        bar.click(position={"x": box["width"] * share, "y": box["height"] / 2})
+        bar.click(position={"x": box["width"] * fraction, "y": box["height"] / 2})
 
-    jump(0.75)
+    seek(0.75)
     until(lambda: page.states == {"wing": "xy not valid"}, "the second minute")
     assert time() == pytest.approx(90, abs=3)
     assert page.marks["wing"]["north"] == pytest.approx(59.9)
     page.wait_for_text("xy not valid from")
-    jump(0.25)
+    seek(0.25)
     until(lambda: page.states == {"wing": "ok"}, "the first minute")
     assert page.marks["wing"]["north"] == pytest.approx(time(), abs=0.3)
     assert {round(north) for _, north in points(page.source("valid0"), "valid0")} <= set(range(35))
     page.page.locator(".strip [data-do=event]").click()
     until(lambda: time() == pytest.approx(60, abs=0.1), "the moment of the event")
     until_states(page, wing="xy not valid")
-    until(lambda: "time" in page.asked, "the address")
-    page.page.get_by_text("flight.mcap").click()  # so that keys are for the page, not for a button
+    until(lambda: "time" in page.asked, "the URL")
+    page.page.get_by_text("flight.mcap").click()  # moves the focus from the button, so that keys reach the page
     for key, seconds in (("ArrowLeft", 59), ("Shift+ArrowLeft", 49), ("ArrowRight", 50), ("n", 60)):
         page.page.keyboard.press(key)
         until(lambda seconds=seconds: time() == pytest.approx(seconds, abs=0.1), key)  # type: ignore[misc]  # bound here
     page.page.locator("[data-do='focus:follow']").press("Enter")
-    until(lambda: page.asked.get("view") == "follow", "a button to be pressed by a key")
+    until(lambda: page.asked.get("view") == "follow", "the button to be pressed by a key")
     other = tab(width=1280, height=800)
     other.open(page.url)
-    until(lambda: other.states == {"wing": "xy not valid"}, "the same moment, from which on it is played")
+    until(lambda: other.states == {"wing": "xy not valid"}, "the same moment")
     other.page.close()
     page.page.locator("select").select_option("50")
     page.page.get_by_text("play", exact=True).click()

@@ -1,4 +1,4 @@
-"""Access to the page of `nedbus web`, and the answers to those refused; spoken by hand, without a browser."""
+"""Access control and limits of the page's server: HTTP and WebSocket requests made by hand, without a browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from nedbus.monitoring import Page
 from nedbus.timings import Timings
-from nedbus.web.server import WebServer, Where, _log_once
+from nedbus.web.server import PageOptions, WebServer, _log_once
 from tests.nedbus.web.page import in_thread
 from tests.peers.ports import free_port
 from tests.peers.processes import Start
@@ -36,13 +36,13 @@ PATHS = ("/", "/metrics", "/healthz")
 
 @pytest.fixture
 def url() -> Iterator[str]:
-    """Serve a page of one word, and two texts."""
+    """Serve a minimal page and two text pages."""
 
-    def serve(stop: threading.Event, tell: Callable[[str], object]) -> None:
+    def serve(stop: threading.Event, on_listening: Callable[[str], object]) -> None:
         texts = {path: lambda: Page.text("a text") for path in PATHS[1:]}
-        where = Where("127.0.0.1", 0, ("ground.example:8420",))
-        server = WebServer(where, lambda document: document.add_root(Div(text="a word")), texts)
-        tell(server.url)
+        options = PageOptions("127.0.0.1", 0, ("ground.example:8420",))
+        server = WebServer(options, lambda document: document.add_root(Div(text="a word")), texts)
+        on_listening(server.url)
         server.run(stop)
 
     with in_thread(serve) as url:
@@ -60,7 +60,7 @@ def status_of(url: str, method: str = "GET", **headers: str) -> int:
 
 
 def open_socket(url: str, origin: str) -> ClientConnection:
-    """Connect to the page's socket as a page from there, with the token of a page that it made."""
+    """Open the WebSocket from this origin, with the token of a new page."""
     with urllib.request.urlopen(url, timeout=DEADLINE) as page:  # noqa: S310 - our own address
         token = re.search(r'"token":"([^"]+)"', page.read().decode())
     assert token
@@ -68,8 +68,8 @@ def open_socket(url: str, origin: str) -> ClientConnection:
     return connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(origin), subprotocols=protocols)
 
 
-def answers(url: str, origin: str) -> bool:
-    """Tell whether the page's socket says anything to a page from there."""
+def is_answered(url: str, origin: str) -> bool:
+    """Return whether the WebSocket sends anything to a page from this origin."""
     try:
         with open_socket(url, origin) as connection:
             return bool(connection.recv(timeout=DEADLINE))
@@ -77,8 +77,8 @@ def answers(url: str, origin: str) -> bool:
         return False
 
 
-def test_foreign_pages_get_nothing(url: str) -> None:
-    """A page of somebody else, also one whose name leads here, gets neither the page nor its socket nor metrics."""
+def test_foreign_hosts_and_origins_are_refused(url: str) -> None:
+    """A page of another site, even one whose name resolves to this host, gets neither page, WebSocket nor metrics."""
     host = url.removeprefix("http://")
     for path in PATHS:
         assert status_of(url + path) == 200
@@ -94,14 +94,14 @@ def test_foreign_pages_get_nothing(url: str) -> None:
         f"http://{host}.evil.example",
         "http://192.0.2.1",
     ):
-        assert not answers(url, origin)
-    assert answers(url, url)
-    assert answers(url, "http://ground.example:8420")
+        assert not is_answered(url, origin)
+    assert is_answered(url, url)
+    assert is_answered(url, "http://ground.example:8420")
     assert status_of(url + "/metrics", Host="localhost" + host.removeprefix("127.0.0.1")) == 200
 
 
-def test_nothing_can_be_sent_and_bodies_are_not_kept(url: str) -> None:
-    """Only reading is answered; who announces 100 MB is refused before it has sent them, whatever name it came by."""
+def test_write_methods_and_large_bodies_are_refused(url: str) -> None:
+    """Only GET is answered; a body of 100 MB is refused before it is sent, whatever the Host header."""
     for path, method in product(PATHS, ("POST", "PUT", "DELETE")):
         assert status_of(url + path, method=method) in {403, 405}
     bodies = ("Content-Length: 100000000\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\n5f5e100\r\n")
@@ -111,8 +111,8 @@ def test_nothing_can_be_sent_and_bodies_are_not_kept(url: str) -> None:
             assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
 
 
-def test_browser_says_little_at_a_time(url: str) -> None:
-    """A message on the socket of a page has a limit of 1 MiB, which ends it."""
+def test_oversized_websocket_message_closes_the_connection(url: str) -> None:
+    """A WebSocket message above 1 MiB closes the connection."""
     with open_socket(url, url) as connection:
 
         def is_closed() -> bool:
@@ -123,25 +123,25 @@ def test_browser_says_little_at_a_time(url: str) -> None:
                 return True
             return False
 
-        connection.recv(timeout=DEADLINE)  # a page that has just been opened takes nothing yet
+        connection.recv(timeout=DEADLINE)  # a new page is not ready for messages yet
         connection.send(" " * 2**20)
         assert not is_closed()
-        with suppress(websockets.ConnectionClosed):  # it may end while this is being sent
+        with suppress(websockets.ConnectionClosed):  # the server may close while this is being sent
             connection.send(" " * (2**20 + 1))
-        wait_for(is_closed, what="the end of the page")
+        wait_for(is_closed, what="the connection to close")
 
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
-def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """One page more than the limit, which is 1 here, says so instead of taking the memory of all."""
+def test_page_above_the_limit_shows_a_notice(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """A page above the limit, 1 here, shows only a notice."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
-    for said in ("a word", "limit of 1 open pages reached: close one"):
+    for text in ("a word", "limit of 1 open pages reached: close one"):
         session = pull_session(url=url)
-        assert [root.text for root in session.document.roots if isinstance(root, Div)] == [said]
+        assert [root.text for root in session.document.roots if isinstance(root, Div)] == [text]
 
 
-def test_parts_of_foreign_pages_are_refused(url: str) -> None:
-    """An image, a script or a frame of another site gets nothing, where a browser names it; a link to here works."""
+def test_cross_site_subresources_are_refused(url: str) -> None:
+    """Cross-site images, scripts and frames are refused (Sec-Fetch-Site); links from other sites work."""
     for path, (site, kind, status) in product(
         PATHS,
         [
@@ -153,8 +153,8 @@ def test_parts_of_foreign_pages_are_refused(url: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
-def test_requests_without_a_socket_take_no_place(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """Ten requests of a program that opens no WebSocket leave the one place, and the pages made for them are few."""
+def test_requests_without_websocket_do_not_count_as_viewers(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """Ten requests without a WebSocket do not use up the limit of one page; their pages are limited, too."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for _ in range(10):
         assert status_of(url) == 200
@@ -166,56 +166,56 @@ def test_requests_without_a_socket_take_no_place(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.fixture
-def tight(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
-    """Shorten the limits of a server that is started later."""
+def low_limits(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
+    """Lower the limits of the server that `url` starts."""
     timings.page_request = 0.3
     monkeypatch.setattr("nedbus.web.server._MAX_CONNECTIONS", 3)
     _log_once.cache_clear()
 
 
 @pytest.mark.parametrize("start", ["", "GET / HTTP/1.1\r\nHost: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\nx"])
-@pytest.mark.usefixtures("tight")
-def test_half_a_request_is_timed_out(url: str, start: str) -> None:
-    """A client that sends nothing, half a header or half a body is disconnected."""
+@pytest.mark.usefixtures("low_limits")
+def test_incomplete_request_times_out(url: str, start: str) -> None:
+    """A client that sends nothing, part of a header or part of a body is disconnected."""
     with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE) as client:
         client.sendall(start.encode())
         while client.recv(1000):
             pass
 
 
-@pytest.mark.usefixtures("tight")
-def test_connections_beyond_the_limit_are_closed(url: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Each connection takes a file: those beyond the limit are closed at once, logged once, and later ones served."""
+@pytest.mark.usefixtures("low_limits")
+def test_connections_above_the_limit_are_closed(url: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Connections above the limit are closed at once and logged once; later ones are served."""
     where = ("127.0.0.1", int(url.rpartition(":")[2]))
-    open_files = [socket.create_connection(where, DEADLINE) for _ in range(10)]
+    connections = [socket.create_connection(where, DEADLINE) for _ in range(10)]
     wait_for(lambda: "limit of connections reached" in caplog.text, what="the warning")
-    for each in open_files:
+    for each in connections:
         with each:
-            each.recv(1)  # the end
+            each.recv(1)  # until closed
     assert status_of(url) == 200
-    assert caplog.text.count("limit of connections reached, further ones are refused: 3") == 1
+    assert caplog.text.count("limit of connections reached (3): further ones are closed") == 1
 
 
 @pytest.mark.parametrize("protocols", [[], ["bokeh"], ["bokeh", "e30"], ["other", "e30"]])
-def test_socket_without_a_token_leaves_no_traceback(
+def test_websocket_without_token_is_refused_without_traceback(
     url: str, protocols: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A WebSocket without the subprotocol or the token of a page is refused."""
+    """A WebSocket without the subprotocol or a valid page token is refused."""
     offered = [websockets.Subprotocol(each) for each in protocols]
     with pytest.raises(websockets.InvalidStatus, match="403"):
         connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(url), subprotocols=offered or None)
     assert not caplog.records
 
 
-def test_tab_that_closes_amid_a_message_leaves_no_traceback(
+def test_disconnect_during_a_message_logs_no_traceback(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A tab may close while its message waits for the document, which an update has on a busy host."""
+    """A tab may close while its message waits for the document lock, which an update holds."""
     ran: list[None] = []
     is_free, is_waiting = threading.Event(), threading.Event()
 
-    class Fast(PeriodicCallback):
-        """A job of Bokeh's server, a hundred times a second."""
+    class FastCallback(PeriodicCallback):
+        """A periodic callback of Bokeh's server that runs at 100 Hz."""
 
         def __init__(self, job: Callable[[], Any], _: float) -> None:
             def run() -> Any:
@@ -229,19 +229,19 @@ def test_tab_that_closes_amid_a_message_leaves_no_traceback(
         while not is_free.is_set():
             await asyncio.sleep(0.01)
 
-    said = TextInput()
+    field = TextInput()
 
     def open_page(document: Document) -> None:
-        document.add_root(said)
+        document.add_root(field)
         document.add_periodic_callback(cast("Any", update), 50)  # Bokeh awaits it
 
-    def serve(stop: threading.Event, tell: Callable[[str], object]) -> None:
-        server = WebServer(Where("127.0.0.1", 0), open_page, {})
-        tell(server.url)
+    def serve(stop: threading.Event, on_listening: Callable[[str], object]) -> None:
+        server = WebServer(PageOptions("127.0.0.1", 0), open_page, {})
+        on_listening(server.url)
         server.run(stop)
 
-    monkeypatch.setattr("bokeh.server.tornado.PeriodicCallback", Fast)
-    changed = {"kind": "ModelChanged", "model": {"id": said.id}, "attr": "value", "new": "x"}
+    monkeypatch.setattr("bokeh.server.tornado.PeriodicCallback", FastCallback)
+    changed = {"kind": "ModelChanged", "model": {"id": field.id}, "attr": "value", "new": "x"}
     with in_thread(serve) as url:
         with open_socket(url, url) as connection:
             connection.recv(timeout=DEADLINE)
@@ -250,16 +250,16 @@ def test_tab_that_closes_amid_a_message_leaves_no_traceback(
                 connection.send(json.dumps(part))
             connection.socket.shutdown(socket.SHUT_RDWR)
         before = len(ran)
-        wait_for(lambda: len(ran) > before + 50, what="the jobs of the server")
+        wait_for(lambda: len(ran) > before + 50, what="the callbacks of the server")
         is_free.set()
-        wait_for(lambda: said.value == "x", what="the message")
+        wait_for(lambda: field.value == "x", what="the message")
         before = len(ran)
         wait_for(lambda: len(ran) > before + 20, what="the end of the connection")
     assert not caplog.records
 
 
-def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: str) -> None:
-    """With --http 0.0.0.0 the command says who can look, --origin adds a name, and Ctrl-C ends it."""
+def test_listening_on_all_interfaces_warns(run_nedbus: Start, endpoint: str) -> None:
+    """With --http 0.0.0.0 the command warns about missing authentication; --origin allows a name; Ctrl-C stops it."""
     port = free_port()
     url, listen = f"http://127.0.0.1:{port}", f"--http=0.0.0.0:{port}"
     process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", measured=False)

@@ -1,4 +1,4 @@
-"""The documents sent to a browser, without one: tracks, the list, texts, moments, live vehicles of a bus."""
+"""The document of a viewer, without a browser: tracks, panels, map, timeline, moments, and live vehicles of a bus."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from nedbus.web.stream import COLUMNS, History
 from nedbus.web.style import DARK, LIGHT, Style
 from nedbus_msgs import Address, Selection
 from tests.flights.messages import VALID, VLP
-from tests.nedbus.web.page import QUAD, WING, Shown, Sky, flying, models_of, sky
+from tests.nedbus.web.page import QUAD, WING, RenderedPage, SimulatedFleet, flying, models_of, sim
 from tests.peers.ports import free_endpoint
 from tests.waits import wait_for
 
-__all__ = ["sky"]  # a fixture
+__all__ = ["sim"]  # a fixture
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 GROUND_TRUTH = Address("wing", TRUTH)
 SECOND_EKF = Address("wing", "estimator_local_position", 1)
 
 
-# The tracks of a viewer
+# Tracks
 
 
 def line_of(tracks: Tracks, index: int, kind: str, ring: int) -> list[tuple[float, float]]:
-    """Return the points of a line in the order in which a browser draws them, from the gap of the ring on."""
+    """Return the points of a line in drawing order; check the gaps at its ends."""
     begin = index * (ring + 2)
     east, north = (
         np.asarray(tracks.source.data[name], float)[begin : begin + ring + 2].tolist() for name in ("east", kind)
@@ -58,7 +58,7 @@ def line_of(tracks: Tracks, index: int, kind: str, ring: int) -> list[tuple[floa
 
 
 def write_points(history: History, count: int, *, breaks: bool) -> None:
-    """Write points into a history: a break after each six, and five of ten by dead reckoning."""
+    """Write points to a history; five of ten are dead reckoning, and with `breaks` every seventh is a gap."""
     for _ in range(count):
         number = history.written
         row = [math.nan if breaks and number % 7 == 6 else float(number)] * len(COLUMNS)
@@ -71,13 +71,13 @@ def write_points(history: History, count: int, *, breaks: bool) -> None:
     breaks=st.booleans(),
     budget=st.sampled_from([(180, 1), (90, 2), (60, 3)]),
 )
-def test_tracks_are_what_a_new_viewer_gets(
+def test_incremental_tracks_equal_those_of_a_new_viewer(
     rounds: list[tuple[int, int, int]], breaks: bool, budget: tuple[int, int]
 ) -> None:
-    """After any number of updates a viewer has the points that one who comes now would get, in the same slots.
+    """After any number of updates a viewer has the same points in the same slots as a new viewer.
 
-    Only the oldest ones may be there for longer, which one who comes now does not get any more. With a smaller budget
-    of points a slot has more of them.
+    Only the oldest slot may differ: an old viewer may keep it longer. With a smaller budget of points each slot
+    covers more of them.
     """
     (limit, step), points = budget, 60
     with pytest.MonkeyPatch.context() as patch:
@@ -99,13 +99,13 @@ def test_tracks_are_what_a_new_viewer_gets(
     for index, (history, _) in enumerate(kept.values()):
         for kind in NAMES:
             old, new = (line_of(each, index, kind, ring) for each in (tracks, fresh))
-            oldest = (max(0, history.written - points) - 1) // step % ring  # may be kept for longer
+            oldest = (max(0, history.written - points) - 1) // step % ring  # an old viewer may keep it longer
             del old[oldest], new[oldest]
             assert repr(old) == repr(new)
 
 
 def data_sent(document: Document) -> list[Any]:
-    """Return a list that gets what a document sends its browser of tables from now on."""
+    """Return a list that collects the data source events a document sends from now on."""
     sent: list[Any] = []
     document.on_change(
         lambda event: sent.append(event) if isinstance(getattr(event, "model", None), ColumnDataSource) else None
@@ -113,50 +113,50 @@ def data_sent(document: Document) -> list[Any]:
     return sent
 
 
-def tracks_of(sky: Sky) -> dict[Address, Track]:
-    """Return the last minute of all streams, each in a colour of its own."""
-    return {address: (stream.minute, number) for number, (address, stream) in enumerate(sky.fleet.streams.items())}
+def tracks_of(sim: SimulatedFleet) -> dict[Address, Track]:
+    """Return the last minute of all streams, each with its own colour."""
+    return {address: (stream.minute, number) for number, (address, stream) in enumerate(sim.fleet.streams.items())}
 
 
-def test_tracks_send_only_what_is_new(sky: Sky) -> None:
-    """An update patches the new points, the gap before them and nothing else; without a new point it sends nothing."""
+def test_tracks_send_only_new_points(sim: SimulatedFleet) -> None:
+    """An update patches only the new points and the gap; without a new point it sends nothing."""
     tracks, document, plot = Tracks(), Document(), figure()
     plot.line("east", NAMES[0], source=tracks.source)
     document.add_root(plot)
-    sky.fly(30, WING, QUAD)
-    tracks.update(tracks_of(sky))
+    sim.fly(30, WING, QUAD)
+    tracks.update(tracks_of(sim))
     sent = data_sent(document)
-    tracks.update(tracks_of(sky))
+    tracks.update(tracks_of(sim))
     assert not sent
-    sky.fly(0.1, WING)
-    tracks.update(tracks_of(sky))
+    sim.fly(0.1, WING)
+    tracks.update(tracks_of(sim))
     (event,) = sent
     assert isinstance(event, ColumnsPatchedEvent)
     assert 0 < sum(len(patch) for patch in event.patches.values()) <= 3 * 4
 
 
-def test_many_tracks_have_fewer_points_each(sky: Sky) -> None:
-    """With 200 vehicles a track has a point a second, so a browser draws no more points than with 20."""
-    sky.fly(0.1, *[Address(f"v{number}", VLP) for number in range(200)])
+def test_points_per_track_shrink_with_the_number_of_tracks(sim: SimulatedFleet) -> None:
+    """With 200 vehicles a track has one point per second, so a browser draws no more points than with 20."""
+    sim.fly(0.1, *[Address(f"v{number}", VLP) for number in range(200)])
     tracks = Tracks()
-    tracks.update(tracks_of(sky))
+    tracks.update(tracks_of(sim))
     assert len(tracks.source.data["east"]) <= 200 * 64
 
 
-# A viewer
+# Panels
 
 
-class Page(Shown):
-    """The document of a viewer of a sky."""
+class Page(RenderedPage):
+    """The document of a viewer of a simulated fleet."""
 
-    def __init__(self, sky: Sky, **options: Any) -> None:
-        super().__init__(sky.fleet, sky.chronicle, **options)
-        self._sky = sky
-        self.look()
+    def __init__(self, sim: SimulatedFleet, **options: Any) -> None:
+        super().__init__(sim.fleet, sim.timeline, **options)
+        self._sim = sim
+        self.refresh()
 
-    def look(self, **known: Any) -> None:
-        """Make a picture of now, and show it."""
-        self._sky.look(**known)
+    def refresh(self, **options: Any) -> None:
+        """Poll the fleet and update the page."""
+        self._sim.poll(**options)
         self.update()
 
     @property
@@ -164,36 +164,36 @@ class Page(Shown):
         return self.viewer.pinned
 
     def tap(self, column: str, text: str) -> None:
-        """Tap the mark with these words, of what has a column of this name, as a browser says it."""
+        """Tap the mark with this text in the first data source that has this column."""
         source = next(each for each in sources(self) if column in each.data and "words" in each.data)
         source.selected.indices = [list(source.data["words"]).index(text)]
         assert source.selected.indices == [], "the same mark cannot be tapped again"
         self.update()
 
 
-def sources(page: Shown) -> list[ColumnDataSource]:
+def sources(page: RenderedPage) -> list[ColumnDataSource]:
     return models_of(page.document, ColumnDataSource)
 
 
-def test_log_stream_is_shown_with_its_vehicle(sky: Sky) -> None:
-    """The chosen vehicle has a line about its ULog stream, whose text is from a peer."""
-    page = Page(sky)
-    sky.fly(3)
-    page.look()
+def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
+    """The selected vehicle has a line about its ULog stream, whose text comes from a peer and is escaped."""
+    page = Page(sim)
+    sim.fly(3)
+    page.refresh()
     assert "ULog stream" not in page.text
-    page.look(logs={"wing": LogStreamStatus(vehicle="wing", state="refused", reason="<b>another client has it")})
+    page.refresh(logs={"wing": LogStreamStatus(vehicle="wing", state="refused", reason="<b>another client has it")})
     assert "ULog stream" in page.text
     assert "refused, &lt;b&gt;another client has it" in page.text
 
 
-def test_every_part_says_the_same(sky: Sky) -> None:
-    """Counts, title, rows, badges and markers are of the same picture; before the first message the page waits."""
-    page = Page(sky)
+def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:
+    """Counts, title, rows, badges and markers agree; before the first message the header says that it waits."""
+    page = Page(sim)
     assert "waiting for the first message" in page.part("head")
     assert page.vehicles == []
-    sky.fly(3, WING, GROUND_TRUTH, x=5.0, z=-7.0)
-    sky.fly(3, QUAD, x=5.0, z=-7.0, xy_valid=False)
-    page.look()
+    sim.fly(3, WING, GROUND_TRUTH, x=5.0, z=-7.0)
+    sim.fly(3, QUAD, x=5.0, z=-7.0, xy_valid=False)
+    page.refresh()
     assert "■ 1 bad" in page.part("head")
     assert "● 1 ok" in page.part("head")
     assert page.document.title == "(1 bad) nedbus"
@@ -204,65 +204,65 @@ def test_every_part_says_the_same(sky: Sky) -> None:
     assert "last valid position: none yet" in page.part("why")
     assert "no valid position yet: quad" in page.part("tool")
     assert set(page.marks) == {"wing"}
-    sky.fly(3, WING, QUAD, x=5.0, z=-7.0)
-    page.look(alive=[WING, QUAD])
+    sim.fly(3, WING, QUAD, x=5.0, z=-7.0)
+    page.refresh(alive=[WING, QUAD])
     assert page.grades == {"quad": "ok", "wing": "ok"}
     assert "● 2 ok" in page.part("head")
     assert page.document.title == "nedbus"
     assert page.marks["quad"]["north"] == 5.0
     assert "<span>height</span><b>7.0 m</b>" in page.part("nums")
-    sky.time += 5
-    page.look(alive=[])
+    sim.time += 5
+    page.refresh(alive=[])
     assert "■ 2 bad" in page.part("head")
     assert page.states == {"quad": "gone", "wing": "gone"}
     assert {mark["shape"] for mark in page.marks.values()} == {"square"}
 
 
-def test_bad_estimates_beside_the_main_one_make_nothing_red(sky: Sky) -> None:
-    """A vehicle whose second EKF or ground truth is invalid is ok in list, header, title and map, and says so below."""
-    sky.fly(1, WING, SECOND_EKF, GROUND_TRUTH)
+def test_bad_secondary_estimates_do_not_mark_the_vehicle_bad(sim: SimulatedFleet) -> None:
+    """An invalid second EKF or ground truth appears in the table of streams, but not in list, header, title or map."""
+    sim.fly(1, WING, SECOND_EKF, GROUND_TRUTH)
     for _ in range(50):
-        sky.fly(0.1)
+        sim.fly(0.1)
         for other in (SECOND_EKF, GROUND_TRUTH):
-            sky.add(other, xy_valid=False, dead_reckoning=True)
-    page = Page(sky)
+            sim.add(other, xy_valid=False, dead_reckoning=True)
+    page = Page(sim)
     assert (page.grades, page.document.title) == ({"wing": "ok"}, "nedbus")
-    assert "nothing was wrong" in page.part("why")
+    assert "no recent faults" in page.part("why")
     assert page.marks["wing"]["shape"] == "circle"
     assert "1 bad" not in page.part("head")
-    page.say("streams")
+    page.send("streams")
     assert page.part("more").count("xy invalid, dead reckoning") == 2
 
 
-def test_page_that_is_behind_says_so(sky: Sky) -> None:
-    """Messages that this reader did not read in time are the page's own fault, in the header; no vehicle changes."""
-    sky.fly(3, WING, QUAD)
-    page = Page(sky)
+def test_overloaded_page_reports_itself(sim: SimulatedFleet) -> None:
+    """If this reader falls behind, the header says so, and no vehicle changes its state."""
+    sim.fly(3, WING, QUAD)
+    page = Page(sim)
     assert "page up to date" in page.part("head")
-    sky.time += 20
+    sim.time += 20
     own = "this page falls behind: 7000 messages queued, 12 dropped"
-    page.look(alive=[WING, QUAD], is_behind=True, own=own)
+    page.refresh(alive=[WING, QUAD], is_behind=True, behind=own)
     assert f'<span class="alarm">{own}</span>' in page.part("head")
     assert "page up to date" not in page.part("head")
     assert page.grades == {"quad": "ok", "wing": "ok"}
     assert page.document.title == "nedbus"
 
 
-def test_other_messages_are_streams_without_a_place(sky: Sky) -> None:
-    """They are listed below with rate and state, if asked for; a vehicle of which nothing else comes is on no map."""
+def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet) -> None:
+    """The table of streams has their rate and state; a vehicle without a position has no marker."""
     attitude, battery = Address("wing", "vehicle_attitude"), Address("far", "battery_status", 0)
-    sky.fly(3, WING, attitude, battery, x=4.0)
-    page = Page(sky)
+    sim.fly(3, WING, attitude, battery, x=4.0)
+    page = Page(sim)
     assert page.vehicles == ["far", "wing"]
     assert set(page.marks) == {"wing"}
-    page.say("vehicle", "far")
+    page.send("vehicle", "far")
     assert page.chosen == "far"
     assert page.part("nums").count("<b>-</b>") == 9
     assert len(page.plotted["speed"]) == 0
-    page.say("vehicle", "wing")
+    page.send("vehicle", "wing")
     assert "▸ 2 streams of wing" in page.part("more")
     assert "vehicle_attitude" not in page.part("more")
-    page.say("streams")
+    page.send("streams")
     rows = re.findall("<tr>(.*?)</tr>", page.part("more"))
     cells = {row[0]: row[1:] for each in rows[1:] if (row := re.findall("<td>(.*?)</td>", each))}
     row = ["10", "0", "0", "-", "ok"]
@@ -270,76 +270,76 @@ def test_other_messages_are_streams_without_a_place(sky: Sky) -> None:
     assert len(page.plotted["speed"]) > 20
 
 
-def test_facts_of_a_vehicle_are_in_its_row_and_tiles(sky: Sky) -> None:
-    """Mode, battery and GPS stand in the row; beside them in the tiles whether it is armed."""
-    sky.fly(2, x=-0.01, heading=-0.001)
-    sky.add(Address("wing", "vehicle_status"), nav_state=4, arming_state=2)
-    sky.add(Address("wing", "battery_status", 0), remaining=0.5)
-    sky.add(Address("wing", "sensor_gps", 0), fix_type=3, satellites_used=14)
-    page = Page(sky)
+def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
+    """The row has mode, battery and GPS; the tiles also have the arming state."""
+    sim.fly(2, x=-0.01, heading=-0.001)
+    sim.add(Address("wing", "vehicle_status"), nav_state=4, arming_state=2)
+    sim.add(Address("wing", "battery_status", 0), remaining=0.5)
+    sim.add(Address("wing", "sensor_gps", 0), fix_type=3, satellites_used=14)
+    page = Page(sim)
     row = page.listed["wing"]
     assert (row["mode"], row["battery"], row["gps"]) == ("Hold", "50 %", "3D · 14")
     for name, text in (("armed", "armed"), ("mode", "Hold"), ("north", "0.0 m"), ("heading", "0°")):
         assert f"<span>{name}</span><b>{text}</b>" in page.part("nums")
 
 
-def test_values_of_a_silent_stream_are_the_last_known(sky: Sky) -> None:
-    """A vehicle that is gone, or one stream that is silent, has no current value: the tiles say how old theirs are."""
+def test_values_of_silent_streams_have_their_age(sim: SimulatedFleet) -> None:
+    """The tiles show the last values of a silent stream or a gone vehicle with their age; the row shows "-"."""
     status, battery = Address("wing", "vehicle_status"), Address("wing", "battery_status", 0)
     for _ in range(50):
-        sky.fly(0.2, z=-7.0)
-        sky.add(status, nav_state=4, arming_state=2)
-        sky.add(battery, remaining=0.5)
-    page = Page(sky)
+        sim.fly(0.2, z=-7.0)
+        sim.add(status, nav_state=4, arming_state=2)
+        sim.add(battery, remaining=0.5)
+    page = Page(sim)
     assert "ago" not in page.part("nums")
     for _ in range(50):
-        sky.fly(0.2, z=-7.0)
-        sky.add(status, nav_state=4, arming_state=2)
-    page.look()
+        sim.fly(0.2, z=-7.0)
+        sim.add(status, nav_state=4, arming_state=2)
+    page.refresh()
     assert (page.listed["wing"]["mode"], page.listed["wing"]["battery"]) == ("Hold", "-")
     assert '<b class="quiet">50 %</b> <small>10.0 s ago</small>' in page.part("nums")
     assert "<span>armed</span><b>armed</b>" in page.part("nums")
-    sky.time += 2100
-    page.look(alive=[])
+    sim.time += 2100
+    page.refresh(alive=[])
     row = page.listed["wing"]
     assert (row["text"], row["mode"], row["battery"], row["gps"]) == ("gone", "-", "-", "-")
     for name, text in (("armed", "armed"), ("battery", "50 %"), ("height", "7.0 m"), ("heading", "0°")):
         assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.part("nums")
 
 
-def test_slow_stream_is_told_with_its_numbers(sky: Sky) -> None:
-    """The numbers of a vehicle whose position arrives at less than half of its usual rate name both rates."""
-    sky.fly(20, rate=20)
-    sky.fly(3, rate=5)
-    page = Page(sky)
+def test_slow_stream_is_named_below_the_numbers(sim: SimulatedFleet) -> None:
+    """If a position arrives below half its usual rate, both rates are shown below the numbers."""
+    sim.fly(20, rate=20)
+    sim.fly(3, rate=5)
+    page = Page(sim)
     assert re.search(r'<div class="watch">slow: 5.0 Hz, usually \d+</div>', page.part("nums"))
     assert page.grades == {"wing": "ok"}
 
 
-def test_story_is_that_of_the_state(sky: Sky) -> None:
-    """Of several conditions the story is that of the one in the badge and in the list, whichever began first."""
+def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
+    """Of several conditions, the story is about the one in badge and list, whichever began first."""
     gps = Address("wing", "sensor_gps", 0)
     for seconds, state, fields in ((5, 1, {}), (5, 3, {}), (5, 3, {"dead_reckoning": True})):
         for _ in range(seconds):
-            sky.fly(1, **fields)
-            sky.add(gps, fix_type=3, satellites_used=14, jamming_state=state)
-    page = Page(sky)
+            sim.fly(1, **fields)
+            sim.add(gps, fix_type=3, satellites_used=14, jamming_state=state)
+    page = Page(sim)
     (badge,) = re.findall(r'<span class="badge \w+">. (.*?)</span>', page.part("why"))
     assert badge == page.states["wing"] == "dead reckoning"
     assert f'<div class="verdict">{badge} from' in page.part("why").replace("position valid throughout, but ", "")
 
 
-def test_marker_stays_where_the_vehicle_was(sky: Sky) -> None:
-    """The marker of a vehicle that is silent or invalid is open, has the shape of its state, and stays where it was."""
-    sky.fly(3, WING, QUAD, x=4.0, y=2.0)
-    page = Page(sky)
+def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> None:
+    """The marker of a silent or invalid vehicle is open, has the shape of its state, and stays in place."""
+    sim.fly(3, WING, QUAD, x=4.0, y=2.0)
+    page = Page(sim)
     assert page.marks["wing"]["shape"] == "circle"
     assert page.marks["wing"]["fill"] == page.marks["wing"]["colour"] != DARK.ground
-    sky.add(xy_valid=False)
-    page.look()
+    sim.add(xy_valid=False)
+    page.refresh()
     assert (page.marks["wing"]["shape"], page.marks["wing"]["fill"]) == ("square", DARK.ground), "at once"
-    sky.fly(3, WING, x=99.0, xy_valid=False)
-    page.look(alive=[WING])
+    sim.fly(3, WING, x=99.0, xy_valid=False)
+    page.refresh(alive=[WING])
     assert page.marks["wing"]["words"] == "xy not valid"
     assert page.marks["quad"]["words"].startswith("gone")
     for mark in page.marks.values():
@@ -347,24 +347,24 @@ def test_marker_stays_where_the_vehicle_was(sky: Sky) -> None:
         assert mark["edge"] == DARK.grades["bad"]
 
 
-def test_choice_stays_while_rows_move(sky: Sky) -> None:
-    """Without a choice the worst vehicle is chosen; a choice stays when the order changes.
+def test_selection_survives_reordering(sim: SimulatedFleet) -> None:
+    """By default the worst vehicle is selected; a selection by the user survives a change of the order.
 
-    It is made in the list, on the map, and by keys, which go around; a name that is not there changes nothing.
+    Vehicles are selected in the list, on the map, or by keys, which wrap around; an unknown name is ignored.
     """
-    sky.fly(3, WING, QUAD)
-    page = Page(sky)
+    sim.fly(3, WING, QUAD)
+    page = Page(sim)
     assert page.chosen == "quad"
     for action, value, chosen in (
-        ("vehicle", "nobody", "quad"), ("vehicle", "wing", "wing"), ("down", "", "quad"), ("up", "", "wing"),
+        ("vehicle", "unknown", "quad"), ("vehicle", "wing", "wing"), ("down", "", "quad"), ("up", "", "wing"),
         ("up", "", "quad"), ("down", "", "wing"),
     ):  # fmt: skip
-        page.say(action, value)
+        page.send(action, value)
         assert page.chosen == chosen
         assert [name for name, row in page.listed.items() if row["chosen"] == "true"] == [chosen]
-    sky.fly(3, QUAD, xy_valid=False)
-    sky.fly(0.1, WING)
-    page.look()
+    sim.fly(3, QUAD, xy_valid=False)
+    sim.fly(0.1, WING)
+    page.refresh()
     assert page.vehicles == ["quad", "wing"]
     assert page.chosen == "wing"
     for name in ("quad", "wing", "quad", "quad"):
@@ -372,11 +372,11 @@ def test_choice_stays_while_rows_move(sky: Sky) -> None:
         assert page.chosen == name
 
 
-def test_search_finds_by_name_and_state(sky: Sky) -> None:
-    """The list has the vehicles whose name or state has what is searched; the counts and the map stay of all."""
-    sky.fly(3, WING, Address("wind", VLP), QUAD)
-    sky.fly(3, Address("wind", VLP), QUAD, xy_valid=False)
-    page = Page(sky)
+def test_search_filters_by_name_and_state(sim: SimulatedFleet) -> None:
+    """The list has the vehicles whose name or state contains the search text; counts and map show all."""
+    sim.fly(3, WING, Address("wind", VLP), QUAD)
+    sim.fly(3, Address("wind", VLP), QUAD, xy_valid=False)
+    page = Page(sim)
     for text, found in ((" WIN ", ["wind", "wing"]), ("not VALID", ["quad", "wind"]), (HOSTILE, []), ("", 3)):
         page.search(text)
         assert page.vehicles == found if isinstance(found, list) else len(page.vehicles) == found
@@ -385,19 +385,19 @@ def test_search_finds_by_name_and_state(sky: Sky) -> None:
     assert HOSTILE not in page.text
 
 
-def test_words_of_peers_are_escaped(sky: Sky) -> None:
-    """Reasons of rejections, a link's words, a title and what the address says are text wherever they are shown."""
-    sky.fly(3)
+def test_text_from_peers_is_escaped(sim: SimulatedFleet) -> None:
+    """Rejection reasons, link faults, titles and URL arguments are escaped wherever they are shown."""
+    sim.fly(3)
     for reason in ("the first", HOSTILE):
-        sky.account.reject(WING, reason, sky.time)
-        sky.fleet.reject([RejectionReport(WING, reason, round(sky.time * 1e9))])
-        sky.time += 20
-        sky.look()
-    assert any(HOSTILE in event.text for event in sky.chronicle.events)
-    sky.fly(0.1)
-    page = Page(sky, title=HOSTILE, asked="?view=%3Cimg&theme=%3Cimg&time=%3Cimg")
-    page.say("streams")
-    page.look(link=HOSTILE, own=HOSTILE)
+        sim.account.reject(WING, reason, sim.time)
+        sim.fleet.reject([RejectionReport(WING, reason, round(sim.time * 1e9))])
+        sim.time += 20
+        sim.poll()
+    assert any(HOSTILE in event.text for event in sim.timeline.events)
+    sim.fly(0.1)
+    page = Page(sim, title=HOSTILE, query="?view=%3Cimg&theme=%3Cimg&time=%3Cimg")
+    page.send("streams")
+    page.refresh(link=HOSTILE, behind=HOSTILE)
     assert "2 rejected" in page.part("head")
     assert "<img" not in page.text
     assert page.part("head").count("&lt;img") == 3
@@ -408,29 +408,29 @@ def test_words_of_peers_are_escaped(sky: Sky) -> None:
             Address(name, VLP)
 
 
-def test_plots_come_one_by_one(sky: Sky) -> None:
-    """Map and list are not held up by plots: the first one follows as soon as a browser has drawn something."""
-    sky.fly(3, WING, Address("far", "vehicle_status"))
-    viewer = (page := Page(sky, asked="?vehicle=wing")).viewer
+def test_plots_are_added_one_by_one(sim: SimulatedFleet) -> None:
+    """Plots do not delay map and list: each is added only after the browser has drawn an update."""
+    sim.fly(3, WING, Address("far", "vehicle_status"))
+    viewer = (page := Page(sim, query="?vehicle=wing")).viewer
     assert len(viewer._grid.children) == 3
     assert viewer._grid.visible
-    page.say("vehicle", "far")
-    assert not viewer._grid.visible, "it has no position, and no plot keeps a place on a phone"
-    other = Shown(sky.fleet, sky.chronicle).viewer
+    page.send("vehicle", "far")
+    assert not viewer._grid.visible, "without a position, empty plots would take space on a phone"
+    other = RenderedPage(sim.fleet, sim.timeline).viewer
     for drawn, count in (("", 0), ("", 0), ("1", 1), ("2", 2), ("3", 3), ("4", 3)):
         other._drawn.value = drawn
         other.update()
         assert len(other._grid.children) == count
 
 
-def test_texts_of_px4_are_quoted_and_escaped(sky: Sky) -> None:
-    """PX4's own texts are on the timeline and in the story, in quotes, whatever is in them; they change no state."""
-    sky.fly(2)
-    sky.add(Address("wing", "log_message"), severity=2, text=HOSTILE)
-    sky.fly(1, xy_valid=False)
-    sky.add(Address("wing", "log_message"), severity=6, text="Landing detected")
-    sky.fly(1, xy_valid=False)
-    page = Page(sky)
+def test_px4_texts_are_quoted_and_escaped(sim: SimulatedFleet) -> None:
+    """PX4's texts appear quoted and escaped on the timeline and in the story, and do not change the state."""
+    sim.fly(2)
+    sim.add(Address("wing", "log_message"), severity=2, text=HOSTILE)
+    sim.fly(1, xy_valid=False)
+    sim.add(Address("wing", "log_message"), severity=6, text="Landing detected")
+    sim.fly(1, xy_valid=False)
+    page = Page(sim)
     assert page.states == {"wing": "xy not valid"}
     timeline = [(row["words"], row["marker"]) for row in page.rows("vehicle")]
     assert timeline == [
@@ -440,67 +440,67 @@ def test_texts_of_px4_are_quoted_and_escaped(sky: Sky) -> None:
     assert "<img" not in page.text
 
 
-def test_viewers_share_no_model(sky: Sky) -> None:
-    """Each viewer has a document of its own."""
-    sky.fly(3)
-    first, second = ([*page.document.models] for page in [Page(sky), Page(sky)])
+def test_viewers_share_no_model(sim: SimulatedFleet) -> None:
+    """Each viewer has its own Bokeh models."""
+    sim.fly(3)
+    first, second = ([*page.document.models] for page in [Page(sim), Page(sim)])
     assert not set(map(id, first)) & set(map(id, second))
 
 
-def test_quiet_page_sends_little(sky: Sky) -> None:
-    """Without a new message, and with nothing that changes, an update sends nothing."""
-    sky.fly(3, WING, heading=None)
-    sky.fly(3, WING, heading=None, dead_reckoning=True)
-    page = Page(sky)
+def test_update_without_changes_sends_nothing(sim: SimulatedFleet) -> None:
+    """Without new messages an update sends no data."""
+    sim.fly(3, WING, heading=None)
+    sim.fly(3, WING, heading=None, dead_reckoning=True)
+    page = Page(sim)
     sent = data_sent(page.document)
     page.update()
     assert not sent
 
 
-# The map
+# Map
 
 
 def frame_of(page: Page) -> tuple[list[float], list[float]]:
-    """Return from where to where the map is, east and north [m]."""
+    """Return the extent of the map: [west, east], [south, north] [m]."""
     frame = next(each for each in sources(page) if set(each.data) == {"east", "north"})
     return list(frame.data["east"]), list(frame.data["north"])
 
 
-def test_map_shows_all_or_one(sky: Sky) -> None:
-    """It fits all vehicles with their trails, and never less than 20 m; it follows one, or shows the trail of one."""
-    sky.fly(3, WING)
-    page = Page(sky)
+def test_map_fits_all_or_follows_one(sim: SimulatedFleet) -> None:
+    """The map fits all vehicles with their trails, at least 20 m, or follows one, or fits the trail of one."""
+    sim.fly(3, WING)
+    page = Page(sim)
     east, north = frame_of(page)
     assert east[1] - east[0] >= MIN_SIDE
     assert north[1] - north[0] >= MIN_SIDE
     for number in range(30):
-        sky.fly(0.1, WING, x=-2.0 * number)
-        sky.fly(0.1, QUAD, x=300.0, y=-500.0)
-    page.look()
+        sim.fly(0.1, WING, x=-2.0 * number)
+        sim.fly(0.1, QUAD, x=300.0, y=-500.0)
+    page.refresh()
     east, north = frame_of(page)
     assert east[0] < -500 < 0 < east[1] < 100
     assert -100 < north[0] < -58 < 300 < north[1] < 400
-    page.say("focus:follow")
-    page.say("vehicle", "wing")
+    page.send("focus:follow")
+    page.send("vehicle", "wing")
     assert frame_of(page) == ([-30, 30], [-88, -28])
-    page.say("focus:vehicle")
+    page.send("focus:vehicle")
     east, north = frame_of(page)
     assert -80 < north[0] <= -58 < 0 <= north[1] < 20
-    page.say("focus:nonsense")
+    page.send("focus:nonsense")
     assert frame_of(page) == (east, north)
-    assert page.address == "?vehicle=wing&view=vehicle"
+    assert page.url_query == "?vehicle=wing&view=vehicle"
 
 
 @pytest.mark.parametrize("size", ["340x330", "560x430", "1100x700"])
-def test_labels_do_not_lie_on_each_other(sky: Sky, size: str) -> None:
-    """Of 50 vehicles in a heap those have their name on the map that have room, the chosen one and bad ones first."""
+def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
+    """Of 50 vehicles close together only labels that fit are shown, the selected and bad ones first."""
     places = {f"uav-{number}": (7.0 * (number // 10), 11.0 * (number % 10)) for number in range(1, 51)}
     for _ in range(5):
-        sky.time += 0.1
+        sim.time += 0.1
         for name, (x, y) in places.items():
-            sky.add(Address(name, VLP), x=x, y=y, xy_valid=True, z_valid=name not in ("uav-17", "uav-50"))
-    page = Page(sky, asked="?vehicle=uav-23")
-    page.say("size", size)
+            sim.add(Address(name, VLP), x=x, y=y, xy_valid=True, z_valid=name not in ("uav-17", "uav-50"))
+    page = Page(sim, query="?vehicle=uav-23")
+    page.send("size", size)
     width, height = map(int, size.split("x"))
     east, north = frame_of(page)
     scale = max((east[1] - east[0]) / width, (north[1] - north[0]) / height)
@@ -518,37 +518,37 @@ def test_labels_do_not_lie_on_each_other(sky: Sky, size: str) -> None:
     for mark, (x, y, wide) in zip(shown, boxes, strict=True):
         for other in page.marks.values():
             is_on = 1 < other["north"] / scale - y < 21 and x < other["east"] / scale < x + wide
-            assert not is_on or mark["name"] in ("uav-23", "uav-17", "uav-50"), "it lies on another marker"
+            assert not is_on or mark["name"] in ("uav-23", "uav-17", "uav-50"), "it covers another marker"
 
 
-def test_trails_are_a_minute_or_long(sky: Sky) -> None:
-    """The key t shows the quarter of an hour that is kept, on the map and in the plots, and the minute again."""
+def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFleet) -> None:
+    """The action "trail" shows 15 minutes on map and plots, then a minute again."""
     for _ in range(20):
-        sky.fly(10, rate=5)
-    page = Page(sky)
-    assert page.moments == pytest.approx((sky.time - 60, sky.time), abs=0.01)
+        sim.fly(10, rate=5)
+    page = Page(sim)
+    assert page.plot_range == pytest.approx((sim.time - 60, sim.time), abs=0.01)
     minute = len(page.plotted["speed"])
-    page.say("trail")
+    page.send("trail")
     assert "trail 15 min" in page.part("tool")
-    assert page.moments == pytest.approx((sky.time - 600, sky.time), abs=0.01)
-    assert page.plotted["time"][0] < (sky.time - 190) * 1e3
-    page.say("trail")
+    assert page.plot_range == pytest.approx((sim.time - 600, sim.time), abs=0.01)
+    assert page.plotted["time"][0] < (sim.time - 190) * 1e3
+    page.send("trail")
     assert len(page.plotted["speed"]) == minute
     assert 'data-do="truth" aria-pressed="true"' in page.part("tool")
-    page.say("truth")
+    page.send("truth")
     assert 'data-do="truth" aria-pressed="false"' in page.part("tool")
 
 
-# The timeline
+# Timeline
 
 
-def test_timeline_counts_the_vehicles_without_a_row(sky: Sky) -> None:
-    """Of 50 vehicles it has rows for the chosen one, and for those with faults before others; the last row counts."""
+def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
+    """Of 50 vehicles the selected one and those with faults come first; the last row counts the hidden ones."""
     addresses = [Address(f"uav-{number}", VLP) for number in range(1, 51)]
-    sky.fly(1, *addresses)
-    sky.fly(1, addresses[29], xy_valid=False)
-    sky.fly(0.1, *addresses)
-    timeline = Page(sky, asked="?vehicle=uav-9").viewer._timeline.figure
+    sim.fly(1, *addresses)
+    sim.fly(1, addresses[29], xy_valid=False)
+    sim.fly(0.1, *addresses)
+    timeline = Page(sim, query="?vehicle=uav-9").viewer._timeline_plot.figure
     labels: dict[int, str] = cast("Any", timeline).yaxis[0].major_label_overrides
     assert [labels[row] for row in sorted(labels, reverse=True)] == [
         "uav-9", "uav-30", "uav-1", "uav-2", "uav-3", "uav-4", "+44 more",
@@ -557,30 +557,30 @@ def test_timeline_counts_the_vehicles_without_a_row(sky: Sky) -> None:
     assert cast("Any", timeline).y_range.start < min(labels)
 
 
-def test_timeline_has_a_legend(sky: Sky) -> None:
-    """Each shape in the timeline is explained in the line above it."""
-    figure = cast("Any", Page(sky).viewer._timeline.figure)
-    for words in ("■ bad", "▲ watch", "● phase of flight", "▬ lasting", "┊ now"):
+def test_timeline_has_a_legend(sim: SimulatedFleet) -> None:
+    """The title of the timeline explains each symbol."""
+    figure = cast("Any", Page(sim).viewer._timeline_plot.figure)
+    for words in ("■ bad", "▲ watch", "● phase of flight", "▬ duration", "┊ now"):
         assert words in figure.title.text
 
 
-def test_timeline_begins_with_the_first_event(sky: Sky) -> None:
-    """The timeline of live vehicles is a minute long at least, and ten minutes at most."""
-    sky.fly(3)
-    page = Page(sky)
+def test_timeline_begins_with_the_first_event(sim: SimulatedFleet) -> None:
+    """The live timeline begins with the first event, but covers at least one minute and at most ten."""
+    sim.fly(3)
+    page = Page(sim)
 
     def shown() -> tuple[float, float]:
-        page.say("focus:all")
-        span: Any = page.viewer._timeline.range
-        return span.start / 1e3 - sky.time, span.end / 1e3 - sky.time
+        page.send("focus:all")
+        span: Any = page.viewer._timeline_plot.range
+        return span.start / 1e3 - sim.time, span.end / 1e3 - sim.time
 
     assert shown() == pytest.approx((-61, 0), abs=0.2)
-    sky.fly(1, xy_valid=False)
-    sky.fly(199)
-    page.look()
+    sim.fly(1, xy_valid=False)
+    sim.fly(199)
+    page.refresh()
     assert shown() == pytest.approx((-201, 0), abs=0.2)
-    sky.fly(500)
-    page.look()
+    sim.fly(500)
+    page.refresh()
     assert shown() == pytest.approx((-61, 0), abs=0.2)
 
 
@@ -588,55 +588,55 @@ def test_timeline_begins_with_the_first_event(sky: Sky) -> None:
 
 
 @pytest.fixture
-def flown(sky: Sky) -> Sky:
-    """Return two vehicles: "wing" was invalid 200 s ago, for 4 s, and 50 s ago reset; "quad" was dead reckoning."""
-    sky.fly(30.04, WING, QUAD)
+def flown(sim: SimulatedFleet) -> SimulatedFleet:
+    """Return two vehicles: "wing" was invalid 200 s ago, for 4 s, and reset 50 s ago; "quad" was dead reckoning."""
+    sim.fly(30.04, WING, QUAD)
     for seconds, wing, quad in (
         (4, {"xy_valid": False}, {}), (96, {}, {}), (4, {}, {"dead_reckoning": True}), (46, {}, {}),
         (50, {"x": 30.0, "xy_reset_counter": 1, "delta_xy": (30.0, 0.0)}, {}),
     ):  # fmt: skip
         for _ in range(seconds * 10):
-            sky.time += 0.1
-            sky.add(WING, **wing)
-            sky.add(QUAD, **quad)
-            if not round(sky.time * 10) % 5:
-                sky.look(alive=[WING, QUAD])
-    sky.look(alive=[WING, QUAD])
-    return sky
+            sim.time += 0.1
+            sim.add(WING, **wing)
+            sim.add(QUAD, **quad)
+            if not round(sim.time * 10) % 5:
+                sim.poll(alive=[WING, QUAD])
+    sim.poll(alive=[WING, QUAD])
+    return sim
 
 
-def event_of(sky: Sky, text: str) -> float:
-    """Return when this happened."""
-    return next(event.time for event in sky.chronicle.events if event.text.startswith(text))
+def event_of(sim: SimulatedFleet, text: str) -> float:
+    """Return the time of the first event with this text."""
+    return next(event.time for event in sim.timeline.events if event.text.startswith(text))
 
 
-def test_tapped_event_is_shown(flown: Sky) -> None:
-    """A tap on an event shows that moment: list and map stay of now, plots and sentence are of then, until "now"."""
-    page = Page(flown, asked="?vehicle=quad")
-    assert (page.pinned, page.address) == (None, "?vehicle=quad")
+def test_tapped_event_shows_its_moment(flown: SimulatedFleet) -> None:
+    """A tap on an event shows its moment in plots and story, until "now"; list and map stay current."""
+    page = Page(flown, query="?vehicle=quad")
+    assert (page.pinned, page.url_query) == (None, "?vehicle=quad")
     page.tap("row", "xy not valid")
     then = event_of(flown, "xy not valid")
     assert (page.chosen, page.pinned) == ("wing", then)
-    assert page.moments == pytest.approx((then - 30, then + 30), abs=0.01)
+    assert page.plot_range == pytest.approx((then - 30, then + 30), abs=0.01)
     assert "xy not valid from 22:13:50.1 to 22:13:54.1 UTC (4.0 s)" in page.part("why")
     assert page.grades["wing"] in ("ok", "watch")
     assert "back to now" in page.part("tool")
-    assert f"time={then:.1f}" in page.address
+    assert f"time={then:.1f}" in page.url_query
     times = page.plotted["time"]
     assert times[0] / 1e3 < then < times[-1] / 1e3
     flown.fly(5, WING, QUAD, x=30.0, xy_reset_counter=1)
-    page.look()
+    page.refresh()
     assert page.pinned == then
-    page.say("now")
+    page.send("now")
     assert page.pinned is None
     assert "back to now" not in page.part("tool")
-    assert "time=" not in page.address
-    assert page.moments == pytest.approx((flown.time - 60, flown.time), abs=0.01)
+    assert "time=" not in page.url_query
+    assert page.plot_range == pytest.approx((flown.time - 60, flown.time), abs=0.01)
 
 
-def test_event_on_the_map_is_shown(flown: Sky) -> None:
-    """An event has a mark on the map where the vehicle was then, which can be tapped, and tapped again."""
-    page = Page(flown, asked="?vehicle=wing")
+def test_tapped_map_event_shows_its_moment(flown: SimulatedFleet) -> None:
+    """An event has a mark on the map at the vehicle's position at that time, which can be tapped repeatedly."""
+    page = Page(flown, query="?vehicle=wing")
     source = next(each for each in sources(page) if "marker" in each.data and "row" not in each.data)
     assert source.data["words"] == ["reset of xy by 30.0 m (30.0 north, 0.0 east)"]
     for _ in range(2):
@@ -644,38 +644,38 @@ def test_event_on_the_map_is_shown(flown: Sky) -> None:
         page.update()
         assert page.pinned == event_of(flown, "reset")
         assert "reset of xy by 30.0 m" in page.part("why")
-        page.say("now")
+        page.send("now")
 
 
-def test_keys_go_from_event_to_event(flown: Sky) -> None:
-    """P goes to the event of the chosen vehicle before, n to the next one, and escape back to now."""
-    page = Page(flown, asked="?vehicle=wing")
+def test_keys_step_through_events(flown: SimulatedFleet) -> None:
+    """The key p shows the previous event of the selected vehicle, n the next one, and Escape the current time."""
+    page = Page(flown, query="?vehicle=wing")
     reset, begin = event_of(flown, "reset"), event_of(flown, "xy not valid")
-    page.say("next")
+    page.send("next")
     assert page.pinned is None
     for action, moment in (
         ("previous", reset), ("previous", begin), ("previous", begin), ("next", reset), ("next", reset), ("now", None),
     ):  # fmt: skip
-        page.say(action)
+        page.send(action)
         assert page.pinned == moment
-    page.say("play")
-    page.say("left")
+    page.send("play")
+    page.send("left")
     assert page.pinned is None
 
 
 @pytest.mark.parametrize("event", ["xy not valid", "reset", None])
-def test_address_shows_the_same_to_somebody_else(flown: Sky, event: str | None) -> None:
-    """A page that is opened with the address of another has its vehicle, view, colours, moment and sentence."""
-    page = Page(flown, asked="?theme=light")
-    page.say("vehicle", "wing")
-    page.say("focus:follow")
+def test_url_restores_the_page(flown: SimulatedFleet, event: str | None) -> None:
+    """A page opened with the URL of another has the same vehicle, view, theme, moment and verdict."""
+    page = Page(flown, query="?theme=light")
+    page.send("vehicle", "wing")
+    page.send("focus:follow")
     if event is not None:
-        page.say("previous")
+        page.send("previous")
         if event != "reset":
-            page.say("previous")
-    other = Page(flown, asked=page.address)
+            page.send("previous")
+    other = Page(flown, query=page.url_query)
     other.update()
-    assert other.address == page.address
+    assert other.url_query == page.url_query
     assert other.chosen == "wing"
     assert other.pinned == (None if event is None else pytest.approx(page.pinned, abs=0.06))
     assert other.part("tool") == page.part("tool")
@@ -684,28 +684,28 @@ def test_address_shows_the_same_to_somebody_else(flown: Sky, event: str | None) 
     assert other.marks["wing"]["colour"] in LIGHT.vehicles
 
 
-ASKED = (
+QUERIES = (
     "vehicle=&view=&time=&theme=", "time=nan", "time=inf", "time=-1e300", "time=99:99:99", "time=25:61",
-    "time=1e18", "vehicle=nobody&view=__class__&time=0", f"vehicle={'x' * 5000}&time={'9' * 5000}",
+    "time=1e18", "vehicle=unknown&view=__class__&time=0", f"vehicle={'x' * 5000}&time={'9' * 5000}",
     "time=%00&vehicle=%FF%00",
 )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "asked",
-    [each if index % 4 == 1 else pytest.param(each, marks=pytest.mark.slow) for index, each in enumerate(ASKED)],
+    "query",
+    [each if index % 4 == 1 else pytest.param(each, marks=pytest.mark.slow) for index, each in enumerate(QUERIES)],
 )
-def test_any_address_is_survived(flown: Sky, asked: str) -> None:
-    """Nonsense in an address is left out; where it names an unknown vehicle, another can be chosen."""
-    page = Page(flown, asked=asked)
+def test_invalid_url_arguments_are_ignored(flown: SimulatedFleet, query: str) -> None:
+    """Invalid URL arguments are ignored; if the vehicle is unknown, another can be selected."""
+    page = Page(flown, query=query)
     page.update()
     assert page.vehicles == ["wing", "quad"]
-    page.say("vehicle", "quad")
-    page.say("now")
-    assert page.address == "?vehicle=quad"
+    page.send("vehicle", "quad")
+    page.send("now")
+    assert page.url_query == "?vehicle=quad"
 
 
-SAID = (
+MALFORMED = (
     "", "null", "7", "[]", "[1, 2]", "[1, 2, 3]", '["vehicle"]', '["event", "-1", 1]', '["event", "²", 1]', "[" * 200,
     f'["event", "{"9" * 250}", 1]', f'["event", {"9" * 250}, 1]', '["event", "1e9", 1]', '["event", null, 1]',
     '["size", "0x0", 1]', '["size", "-5x5", 1]', '["size", "99999999999x1", 1]', '["size", "x", 1]', '["size", {}, 1]',
@@ -718,11 +718,11 @@ SAID = (
 )  # fmt: skip
 
 
-def test_whatever_a_browser_says_is_survived(flown: Sky) -> None:
-    """No action, index, size, number of a picture, selection or range of a browser stops the updates of its page."""
+def test_malformed_input_from_the_browser_is_ignored(flown: SimulatedFleet) -> None:
+    """No action, index, size, update number, selection or range from a browser stops the updates of its page."""
     page = Page(flown)
-    for said in SAID:
-        page.say_raw(said)
+    for message in MALFORMED:
+        page.send_raw(message)
     for source in sources(page):
         for indices in ([99], [-99], [-1], [10**18], [0, 5], []):
             source.selected.indices = indices
@@ -739,7 +739,7 @@ def test_whatever_a_browser_says_is_survived(flown: Sky) -> None:
     for start, end in ranges:
         for plot in figures:
             for name, value in (("start", start), ("end", end)):
-                with suppress(ValueError):  # what Bokeh refuses from a browser as well
+                with suppress(ValueError):  # Bokeh rejects it from a browser, too
                     setattr(cast("Any", plot).x_range, name, value)
         page.update()
     for drawn in ("", "x", "-5", "1e9", "9" * 6000, "²", "NaN"):
@@ -747,22 +747,22 @@ def test_whatever_a_browser_says_is_survived(flown: Sky) -> None:
         page.update()
     page.search("x" * 10**6)
     page.search("")
-    page.say("now")
-    page.say("vehicle", "wing")
-    page.look()
+    page.send("now")
+    page.send("vehicle", "wing")
+    page.refresh()
     assert page.vehicles == ["wing", "quad"]
     assert page.chosen == "wing"
     assert page.part("list").count("<div") == 4
 
 
-def test_browser_that_draws_nothing_is_sent_nothing(sky: Sky) -> None:
-    """A browser is sent two pictures ahead of the last one that it has drawn, and no more until it has drawn that."""
-    sky.fly(3)
-    page = Page(sky)
+def test_updates_pause_while_the_browser_does_not_draw(sim: SimulatedFleet) -> None:
+    """At most two updates are sent ahead of the last one that the browser has drawn."""
+    sim.fly(3)
+    page = Page(sim)
     drawn = page.viewer._sent
     for _ in range(10):
-        sky.fly(0.1)
-        sky.look()
+        sim.fly(0.1)
+        sim.poll()
         page.viewer.update()
     assert page.viewer._sent == drawn + 2
     sent = data_sent(page.document)
@@ -774,7 +774,7 @@ def test_browser_that_draws_nothing_is_sent_nothing(sky: Sky) -> None:
 
 
 def contrast(one: str, other: str) -> float:
-    """Return the contrast of two colours, as WCAG 2 has it."""
+    """Return the contrast ratio of two colours (WCAG 2)."""
 
     def luminance(colour: str) -> float:
         parts = [int(colour[index : index + 2], 16) / 255 for index in (1, 3, 5)]
@@ -786,8 +786,8 @@ def contrast(one: str, other: str) -> float:
 
 
 @pytest.mark.parametrize("style", [DARK, LIGHT], ids=lambda style: style.name)
-def test_colours_can_be_read(style: Style) -> None:
-    """Text has a contrast of 4.5 with all that is under it, marks and lines one of 3; no vehicle looks like a state."""
+def test_colours_have_sufficient_contrast(style: Style) -> None:
+    """Text has a contrast ratio of 4.5 to its background, marks and lines 3; no vehicle has the colour of a state."""
     for ground in (style.ground, style.panel, style.chosen):
         for text in (style.text, style.quiet, *(style.grades[grade] for grade in ("bad", "watch", "ok"))):
             assert contrast(text, ground) >= 4.5, (text, ground)
@@ -798,23 +798,23 @@ def test_colours_can_be_read(style: Style) -> None:
     assert not set(style.vehicles) & set(style.grades.values())
 
 
-# Live vehicles, of a real bus
+# Live vehicles of a real bus
 
 
 @contextmanager
-def open_page(endpoint: str) -> Iterator[tuple[Shown, Callable[[Callable[[], object], str], None]]]:
-    """Give the page of a bus with one viewer, and what goes on as the server does until a condition holds."""
+def open_page(endpoint: str) -> Iterator[tuple[RenderedPage, Callable[[Callable[[], object], str], None]]]:
+    """Yield the page of a bus, and a function that updates it like the server until a condition holds."""
     stop = threading.Event()
     with nedbus.connect(endpoint) as bus, ThreadPoolExecutor(1) as pool:
         live = LiveFleet(bus, Selection(), version="0")
-        page = Shown(live.fleet, live.chronicle)
+        page = RenderedPage(live.fleet, live.timeline)
 
         def until(condition: Callable[[], object], what: str) -> None:
-            def is_so() -> object:
+            def is_met() -> object:
                 page.update()
                 return condition()
 
-            wait_for(is_so, what=what)
+            wait_for(is_met, what=what)
 
         reading = pool.submit(live.run, stop)
         try:
@@ -824,8 +824,8 @@ def open_page(endpoint: str) -> Iterator[tuple[Shown, Callable[[Callable[[], obj
         reading.result()
 
 
-def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
-    """Published vehicles are in the list and on the map; those no longer valid, or switched off, stay there."""
+def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+    """Published vehicles are in the list and on the map, and stay there when invalid or gone."""
     fields = {**VALID, "x": 5.0}
     wing, quad = (bus.publisher(VLP, vehicle=name) for name in ("wing", "quad"))
     with open_page(endpoint) as (page, until):
@@ -840,13 +840,13 @@ def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session)
             until(lambda: page.states == {"quad": "gone", "wing": "xy not valid"}, "the end of the other")
         assert page.marks["quad"]["shape"] == "square"
         raw.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
-        page.say("streams")
+        page.send("streams")
         until(lambda: "<td>a rule</td>" in page.part("more"), "the report")
-        until(lambda: any("rejected: a rule" in event.text for event in page.viewer._chronicle.events), "its event")
+        until(lambda: any("rejected: a rule" in event.text for event in page.viewer._timeline.events), "its event")
 
 
-def test_page_outlives_the_router() -> None:
-    """While the router is away the header says so, markers are open, and no vehicle is blamed; then all goes on."""
+def test_page_survives_a_router_restart() -> None:
+    """While the router is down, the header has an alarm, markers are open, and states do not change."""
     where = free_endpoint()
     router = open_router(listen=(where,))
     with (
@@ -857,14 +857,14 @@ def test_page_outlives_the_router() -> None:
     ):
         until(lambda: page.grades == {"wing": "ok"}, "the vehicle")
         router.close()
-        until(lambda: f"no link to {where}" in page.part("head"), "the words")
+        until(lambda: f"no link to {where}" in page.part("head"), "the alarm")
         assert page.grades == {"wing": "ok"}
         assert page.marks["wing"]["fill"] == DARK.ground
         router = open_router(listen=(where,))
         until(lambda: page.marks["wing"]["fill"] != DARK.ground, "the vehicle again")
-        until(lambda: "no link to" not in page.part("head"), "the header to say so")
-        told = [
-            event.text.partition(" after")[0] for event in page.viewer._chronicle.events if event.kind == "link_down"
+        until(lambda: "no link to" not in page.part("head"), "the alarm to end")
+        texts = [
+            event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"
         ]
-        assert told == [f"no link to {where}", "link is back"]
+        assert texts == [f"no link to {where}", "link is back"]
     router.close()

@@ -55,19 +55,19 @@ def web(
     for name in origin or ():
         _split("--origin", name)
     selection = Selection(topic_option, vehicle, instance)
-    where = page.Where(host, port, tuple(origin or ()), background)
+    options = page.PageOptions(host, port, tuple(origin or ()), background)
 
-    def tell(url: str) -> None:
+    def on_listening(url: str) -> None:
         write_stderr(f"open {url} in a browser; Ctrl-C stops the server")
         if not is_loopback(host):
             write_stderr(f"no password protects {http}: every client that reaches it can view, but not change anything")
 
     if files:
-        run_until_stopped(lambda stop: page.serve_recording(files, where, stop=stop, tell=tell))
+        run_until_stopped(lambda stop: page.serve_recording(files, options, stop=stop, on_listening=on_listening))
         return
-    serve_live = partial(page.serve_live, version=__version__, tell=tell)
+    serve_live = partial(page.serve_live, version=__version__, on_listening=on_listening)
     with open_bus() as bus:
-        run_until_stopped(lambda stop: serve_live(bus, selection, where, stop=stop))
+        run_until_stopped(lambda stop: serve_live(bus, selection, options, stop=stop))
 
 
 @command

@@ -31,7 +31,7 @@ from nedbus.events import (
     verdict_of,
 )
 from nedbus.monitoring import Observer
-from nedbus.sources import FileAccount, read_account
+from nedbus.sources import FileEvents, read_file_events
 from nedbus_msgs import ANY, Selection, check_vehicle
 
 _HEAD: Final = (
@@ -230,8 +230,8 @@ def _name(files: Sequence[Path]) -> str:
     return ", ".join(map(str, files))
 
 
-def _read(files: Sequence[Path]) -> tuple[FileAccount, list[Event]]:
-    read = read_account(*files)
+def _read(files: Sequence[Path]) -> tuple[FileEvents, list[Event]]:
+    read = read_file_events(*files)
     found, told = read.account.events_since(0)
     for warning in read.warnings:
         write_stderr(warning)

@@ -16,7 +16,7 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
-from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
+from nedbus.sources import LiveSource, parse_source, read_file_events, source_text_of_file
 from nedbus.sources import convert as convert_messages
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
@@ -116,7 +116,7 @@ def plot(
         if not streams:
             raise SourceError(str(source), "nothing to plot: the selected streams have no valid message")
         target = output or source.with_suffix(".png")
-        read = read_account(source)
+        read = read_file_events(source)
         known = (each for vehicle in read.account.vehicles.values() for each in vehicle.conditions.values())
         events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.account.events_since(0)[0]]
         draw(streams, target, title=source.name, events=events, times=read.times)

@@ -1,5 +1,5 @@
-// Sends clicks, keys and the size of the map to the viewer through the input `message`.
 // Body of a Bokeh callback with the arguments `message`, `map` and `search`.
+// Sends clicks, keys and the size of the map to the server as the value of `message`, a hidden input.
 if (window.nedbusActions) return
 window.nedbusActions = true
 const send = (action, value = "") => {
@@ -14,7 +14,7 @@ const act = part => {
   location.search = query
 }
 
-let pressed = null  // not "click" events: an update may replace the element between pointerdown and pointerup
+let pressed = null  // "click" events would be lost if an update replaces the element between pointerdown and pointerup
 document.addEventListener("pointerdown", event => {
   pressed = event.button == 0 ? {part: partOf(event), x: event.clientX, y: event.clientY} : null
 })

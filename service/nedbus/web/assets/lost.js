@@ -1,4 +1,4 @@
-// Connection lost: show a bar, and reload the page when the server responds again.
+// Connection lost: show a bar, and reload the page once the server responds again.
 if (window.nedbusLost) return
 const bar = window.nedbusLost = document.createElement("div")
 bar.textContent = `nedbus web has not responded since ${new Date().toLocaleTimeString()}: reconnecting`

@@ -19,7 +19,7 @@ import pytest
 import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
-from nedbus.sources import read_account, source_text_of_file
+from nedbus.sources import read_file_events, source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter, account_of
@@ -76,8 +76,8 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have all commands read the real log once: what they say of it is what is tested."""
-    where = "nedbus.cli.commands.events.read_account"
-    monkeypatch.setattr(where, lambda path: (account_of if path == REAL else read_account)(path))
+    where = "nedbus.cli.commands.events.read_file_events"
+    monkeypatch.setattr(where, lambda path: (account_of if path == REAL else read_file_events)(path))
 
 
 def lines_of(shown: Ended) -> list[tuple[str, str, str]]:
@@ -227,7 +227,7 @@ def test_what_never_was_valid_is_said(tmp_path: Path) -> None:
 
 def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of more than an account keeps the last are told, and that there were more."""
-    monkeypatch.setattr("nedbus.sources.account.KEPT_OF_FILE", 2000)
+    monkeypatch.setattr("nedbus.sources.file_events.MAX_FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
     for second in range(2200):

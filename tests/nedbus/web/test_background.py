@@ -1,4 +1,4 @@
-"""The layer under the tracks of the page: GeoJSON, or a picture with a world file, and errors of both."""
+"""The map background: GeoJSON, or an image with a world file, and the errors of both."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from nedbus.web.background import Background
 from nedbus.web.style import DARK
 from nedbus_msgs.frames import MapProjection
 
-PLACE = MapProjection(47.397, 8.545)
+ORIGIN = MapProjection(47.397, 8.545)
 RING = [[8.545, 47.397], [8.546, 47.397], [8.546, 47.398], [8.545, 47.397]]
 FEATURE = {"type": "Feature", "geometry": {"type": "LineString", "coordinates": RING}}
 WORLD = "0.0001 0 0 -0.0001 8.54505 47.39895"
-HINT = "expected GeoJSON, or a picture with a world file"
+HINT = "expected GeoJSON, or an image with a world file"
 
 
 def drawn(background: Background) -> Any:
-    """Return what is drawn first."""
+    """Return the first renderer of the drawn background."""
     plot = figure()
-    background.draw(plot, DARK, PLACE)
+    background.draw(plot, DARK, ORIGIN)
     return plot.renderers[0]
 
 
@@ -45,17 +45,17 @@ def drawn(background: Background) -> Any:
     ],
     ids=lambda value: value.get("type") if isinstance(value, dict) else "",
 )
-def test_every_kind_of_geojson_is_drawn(tmp_path: Path, shape: object, lengths: list[int]) -> None:
-    """Each geometry of GeoJSON becomes lines and points in metres from the common origin."""
+def test_every_geojson_geometry_is_drawn(tmp_path: Path, shape: object, lengths: list[int]) -> None:
+    """Each GeoJSON geometry becomes lines and points in metres from the common origin."""
     file = tmp_path / "field.geojson"
-    file.write_text(json.dumps(shape), encoding="utf-8-sig")  # with the byte order mark of editors on Windows
+    file.write_text(json.dumps(shape), encoding="utf-8-sig")  # with a byte order mark, as Windows editors write
     lines = drawn(Background(file)).data_source.data
     assert [len(each) for each in lines["east"]] == lengths
     assert (lines["east"][0][0], lines["north"][0][0]) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
-def picture(folder: Path, *, world: str | None, size: tuple[int, int] = (40, 20)) -> Path:
-    """Write a picture whose first row is red, and its world file."""
+def write_image(folder: Path, *, world: str | None, size: tuple[int, int] = (40, 20)) -> Path:
+    """Write a blue image with a red first row, and its world file."""
     file = folder / "field.png"
     image = Image.new("RGB", size, (0, 0, 255))
     image.paste((255, 0, 0), (0, 0, size[0], 1))
@@ -66,13 +66,13 @@ def picture(folder: Path, *, world: str | None, size: tuple[int, int] = (40, 20)
 
 
 @pytest.mark.parametrize("suffix", [".pgw", ".wld"])
-def test_picture_lies_where_its_world_file_says(tmp_path: Path, suffix: str) -> None:
-    """The first pixel's centre is in the world file; the picture is north up, its first row in the north."""
-    file = picture(tmp_path, world=WORLD)
+def test_image_is_placed_by_its_world_file(tmp_path: Path, suffix: str) -> None:
+    """The world file has the centre of the first pixel; the image is north up, its first row is the northernmost."""
+    file = write_image(tmp_path, world=WORLD)
     file.with_suffix(".pgw").rename(file.with_suffix(suffix))
     background = Background(file)
     glyph = drawn(background).glyph
-    corner = PLACE.project(47.399, 8.549)
+    corner = ORIGIN.project(47.399, 8.549)
     assert (glyph.x, glyph.y) == pytest.approx((0.0, 0.0), abs=0.01)
     assert (glyph.y + glyph.dh, glyph.x + glyph.dw) == pytest.approx(corner, abs=0.05)
     assert background.pixels.shape == (20, 40)
@@ -80,14 +80,14 @@ def test_picture_lies_where_its_world_file_says(tmp_path: Path, suffix: str) -> 
     assert (background.pixels[-1, 0], background.pixels[0, 0]) == (red, blue)
 
 
-def test_large_picture_is_made_smaller(tmp_path: Path) -> None:
-    """A browser gets at most 2,000 pixels a side, over the same ground."""
-    file = picture(tmp_path, world=WORLD, size=(5000, 40))
+def test_large_image_is_scaled_down(tmp_path: Path) -> None:
+    """A browser gets at most 2,000 pixels per side."""
+    file = write_image(tmp_path, world=WORLD, size=(5000, 40))
     assert max(Background(file).pixels.shape) == 2000
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "reason"),
     [
         (None, "no such file"),
         ("no JSON", HINT),
@@ -103,19 +103,19 @@ def test_large_picture_is_made_smaller(tmp_path: Path) -> None:
         ('{"type": "LineString", "coordinates": ' + "[" * 400 + "1" + "]" * 400 + "}", HINT),
     ],
 )
-def test_file_that_is_no_map_is_named(tmp_path: Path, content: str | None, said: str) -> None:
-    """A map that cannot be drawn is an error of --map that names the file and the accepted ones."""
+def test_invalid_geojson_raises(tmp_path: Path, content: str | None, reason: str) -> None:
+    """An invalid background file raises; the error names --map, the file and the accepted formats."""
     file = tmp_path / "field.geojson"
     if content is not None:
         file.write_text(content)
     with pytest.raises(ConfigError) as error:
         Background(file)
-    for part in (said, "--map", str(file)):
+    for part in (reason, "--map", str(file)):
         assert part in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("world", "said"),
+    ("world", "reason"),
     [
         (None, "world file field.pgw not found"),
         ("0.5 0 0 -0.5 2600000 1200000", "not north up in degrees"),
@@ -127,10 +127,10 @@ def test_file_that_is_no_map_is_named(tmp_path: Path, content: str | None, said:
         (WORLD, "--map"),
     ],
 )
-def test_picture_without_its_place_is_named(tmp_path: Path, world: str | None, said: str) -> None:
-    """A picture needs a world file in degrees, north up, and to be one; the error says how to make one."""
-    file = picture(tmp_path, world=world)
+def test_image_without_valid_world_file_raises(tmp_path: Path, world: str | None, reason: str) -> None:
+    """An image needs a world file in degrees, north up; the error names the GDAL command that creates one."""
+    file = write_image(tmp_path, world=world)
     if world == WORLD:
-        file.write_bytes(b"no picture")
-    with pytest.raises(ConfigError, match=re.escape(said)):
+        file.write_bytes(b"not an image")
+    with pytest.raises(ConfigError, match=re.escape(reason)):
         Background(file)

@@ -1,4 +1,4 @@
-"""Every command of docs/live.md that needs no PX4 and no ROS 2, with other ports, against stand-ins for both."""
+"""All commands in docs/live.md that need neither PX4 nor ROS 2, with other ports, against simulated peers."""
 
 from __future__ import annotations
 
@@ -27,31 +27,33 @@ __all__ = ["fly", "peer", "port"]  # fixtures
 PAGE = (Path(__file__).parents[3] / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [line.partition("#")[0].strip() for block in BLOCKS for line in block.splitlines()]
-COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # test_px4_real.py has definitions of PX4
+COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # those need PX4's .msg files
 SERVES, ROS2 = ([each for each in COMMANDS if each.startswith(f"nedbus {name}")] for name in ("serve", "ros2"))
 
 
 def arguments_of(command: str, **others: str) -> list[str]:
-    """Return the arguments of a command on the page, with other endpoints in it."""
+    """Return the arguments of a command on the page, with endpoints replaced."""
     return [others.get(each, each) for each in shlex.split(command)[1:]]
 
 
-def test_all_commands_are_known() -> None:
-    """No command on the page that no test runs, but the installation."""
+def test_every_command_has_a_test() -> None:
+    """The tests below run every command on the page except the installation."""
     others = set(COMMANDS) - {*SERVES, *ROS2}
     assert others == {"nedbus echo vehicle_local_position", 'pip install ".[mavlink]"'}
     assert (len(SERVES), len(ROS2)) == (6, 6)
 
 
-def test_hashes_are_those_of_the_layouts() -> None:
-    """The table by which a reader finds the layout of a workspace names each layout with the start of its hash."""
+def test_hash_table_matches_the_layouts() -> None:
+    """The table of layouts on the page lists each layout with the prefix of its type hash."""
     rows = re.findall(r"^\| `(RIHS01_\w{8})` \| (\S+)", PAGE, re.MULTILINE)
     assert {layout: start for start, layout in rows} == {layout: type_hash(layout)[:15] for layout in LAYOUTS}
 
 
 @pytest.mark.parametrize("command", SERVES)
-def test_vehicle_is_echoed(run_nedbus: Start, endpoint: str, port: int, fly: Fly, command: str) -> None:
-    """The service as on the page, a vehicle, and the echo of the page: a line of that vehicle."""
+def test_serve_command_publishes_the_vehicle(
+    run_nedbus: Start, endpoint: str, port: int, fly: Fly, command: str
+) -> None:
+    """With the service and the echo command of the page, a line of the vehicle is printed."""
     where = endpoint if "--connect" in command else free_endpoint()
     others = dict.fromkeys(("tcp/192.168.1.5:7447", "tcp/0.0.0.0:7447"), where)
     arguments = arguments_of(command.replace("0.0.0.0:14540", f"127.0.0.1:{port}"), **others)
@@ -70,8 +72,10 @@ def test_vehicle_is_echoed(run_nedbus: Start, endpoint: str, port: int, fly: Fly
 
 
 @pytest.mark.parametrize("command", ROS2)
-def test_ros_2_lists_it(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, peer: Peer, command: str) -> None:
-    """The bridge as on the page, and a ROS 2 node that listens: it gets a message, and lists the topic."""
+def test_ros2_command_reaches_a_node(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, peer: Peer, command: str
+) -> None:
+    """With the bridge command of the page, a ROS 2 node receives a message and lists the topic."""
     bridge = run_nedbus(*arguments_of(command, **{"tcp/192.168.1.5:7447": endpoint}), "-c", endpoint)
     layout = "1.14" if "1.14" in command else "1.16"
     domain = 3 if "--domain 3" in command else 0

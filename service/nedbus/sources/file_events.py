@@ -1,4 +1,4 @@
-"""Detect the events of all vehicles in logs and recordings, by replaying them."""
+"""Event detection in logs and recordings, by replaying them."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
 from .source import ReplayRun, ReplaySource, SourceMessage
 
-KEPT_OF_FILE: Final = 100_000  # events; the oldest are discarded
-_AHEAD: Final = 1000  # messages read for the start of a file
+MAX_FILE_EVENTS: Final = 100_000  # events; the oldest are discarded
+_LOOKAHEAD: Final = 1000  # messages read to determine the start time of a file
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
 
 
 @dataclass(frozen=True, slots=True)
-class FileAccount:
-    """The events of whole files. Times are seconds since their first message; `end` is the time of the last one."""
+class FileEvents:
+    """Events of complete files; `end`: time of the last message. Times are seconds since the first message."""
 
     account: Account
     times: Times
@@ -38,7 +38,7 @@ class FileAccount:
 
 
 class _EventOptions(RecordedOptions):
-    """Options of a replay for its events: all known topics, and two without a file that events need."""
+    """Replay options for event detection: all known topics, and two that nedbus does not define."""
 
     @property
     def chosen_topics(self) -> Collection[str]:
@@ -47,9 +47,9 @@ class _EventOptions(RecordedOptions):
 
 
 class Flights:
-    """The messages of one file, or those of several files on one axis of UTC.
+    """The messages of one file, or of several files merged by UTC.
 
-    A vehicle that is in several files is named after its file in each. `ended`: the vehicles whose file has ended.
+    A vehicle that is in several files is named after the file in each. `ended`: vehicles whose file has ended.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
@@ -64,21 +64,21 @@ class Flights:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Damage, what was left out, and names given to vehicles so far."""
+        """Damage, omissions and renamed vehicles so far."""
         found = []
         for path, run, names in self._files:
             reason = "here, as several files have a vehicle"
-            renamed = [f"vehicle {own} is {name} {reason} {own}" for own, name in names.items() if own != name]
+            renamed = [f"vehicle {own} is named {name} {reason} {own}" for own, name in names.items() if own != name]
             found += [f"{path}: {text}" for text in (*renamed, *run.warnings)]
         return tuple(found)
 
     @cached_property
     def times(self) -> Times:
-        """The offsets of each vehicle's time to UTC, if its messages contain UTC."""
+        """The UTC offset of each vehicle whose messages contain UTC."""
         return Times(offsets={name: utc.offset_us / 1e6 for name, utc in self._utc.items()})
 
     @cached_property
-    def _utc(self) -> dict[str, recording.UtcOffset]:  # which would load NumPy
+    def _utc(self) -> dict[str, recording.UtcOffset]:  # lazy, since it loads NumPy
         names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
         found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
         return {name: utc for name, utc in found if utc is not None}
@@ -94,13 +94,13 @@ class Flights:
 
     def _start(self, path: Path, run: ReplayRun, names: Mapping[str, str]) -> float:
         """Return the Unix time of the start of a file [s]."""
-        ahead = list(islice(run.messages, _AHEAD))
+        ahead = list(islice(run.messages, _LOOKAHEAD))
         run.messages = chain(ahead, run.messages)
         known = ((self._utc.get(names[each.address.vehicle]), each) for each in ahead if not each.error)
         times = ((utc.unix_us(cast("int", each.fields["timestamp"])), each.due) for utc, each in known if utc)
         found = [float(unix) / 1e6 - due for unix, due in times]
         if not found:
-            raise SourceError(str(path), "no message gives UTC, the axis of several files: read it alone")
+            raise SourceError(str(path), "no message gives UTC, which merging several files requires: read it alone")
         return median(found)
 
     def _shift(self, run: ReplayRun, names: Mapping[str, str], offset: float) -> Iterator[SourceMessage]:
@@ -110,21 +110,21 @@ class Flights:
         self.ended.update(names.values())
 
 
-def read_account(*paths: Path) -> FileAccount:
-    """Return the events of files, as `Flights` reads them; raise its errors."""
-    flights, account, due = Flights(paths), Account(KEPT_OF_FILE), 0.0
+def read_file_events(*paths: Path) -> FileEvents:
+    """Detect the events in files; raises like `Flights`."""
+    flights, account, due = Flights(paths), Account(MAX_FILE_EVENTS), 0.0
     for message, _, _ in follow(flights.messages(), account, ended=flights.ended):
         due = message.due
     account.label_first_events()
-    return FileAccount(account, flights.times, due, flights.warnings)
+    return FileEvents(account, flights.times, due, flights.warnings)
 
 
 def follow(
     messages: Iterable[SourceMessage], account: Account, *, ended: Collection[str] = ()
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
-    """Add the messages of a replay to an account; yield each with its rejection reason or its payload.
+    """Detect events in a replay; yield each message with its rejection reason or its payload.
 
-    `ended`: the vehicles that have no more messages, which are not silent.
+    `ended`: vehicles without further messages, which do not count as silent.
     """
     checked = due = 0.0
 
@@ -137,7 +137,7 @@ def follow(
             account.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
         if due - checked >= _CHECK_INTERVAL and account.vehicles.keys() <= set(ended):
-            checked = due  # between two files
+            checked = due  # no vehicle is active between two files
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
             update(checked)

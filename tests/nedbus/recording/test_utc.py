@@ -1,4 +1,4 @@
-"""The clock of timestamps, and the vehicle of inputs, in files of three kinds."""
+"""Clocks of timestamps, and vehicles of input topics, in files of three kinds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.sources import read_account
+from nedbus.sources import read_file_events
 from nedbus_msgs import DEFAULT_TOPIC, is_unix_time
 from tests.flights.replays import convert_replay, open_replay
 
@@ -24,25 +24,25 @@ INPUTS: Final = DATA / "fmu_in_topics.mcap"
     ("path", "utc", "source"),
     [(UNIX, "2025-10-09 08:53:19.997000", "timestamp"), (BOOT, "2025-09-08 13:31:04", "boot_time_utc_us")],
 )
-def test_every_caller_has_the_same_utc(path: Path, utc: str, source: str) -> None:
-    """`utc_of`, `align` and the events agree, for Unix timestamps of uXRCE-DDS and for a log that has its boot time."""
+def test_utc_of_align_and_events_agree(path: Path, utc: str, source: str) -> None:
+    """UTC is the same for Unix timestamps of uXRCE-DDS, and for a log with the time of its boot."""
     found = nedbus.utc_of(path)
     assert found is not None
     first = nedbus.read(path)["timestamp"][0]
     assert (found.source, str(found.at(first))) == (source, f"{utc}+00:00")
     assert nedbus.align(path, utc=True)["utc"][0] == np.datetime64(utc.replace(" ", "T"))
     event: Any = SimpleNamespace(vehicle="1", boot=first / 1e6)
-    assert read_account(path).times.utc(event) == pytest.approx(found.unix_us(int(first)) / 1e6)
+    assert read_file_events(path).times.utc(event) == pytest.approx(found.unix_us(int(first)) / 1e6)
 
 
-def test_conversion_keeps_the_time_of_the_boot(tmp_path: Path) -> None:
-    """A recording of a log without a clock in its messages has the UTC that the log's information gives."""
+def test_conversion_keeps_the_boot_time(tmp_path: Path) -> None:
+    """A recording converted from a log keeps the UTC of the log's metadata."""
     convert_replay(f"ulog:{BOOT}", tmp_path / "a.mcap")
     assert nedbus.utc_of(tmp_path / "a.mcap") == nedbus.utc_of(BOOT)
 
 
-def test_clocks_may_be_mixed() -> None:
-    """Of two clocks in one stream each timestamp is taken as it is: UTC where it is known, no date of 1970 or 2081."""
+def test_mixed_clocks_are_distinguished_per_timestamp() -> None:
+    """In a stream with both clocks, Unix timestamps have a UTC, and times since boot have none."""
     messages = nedbus.read(UNIX)
     messages["timestamp"][:100] = np.arange(100) * 20_000 + 1_000_000  # before the time is synchronized
     table = nedbus.align({DEFAULT_TOPIC: messages}, utc=True)
@@ -50,8 +50,8 @@ def test_clocks_may_be_mixed() -> None:
     assert is_unix_time(table["utc"][100:].astype(np.int64)).all()
 
 
-def test_inputs_belong_to_their_vehicle() -> None:
-    """/fmu/in/... of an offboard bag is of the vehicle of /fmu/out/..., and its messages are labelled as inputs."""
+def test_input_topics_belong_to_their_vehicle() -> None:
+    """/fmu/in/... in an offboard bag belongs to the vehicle of /fmu/out/..., and has the source mcap-input."""
     inputs = {"offboard_control_mode", "trajectory_setpoint", "vehicle_visual_odometry"}
     assert {name: len(each) for name, each in nedbus.read(INPUTS, ["*"]).items()} == dict.fromkeys(
         inputs | {DEFAULT_TOPIC}, 50

@@ -1,4 +1,4 @@
-"""Events of a page in time order, with the spans, states and stories derived from them, and times as text."""
+"""Events of a page in order of time, the spans, stories and verdicts derived from them, and formatted times."""
 
 import functools
 import math
@@ -26,10 +26,10 @@ _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
 _TENTH: Final = 0.1  # s; time resolution of the page's URL
 
 
-class Chronicle:
-    """The events of an account and those `before` it; re-evaluated only after new events.
+class EventTimeline:
+    """The events of an account and earlier ones (`before`); derived values are cached until the next event.
 
-    `start`: what to add to times of the account on an axis [s]; `unit`: the name of the clock that this gives.
+    `start`: offset from times of the account to the clock of the time axes [s]; `unit`: the name of that clock.
     """
 
     def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
@@ -37,59 +37,59 @@ class Chronicle:
         self.times = times or Times(is_live=True)
         self.start, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
         self._before = before
-        self._taken = -1
+        self._reported = -1
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
-        self._tell = functools.cache(self._find_stories)  # for all viewers, until the next event
+        self._find_stories_cached = functools.cache(self._find_stories)  # shared by all viewers
         self._verdicts: dict[tuple[str, float | None], tuple[float, Verdict]] = {}
 
     @property
     def events(self) -> Sequence[Event]:
         """All events so far."""
-        self._read()
+        self._refresh()
         return self._events
 
     @property
     def spans(self) -> Mapping[str, Sequence[Span]]:
-        """Spans of all conditions, by vehicle."""
-        self._read()
+        """The spans of all conditions, by vehicle."""
+        self._refresh()
         return self._spans
 
     def set_start(self, vehicle: str, boot: float, time: float) -> None:
-        """Set the clock of the axis in a recording, from a message `boot` seconds after a vehicle's boot."""
+        """Set the clock of a recording's time axes, given a message received at `time`, `boot` seconds after boot."""
         utc = self.times.utc_of_boot(vehicle, boot)
         if utc is not None or len(self.account.vehicles) < 2:  # vehicles boot at different times
             self.start, self.unit = (boot if utc is None else utc) - time, unit_of("boot" if utc is None else "vehicle")
 
     def moment(self, seconds: float) -> str:
-        """Format a time of the account by the clock of the axis."""
+        """Format a time of the account on the clock of the time axes."""
         return to_clock(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
 
     def clock(self, seconds: float) -> str:
-        """Format a time of the account with the name of its clock and, in a recording, since the start."""
+        """Format a time with the name of its clock and, for a recording, also as seconds since its start."""
         since = "" if self.times.is_live or not self.start else f", {seconds:.1f} {unit_of('start')}"
         return f"{self.moment(seconds)} {self.unit}{since}"
 
     def story(self, vehicle: str, now: float, at: Event | float | None, held: Sequence[Condition]) -> Story | None:
-        """Return the story of the selected event or time; for now, that of the current state or a recent condition.
+        """Return the story of an event or time; without one, that of the current state, else of a recent condition.
 
-        `at`: the selected event or time, None for now. `held`: the conditions of the current state.
+        `at`: the selected event or time, or None. `held`: the active conditions, the one that names the state first.
         """
-        self._read()
-        if at is None and held:  # the condition that gives the state its text
+        self._refresh()
+        if at is None and held:
             at = held[0].begin
-        stories = self._tell(vehicle, at)
+        stories = self._find_stories_cached(vehicle, at)
         if at is None:
             stories = [story for story in stories if story.since <= now and now - (story.until or now) < PAST][::-1]
         return next(iter(stories), None)
 
     def verdict(self, vehicle: str, end: float, at: float | None = None) -> Verdict:
-        """Return the verdict at a time, or on all of a recording or the last ten minutes; `end` is its end, or now."""
-        self._read()
-        made, verdict = self._verdicts.get((vehicle, at), (-math.inf, None))
-        if verdict is None or end - made >= 1.0:
-            events, (topics, held) = self._by_vehicle.get(vehicle, [])[-_MAX_EVENTS:], self._known(vehicle)
+        """Return the verdict at a time, by default on the whole recording or the last ten minutes before `end`."""
+        self._refresh()
+        computed, verdict = self._verdicts.get((vehicle, at), (-math.inf, None))
+        if verdict is None or end - computed >= 1.0:
+            events, (topics, held) = self._by_vehicle.get(vehicle, [])[-_MAX_EVENTS:], self._evidence(vehicle)
             events = [event for event in events if event.time > end - PAST or not self.times.is_live]
             verdict = verdict_of(vehicle, events, held, topics=topics, times=self.times, end=end, at=at)
             self._verdicts[vehicle, at] = end, verdict
@@ -97,30 +97,30 @@ class Chronicle:
 
     @property
     def faults(self) -> Sequence[tuple[str, Story]]:
-        """The stories of all vehicles, in order of time."""
-        self._read()
-        stories = [(name, story) for name in self._by_vehicle for story in self._tell(name, None)]
+        """The vehicle and story of each fault, in order of time."""
+        self._refresh()
+        stories = [(name, story) for name in self._by_vehicle for story in self._find_stories_cached(name, None)]
         return sorted(stories, key=lambda each: each[1].since)
 
     def _find_stories(self, vehicle: str, at: Event | float | None) -> list[Story]:
-        events, (topics, held) = self._by_vehicle.get(vehicle, []), self._known(vehicle)
+        events, (topics, held) = self._by_vehicle.get(vehicle, []), self._evidence(vehicle)
         if isinstance(at, Event):
             story = story_of(at, events, held, topics=topics)
             return [] if story is None else [story]
         moment = None if at is None else at + _TENTH
         return stories_of(events[-_MAX_EVENTS:], held, topics=topics, at=moment)
 
-    def _known(self, vehicle: str) -> tuple[list[str], list[Condition]]:
-        """Return the topics of a vehicle, and the conditions that began before the first event or are still active."""
-        known = self.account.vehicles.get(vehicle)
-        return ([], []) if known is None else ([*known.topics], [*known.initial, *known.conditions.values()])
+    def _evidence(self, vehicle: str) -> tuple[list[str], list[Condition]]:
+        """Return a vehicle's topics, and its conditions that began before the first event or are still active."""
+        state = self.account.vehicles.get(vehicle)
+        return ([], []) if state is None else ([*state.topics], [*state.initial, *state.conditions.values()])
 
-    def _read(self) -> None:
-        if self._taken == self.account.reported:
+    def _refresh(self) -> None:
+        if self._reported == self.account.reported:
             return
-        events, self._taken = self.account.events_since(0)
+        events, self._reported = self.account.events_since(0)
         self._events = sorted([*self._before, *events], key=lambda event: event.time)
-        self._tell.cache_clear()
+        self._find_stories_cached.cache_clear()
         self._verdicts.clear()
         vehicles = dict(self.account.vehicles)
         self._by_vehicle = {name: [] for name in vehicles}
