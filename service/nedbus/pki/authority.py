@@ -114,7 +114,7 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
         signed = _sign(_CA_NAME, authority.key.public_key(), authority.key, days)
         return _write_files(folder / "ca", signed, replace=True)
     if entry.problem == _FOREIGN:
-        raise PkiError(f"{entry.path} is {_FOREIGN}: renew it in the folder of that authority")
+        raise PkiError(f"{entry.path} is signed by another CA: renew it in the folder of that CA")
     # The private key may exist only on the vehicle, but the old certificate has the public key.
     key = new_key() if replace_key else None
     public_key = key.public_key() if key else load_certificate(entry.path).public_key()
@@ -230,11 +230,11 @@ def _sign(
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
         builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if hosts:
-        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
+        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_general_name, hosts))), critical=False)
     return builder.sign(signer, hashes.SHA256())
 
 
-def _host(host: str) -> x509.GeneralName:
+def _general_name(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:

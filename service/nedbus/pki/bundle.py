@@ -21,7 +21,7 @@ _TEMPLATES: Final = _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[
 
 
 class _Template(string.Template):
-    delimiter = "@"  # as $ is used by the shell and by Docker
+    delimiter = "@"  # the shell and Docker use $
 
 
 def make_bundle(
@@ -64,7 +64,7 @@ def make_bundle(
         "name": vehicle,
         "target": str(target),
     }
-    facts = {fact: json.dumps(value) for fact, value in strings.items()} | {
+    values = {field: json.dumps(value) for field, value in strings.items()} | {
         "vehicle": vehicle,
         "common_name": name,
         "pki": f"{target}/pki",
@@ -81,7 +81,7 @@ def make_bundle(
             for file, item in ((f"{name}.key", key), (f"{name}.crt", certificate), ("ca.crt", authority.certificate)):
                 write_new(temporary / "pki" / file, item)
             for file in ("nedbus.toml", "compose.yml", "README.txt"):
-                (temporary / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(facts))
+                (temporary / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(values))
             temporary.rename(output)
     except OSError as exc:
         raise PkiError(f"cannot create {output}: {(exc.strerror or str(exc)).lower()}") from exc

@@ -28,6 +28,6 @@ from .session import (
     translate_error,
     translate_zenoh_errors,
 )
-from .tls import UNKNOWN_AUTHORITY, Tls, check_pem
+from .tls import UNKNOWN_CA, Tls, check_pem
 from .write_probe import Verdict, probe_writes
 from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload

@@ -407,7 +407,7 @@ def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
     found(findings, "tls", "ok", router)
     found(findings, "tls", "warning", r"the router shows router-soon.*\d+ days from now")
     found(findings, "certificate", "ok", "this client is reader, issued by nedbus CA")
-    found(findings, "certificate", "ok", "the authority is nedbus CA")
+    found(findings, "certificate", "ok", "the CA is nedbus CA")
 
 
 @pytest.mark.parametrize(
@@ -415,7 +415,7 @@ def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
     [
         (("router-expired", "reader", "ca.crt"), {"tls": "the router shows router-expired .*has expired"}),
         (("router-elsewhere", "reader", "ca.crt"), {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"}),
-        (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the authority in .*, but by nedbus CA"}),
+        (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the CA in .*, but by nedbus CA"}),
         (("router", None, "ca.crt"), {"tls": "it requires a client certificate, and none is given"}),
         (
             ("router", "expired", "ca.crt"),
@@ -444,7 +444,7 @@ def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timi
     findings = look(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
     found(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
     found(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
-    found(findings, "tls", "wrong", f"{secure}: .*no authority is given")
+    found(findings, "tls", "wrong", f"{secure}: .*no CA is given")
     for files, reason in (
         ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
