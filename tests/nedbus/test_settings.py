@@ -230,7 +230,7 @@ def test_expired_or_foreign_certificate_is_explained(keys: Path, tmp_path: Path)
 # Router files and endpoints
 
 
-def test_missing_or_foreign_router_file_raises(tmp_path: Path) -> None:
+def test_missing_router_file_or_unknown_suffix_raises(tmp_path: Path) -> None:
     """A missing file and an unknown file suffix raise ConfigError."""
     for name, reason in (
         ("no.json5", "there is no such file"),

@@ -49,16 +49,16 @@ CONFIG = certificates.CONFIG / "router-secure.json5"
 FLEET = [str(number) for number in range(1, 201)]
 SAMPLE = ("1", "99", "200")
 
-made = certificates.pki
+shared_pki = certificates.pki
 Join = Callable[..., nedbus.Bus]
 RunRouter = Callable[[Path], Callable[[], None]]
 
 
 @pytest.fixture
-def pki(made: Path, tmp_path: Path) -> Path:
+def pki(shared_pki: Path, tmp_path: Path) -> Path:
     """Copy a CA with certificates of routers, vehicles and readers, which the test may modify."""
     invalid = shutil.ignore_patterns("foreign", "*expired*", "router-soon*", "router-elsewhere*")
-    return Path(shutil.copytree(made, tmp_path / "pki", ignore=invalid))
+    return Path(shutil.copytree(shared_pki, tmp_path / "pki", ignore=invalid))
 
 
 @pytest.fixture
