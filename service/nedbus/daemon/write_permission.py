@@ -72,16 +72,15 @@ class WritePermission:
         self._thread.join(_GRACE)
 
     def _run(self) -> None:
-        due, known = 0.0, (set[str](), set[str]())
+        due, routers, vehicles = 0.0, set[str](), set[str]()
         while not self._stop.wait(TIMINGS.probe_poll):
-            now = time.monotonic()
+            now, last_routers, last_vehicles = time.monotonic(), routers, vehicles
             routers, vehicles = _routers_of(self._session), self._vehicles()
-            if routers != known[0]:
+            if routers != last_routers:
                 self._denials = {vehicle: _CONFIRMED * refused for vehicle, refused in self.refused.items()}
                 due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
-            elif vehicles - known[1]:
+            elif vehicles - last_vehicles:
                 due = min(due, now + TIMINGS.probe_first[0])
-            known = routers, vehicles
             if routers and vehicles and now >= due:
                 due = now + self.check()
 
