@@ -10,7 +10,7 @@ from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
@@ -77,7 +77,7 @@ class Worker:
         *,
         router: Session | None = None,
         clock: Clock | None = None,
-        account: Account,
+        event_log: EventLog,
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
@@ -90,7 +90,7 @@ class Worker:
         self._clock = clock or Clock()
         self._retry = retry or isinstance(self.source, LiveSource)
         self._on_end = on_end
-        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, account)
+        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, event_log)
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None
