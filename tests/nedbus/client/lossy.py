@@ -54,7 +54,7 @@ class CountedRequest:
         self._answers = answers
         self._lossy = lossy
 
-    def receive_timestamps(self) -> dict[int, RawSample]:
+    def poll(self) -> dict[int, RawSample]:
         had_ended, taken = self._answers.ended, self._answers.poll()
         self._lossy.open -= self._answers.ended and not had_ended
         return taken
