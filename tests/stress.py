@@ -26,7 +26,7 @@ from typing import Final
 
 import nedbus
 from nedbus import NedbusError
-from nedbus.transport import alive_keys, open_router
+from nedbus.transport import open_router, token_keys
 from nedbus_msgs import Selection
 
 TICK: Final = 0.05  # s
@@ -136,7 +136,7 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
         actions: dict[str, Callable[[], object]] = {
             "closed": open_and_close,
             "put": put,
-            "vehicles": lambda: alive_keys(bus._session, Selection().alive_key_expr(prefix=bus.prefix), timeout=1.0),
+            "vehicles": lambda: token_keys(bus._session, Selection().alive_key_expr(prefix=bus.prefix), timeout=1.0),
             "followed": lambda: (bus.vehicles(timeout=1.0), stop.wait(0.01)),
             "latest": lambda: bus.latest(timeout=1.0),
             "subscribed": receive_some,

@@ -12,7 +12,7 @@ from typing import cast
 import zenoh
 
 from nedbus.timings import TIMINGS, Timings
-from nedbus.transport import Session, alive_keys
+from nedbus.transport import Session, token_keys
 
 DEADLINE = 30.0
 """Seconds that a test waits for a condition before it fails."""
@@ -35,7 +35,7 @@ def wait_for_matching(zenoh_session: Session, key: str) -> None:
 
 def wait_for_router(zenoh_session: Session) -> None:
     """Wait until the router has processed the session's declarations: it replies to this query after them."""
-    alive_keys(zenoh_session, "nowhere", timeout=DEADLINE)
+    token_keys(zenoh_session, "nowhere", timeout=DEADLINE)
 
 
 @contextmanager

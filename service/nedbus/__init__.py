@@ -6,7 +6,7 @@ with nedbus.connect() as bus:
     for sample in bus.subscribe():
         print(sample.vehicle, sample.message.position)  # north, east and down; None while it is invalid
 
-More is in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
+Further public names are in `nedbus.frames`, `nedbus.health` and `nedbus.errors`.
 """
 
 from importlib import import_module as _import_module
@@ -74,13 +74,13 @@ __all__ = [
     "define_msg", "dtype_of", "mask_invalid", "missing_of", "read", "to_array", "to_message", "utc_of",
 ]  # fmt: skip
 
-# Imported on first use of a name, for fast start: `nedbus --version` needs none; only the last two load NumPy.
+# Imported in this order on first use of a name, for a fast start; only the last two load NumPy.
 _MODULES = "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client", "nedbus_msgs.arrays", "nedbus.recording"
 _SUBMODULES = "errors", "frames", "health"
 
 
 def __dir__() -> list[str]:
-    """Return all public names, also those not imported yet, for tab completion."""
+    """Return all public names, for tab completion, including names that are not imported yet."""
     messages = _import_module("nedbus_msgs").MESSAGES
     return sorted({*__all__, *messages, *_SUBMODULES, *(name for name in globals() if name.startswith("__"))})
 

@@ -13,7 +13,7 @@
     │   └── OutputError (OSError)            a recording or a picture that cannot be written
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
-    │   ├── ListenError (OSError)            cannot listen on the endpoint: the port is taken, ...
+    │   ├── ListenError (OSError)            cannot listen on the endpoint: port in use, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
     │   ├── ClosedError (RuntimeError)       the bus was closed
     │   ├── ReceiveError (RuntimeError)      a subscription ended by its session or thread

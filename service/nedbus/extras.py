@@ -19,7 +19,7 @@ def import_optional(extra: str, module: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
-        # Never install nedbus by its name alone, which on PyPI belongs to another project.
+        # Never suggest nedbus by its name alone: on PyPI it belongs to another project.
         hint = f"in a clone of nedbus, pip install '.[{extra}]'" if extra in EXTRAS else f"pip install {extra}"
         raise ConfigError(missing, f"not installed: {hint}") from exc
 

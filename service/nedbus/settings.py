@@ -229,15 +229,15 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
     wrong: dict[str, set[int | str]] = defaultdict(set)
     for detail in details:
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
-    kept = {name: value for name, value in values.items() if name not in wrong}
+    valid = {name: value for name, value in values.items() if name not in wrong}
     for name in wrong.keys() & Settings.model_fields.keys():
         value = values.get(name) or _from_environment(name)
         items = split_sources(value) if name == "source" else split_values(value)
         if wrong[name] and isinstance(items, list | tuple):
-            kept[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])
+            valid[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])
         else:
-            kept[name] = Settings.model_fields[name].default
-    return kept
+            valid[name] = Settings.model_fields[name].default
+    return valid
 
 
 def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:

@@ -14,8 +14,8 @@ class Timings:
     retransmit_timeout: float = 20.0  # until a sequence gap counts as lost; publishers cache messages as long
     downsampled_timeout: float = 10.0  # from a liveliness token to the warning that no downsampled message arrives
     definition_timeout: float = 3.0  # for a busy publisher to send the definition of a message
-    return_wait: float = 5.0  # to wait for a reader that disconnected without closing, while a router is connected
-    frozen_wait: float = 90.0  # to wait for a reader whose lease expired: its process may be suspended
+    return_wait: float = 5.0  # for a reader to return that disconnected without closing, while a router is connected
+    frozen_wait: float = 90.0  # for a reader to return whose lease expired: its process may be suspended
     credit_polls: tuple[float, float] = (0.0005, 0.005)  # between polls for credit: first and longest pause
     stale: float = 3.0  # without a message until a stream is stale: it has no rate, and sources stop publishing it
     forgotten: float = 3600.0  # until a vehicle that is gone or silent counts as switched off, and its state is deleted
@@ -50,9 +50,9 @@ class Timings:
     doctor_open: float = 1.5  # to open a session
     handshake: float = 1.5  # TLS handshake
     tls_alert: float = 0.5  # for the TLS alert of a router that rejects our certificate
-    list_timeout: float = 10.0  # for the router to list all streams
+    list_timeout: float = 10.0  # for a router to list all streams
     first_sample: float = 2.0  # without a sample until a notice is printed to stderr
-    old: float = 1.0  # latency from which it is displayed: retained or recovered messages
+    old: float = 1.0  # latency from which it is displayed, for retained or recovered messages
     reports: tuple[float, ...] = (*(10.0,) * 6, 60.0)  # between progress reports of `serve`; the last interval repeats
     systemd_patience: float = 30.0  # until a client without a router reports READY, to let the boot continue
     systemd_status: float = 1.0  # between status texts

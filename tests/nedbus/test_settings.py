@@ -15,7 +15,7 @@ from nedbus.pki import make_authority, make_certificate
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
-from nedbus.transport.endpoints import explain_endpoints
+from nedbus.transport.endpoints import resolution_error
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.waits import wait_for
@@ -173,8 +173,8 @@ def test_unresolvable_host_name_is_reported() -> None:
     """ConnectError reports a host name that cannot be resolved, but only if all endpoints fail to resolve."""
     with pytest.raises(ConnectError, match=r"cannot resolve no-such-host\.invalid"):
         nedbus.connect("tcp/no-such-host.invalid:7447", timeout=0.1)
-    assert explain_endpoints(["tcp/no-such-host.invalid:1", "tcp/127.0.0.1:1"]) is None
-    assert explain_endpoints(["tcp/[::1]:1"]) is None
+    assert resolution_error(["tcp/no-such-host.invalid:1", "tcp/127.0.0.1:1"]) is None
+    assert resolution_error(["tcp/[::1]:1"]) is None
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +230,7 @@ def test_expired_or_foreign_certificate_is_explained(keys: Path, tmp_path: Path)
 # Router files and endpoints
 
 
-def test_missing_or_foreign_router_file_raises(tmp_path: Path) -> None:
+def test_missing_router_file_or_unknown_suffix_raises(tmp_path: Path) -> None:
     """A missing file and an unknown file suffix raise ConfigError."""
     for name, reason in (
         ("no.json5", "there is no such file"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from nedbus.transport import Session, alive_keys
+from nedbus.transport import Session, token_keys
 from tests.waits import DEADLINE
 
 
@@ -16,7 +16,7 @@ from tests.waits import DEADLINE
 def answer_queries(session: Session, key_expr: str, reply: Callable[[zenoh.Query], object]) -> Iterator[None]:
     """Declare a queryable for `key_expr` that the router has registered before the block begins."""
     queryable = session.declare_queryable(key_expr, zenoh.handlers.Callback(reply, indirect=False))
-    alive_keys(
+    token_keys(
         session, "nedbus/*/@alive/*/**", timeout=DEADLINE
     )  # the router answers after it has registered the queryable
     yield

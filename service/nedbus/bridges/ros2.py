@@ -117,7 +117,7 @@ class Ros2Bridge:
     def _require_visible(self, observer: transport.Session, token: str, stop: threading.Event) -> None:
         """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
         end = time.monotonic() + TIMINGS.token_visible
-        while not stop.is_set() and not transport.alive_keys(observer, token, timeout=0.5):
+        while not stop.is_set() and not transport.token_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
                 end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
             elif time.monotonic() > end:
@@ -159,7 +159,7 @@ class Ros2Bridge:
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
         nodes, own = dict[transport.TopicKey, str](), self._zid  # other nodes, by the topic they publish
-        for text in transport.alive_keys(self._session, transport.px4_publishers_key_expr(self._domain), timeout=0.5):
+        for text in transport.token_keys(self._session, transport.px4_publishers_key_expr(self._domain), timeout=0.5):
             with suppress(DecodeError):
                 token = transport.PublisherToken.parse(text)
                 if token.session != own:

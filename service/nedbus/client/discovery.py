@@ -22,7 +22,7 @@ from nedbus.client.health import Health
 from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
-from nedbus.transport import MAX_REPLY_BYTES, AliveTokens, RawSample, Session, query, translate_zenoh_errors
+from nedbus.transport import MAX_REPLY_BYTES, LivelinessTokens, RawSample, Session, query, translate_zenoh_errors
 from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
 
 _log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class VehicleDirectory:
         self._prefix, self._key_expr = prefix, key_expr
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
-        self._tokens: AliveTokens | None = None
+        self._tokens: LivelinessTokens | None = None
         self._logged = False
 
     def publishers(self, session: Session, *, timeout: float) -> Publishers:
@@ -64,9 +64,9 @@ class VehicleDirectory:
         end = time.monotonic() + timeout
         with self._lock:
             if self._tokens is None:
-                self._tokens = AliveTokens(session, self._key_expr)
+                self._tokens = LivelinessTokens(session, self._key_expr)
             while True:
-                for key, alive in self._tokens.take():
+                for key, alive in self._tokens.poll():
                     if not alive:
                         self._addresses.pop(key, None)
                         continue

@@ -81,7 +81,7 @@ class Daemon:
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: Sequence[Worker] = ()
-        self._planning = threading.Lock()  # held while workers start or stop
+        self._workers_lock = threading.Lock()  # held while workers start or stop
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
@@ -160,7 +160,7 @@ class Daemon:
             self.update_events(), self.id, socket.gethostname(), clock.steady(), within=within, to_utc=clock.to_utc()
         )
 
-    def _answer(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
+    def _status_reply(self, parameter: Callable[[str], str | None]) -> Iterator[bytes]:
         within, seconds = parameter(ACCOUNT_PARAMETER), 0.0
         with suppress(ValueError):
             seconds = float(within or 0.0)
@@ -181,13 +181,13 @@ class Daemon:
             if name not in _RELOADABLE and getattr(settings, name) != getattr(self._settings, name):
                 raise locate_setting(settings, name, f"{name} cannot be changed by a reload: restart the service")
         plan = self._make_plan(settings)
-        with self._planning:
+        with self._workers_lock:
             self._settings, self._plan = settings, plan
             if self._registry is None:
                 return "no source is running yet"
-            before, kept = len(self._workers), self._apply_plan(self._registry)
+            before, unchanged = len(self._workers), self._apply_plan(self._registry)
         self._changed.set()
-        return f"{len(plan) - kept} started, {before - kept} stopped, {kept} unchanged"
+        return f"{len(plan) - unchanged} started, {before - unchanged} stopped, {unchanged} unchanged"
 
     def run(self) -> bool:
         """Publish until done or stopped; return False if a source failed; raise ListenError or ConfigError."""
@@ -197,8 +197,8 @@ class Daemon:
         settings, queries, is_client = self._settings, QueryServer(session), self.role == "client"
         registry = PublisherRegistry(session, queries, prefix=settings.prefix, is_client=is_client)
         try:
-            queries.answer_json(status_key(self.id, prefix=settings.prefix), self._answer)
-            with self._planning:
+            queries.answer_json(status_key(self.id, prefix=settings.prefix), self._status_reply)
+            with self._workers_lock:
                 self._registry = registry
                 self._apply_plan(registry)
             self.ready.set()

@@ -97,7 +97,7 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher with this definition, unless open; raise AddressInUseError if another source has it."""
+        """Open a publisher, unless open with this definition; raise AddressInUseError if another source has it."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
@@ -158,7 +158,7 @@ class SourceOutput:
         publisher = stream.publisher if stream is not None else None
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
             resumed = stream is not None and stream.last_received is not None
-            if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._make_room():
+            if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._evict_stale():
                 reason = f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"
                 self.reject(Rejection("vehicles", reason), rule=TOO_MANY)
                 return
@@ -202,7 +202,7 @@ class SourceOutput:
         self._is_full = False
         return bool(fresh)
 
-    def _make_room(self) -> bool:
+    def _evict_stale(self) -> bool:
         """Delete the address that has been stale longest; return False if all are published."""
         stale = () if self._is_full else {*self._streams}.difference(self.addresses)
         if stale:
@@ -239,7 +239,7 @@ class SourceOutput:
             for address, stream in self._streams.items()
             if address.vehicle == vehicle and stream.last is not None
         ]
-        rebooted = message.rebooted or _time_of(message) < max((_time_of(last) for *_, last in known), default=0)
+        rebooted = message.rebooted or _timestamp(message) < max((_timestamp(last) for *_, last in known), default=0)
         for address, stream, last in known:
             if stream.publisher is not None or get_topic(address.topic).rate:
                 continue
@@ -277,5 +277,5 @@ def _differs(new: Definition[Any] | None, known: Definition[Any]) -> bool:
     return new is not None and new is not known and [*new.types.items()] != [*known.types.items()]
 
 
-def _time_of(message: SourceMessage) -> int:
+def _timestamp(message: SourceMessage) -> int:
     return cast("int", message.fields.get("timestamp", 0))

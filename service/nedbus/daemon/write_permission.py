@@ -72,16 +72,15 @@ class WritePermission:
         self._thread.join(_GRACE)
 
     def _run(self) -> None:
-        due, known = 0.0, (set[str](), set[str]())
+        due, routers, vehicles = 0.0, set[str](), set[str]()
         while not self._stop.wait(TIMINGS.probe_poll):
-            now = time.monotonic()
+            now, last_routers, last_vehicles = time.monotonic(), routers, vehicles
             routers, vehicles = _routers_of(self._session), self._vehicles()
-            if routers != known[0]:
+            if routers != last_routers:
                 self._denials = {vehicle: _CONFIRMED * refused for vehicle, refused in self.refused.items()}
                 due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
-            elif vehicles - known[1]:
+            elif vehicles - last_vehicles:
                 due = min(due, now + TIMINGS.probe_first[0])
-            known = routers, vehicles
             if routers and vehicles and now >= due:
                 due = now + self.check()
 
@@ -108,16 +107,16 @@ class WritePermission:
             _log.warning(
                 "the router refuses %s: its messages reach no reader; check that the access rules name it, and that"
                 " %s is its certificate ('nedbus pki rules', docs/security.md); still checking",
-                _name(new),
+                _list_vehicles(new),
                 self._tls.certificate,
                 extra=about("access_denied"),
             )
         if accepted := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router accepts %s now", _name(accepted), extra=about("access_granted"))
+            _log.info("the router accepts %s now", _list_vehicles(accepted), extra=about("access_granted"))
         if any(verdict == "denied" and self._denials[vehicle] < _CONFIRMED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
-        is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
-        return TIMINGS.probe_pause if is_well else TIMINGS.probe_unsure
+        are_allowed = bool(verdicts) and set(verdicts.values()) == {"allowed"}
+        return TIMINGS.probe_pause if are_allowed else TIMINGS.probe_unsure
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
         """Return the verdict for each vehicle; empty if the two sessions share no router."""
@@ -128,11 +127,11 @@ class WritePermission:
             except ConnectError:
                 continue
             with reader:
-                if not (there := _routers_of(reader)) or not there <= routers:
+                if not (shared := _routers_of(reader)) or not shared <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
-                # A missing probe only counts if no link was lost during the check.
-                return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
+                # A missing probe message only counts if no link was lost during the check.
+                return verdicts if _routers_of(reader) == shared and _routers_of(self._session) == routers else {}
         return {}
 
 
@@ -144,6 +143,6 @@ def _routers_of(session: Session) -> set[str]:
         return set()
 
 
-def _name(vehicles: Sequence[str]) -> str:
+def _list_vehicles(vehicles: Sequence[str]) -> str:
     more = f" and {len(vehicles) - _MAX_NAMED} more" if len(vehicles) > _MAX_NAMED else ""
     return f"vehicle {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"

@@ -21,10 +21,10 @@ from nedbus.transport import (
     RouterState,
     Session,
     Verdict,
-    alive_keys,
     px4_publishers_key_expr,
     query,
     query_routers,
+    token_keys,
     translate_zenoh_errors,
 )
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
@@ -85,9 +85,9 @@ class Observation:
         self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
         self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        tokens = alive_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
+        tokens = token_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
         self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
-        tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
+        tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # nedbus bridges
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
@@ -95,7 +95,7 @@ class Observation:
                 # several publishers, or a storage, may answer
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
-        tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
+        tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add(take_messages())
         self.delays = dict.fromkeys(self.delays)  # these were buffered during the queries, and seem late

@@ -12,15 +12,15 @@ from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
-from nedbus.transport import UNKNOWN_AUTHORITY, Tls, check_pem, open_client, split_endpoint
+from nedbus.transport import UNKNOWN_CA, Tls, check_pem, open_client, split_endpoint
 
 from .finding import Finding, brief, worst_state
 
 _CONNECT_TIMEOUT: Final = 2.0  # s
-_PEM_FILES: Final = {"tls_ca": "the authority is", "tls_certificate": "this client is", "tls_key": ""}
+_PEM_FILES: Final = {"tls_ca": "the CA is", "tls_certificate": "this client is", "tls_key": ""}
 _ALERTS: Final = {  # by substring of OpenSSL's reason for a TLS alert
     "CERTIFICATE_REQUIRED": "it requires a client certificate, and none is given",
-    "UNKNOWN_CA": "it does not trust the authority that issued the client certificate",
+    "UNKNOWN_CA": "it does not trust the CA that issued the client certificate",
     "CERTIFICATE_EXPIRED": "the client certificate has expired, by the router's clock",
     "CERTIFICATE": "it rejects the client certificate",
     "": "it aborts the handshake",
@@ -89,8 +89,8 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
     validity, certificate = _check_validity("tls", endpoint, "the router presents", pem.encode())
     yield validity
     if tls is None:
-        advice = "pass the certificate of its authority with --tls-ca or NEDBUS_TLS_CA"
-        yield Finding("tls", endpoint, "wrong", "cannot verify the router: no authority is given", advice)
+        advice = "pass the certificate of its CA with --tls-ca or NEDBUS_TLS_CA"
+        yield Finding("tls", endpoint, "wrong", "cannot verify the router: no CA is given", advice)
         return
     try:
         with (
@@ -105,17 +105,17 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
             names = f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}" if certificate else ""
             seen = f"the router's certificate is not for {host}{names}"
             advice = f"connect to one of its hosts, or create a certificate: 'nedbus pki cert' with --host {host}"
-        elif exc.verify_code in UNKNOWN_AUTHORITY:
+        elif exc.verify_code in UNKNOWN_CA:
             issuer = f", but by {brief(certificate.issuer)}" if certificate else ""
-            seen = f"the router's certificate is not signed by the authority in {tls.ca}{issuer}"
-            advice = "pass its authority as --tls-ca, or check that the router is yours"
+            seen = f"the router's certificate is not signed by the CA in {tls.ca}{issuer}"
+            advice = "pass its CA as --tls-ca, or check that the router is yours"
         else:
             seen, advice = f"the router's certificate is not trusted: {exc.verify_message}", ""
         if advice or validity.state != "wrong":  # else the validity finding reports the same
             yield Finding("tls", endpoint, "wrong", seen, advice)
     except ssl.SSLError as exc:
         seen = next(text for name, text in _ALERTS.items() if name in (exc.reason or ""))
-        advice = "use --tls-certificate and --tls-key with a certificate signed by the router's authority"
+        advice = "use --tls-certificate and --tls-key with a certificate signed by the router's CA"
         yield Finding("tls", endpoint, "wrong", f"the router refuses this client: {seen}", advice)
 
 
@@ -136,7 +136,7 @@ def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls 
     try:
         if settings.tls is not None:
             settings.tls.zenoh_settings()
-            tls, advice = settings.tls, "use a certificate signed by the authority of the router"
+            tls, advice = settings.tls, "use a certificate signed by the CA of the router"
             reason = None if wrong else tls.explain()
     except ConfigError as exc:
         reason = exc.reason

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from nedbus.atomic_write import atomic_write
 from nedbus.errors import ConfigError
-from nedbus.whole_file import whole_file
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix
 
 from .certificate import CERTIFICATE_PREFIX, certificate_name
@@ -73,9 +73,9 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
         return "".join([block["begin"], *(f"{block['indent']}{line}\n" for line in next(sections)), block["end"]])
 
     try:
-        with whole_file(file, replace=True) as part:
-            part.write_text(_BLOCK.sub(fill, text), encoding="utf-8")
-            part.chmod(file.stat().st_mode)
+        with atomic_write(file, replace=True) as temporary:
+            temporary.write_text(_BLOCK.sub(fill, text), encoding="utf-8")
+            temporary.chmod(file.stat().st_mode)
     except OSError as exc:
         raise ConfigError.in_file(file, f"cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
 

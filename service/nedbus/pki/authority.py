@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKey
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from nedbus import clock
+from nedbus.atomic_write import atomic_write
 from nedbus.errors import PkiError
-from nedbus.whole_file import whole_file
 
 from .certificate import DAYS, MAX_NAME, Certificate
 
@@ -114,7 +114,7 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
         signed = _sign(_CA_NAME, authority.key.public_key(), authority.key, days)
         return _write_files(folder / "ca", signed, replace=True)
     if entry.problem == _FOREIGN:
-        raise PkiError(f"{entry.path} is {_FOREIGN}: renew it in the folder of that authority")
+        raise PkiError(f"{entry.path} is signed by another CA: renew it in the folder of that CA")
     # The private key may exist only on the vehicle, but the old certificate has the public key.
     key = new_key() if replace_key else None
     public_key = key.public_key() if key else load_certificate(entry.path).public_key()
@@ -179,10 +179,10 @@ def _write_files(
     written = {path: item for path, item in items.items() if item is not None}
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as opened:
-            parts = [opened.enter_context(whole_file(path, replace=replace)) for path in written]
-            for part, item in zip(parts, written.values(), strict=True):
-                write_new(part, item)
+        with ExitStack() as stack:
+            temporary = [stack.enter_context(atomic_write(path, replace=replace)) for path in written]
+            for path, item in zip(temporary, written.values(), strict=True):
+                write_new(path, item)
     except FileExistsError as exc:
         reason = "move it away, or choose another folder or name"
         raise PkiError(f"{exc.filename} exists and is not overwritten: {reason}") from exc
@@ -230,11 +230,11 @@ def _sign(
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
         builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if hosts:
-        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
+        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_general_name, hosts))), critical=False)
     return builder.sign(signer, hashes.SHA256())
 
 
-def _host(host: str) -> x509.GeneralName:
+def _general_name(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from nedbus.atomic_write import atomic_write
 from nedbus.errors import ConfigError, PkiError
 from nedbus.transport import check_endpoints
-from nedbus.whole_file import whole_file
 
 from .authority import Authority, new_key, write_new
 from .certificate import certificate_name
@@ -21,7 +21,7 @@ _TEMPLATES: Final = _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[
 
 
 class _Template(string.Template):
-    delimiter = "@"  # as $ is used by the shell and by Docker
+    delimiter = "@"  # the shell and Docker use $
 
 
 def make_bundle(
@@ -64,7 +64,7 @@ def make_bundle(
         "name": vehicle,
         "target": str(target),
     }
-    facts = {fact: json.dumps(value) for fact, value in strings.items()} | {
+    values = {field: json.dumps(value) for field, value in strings.items()} | {
         "vehicle": vehicle,
         "common_name": name,
         "pki": f"{target}/pki",
@@ -72,19 +72,19 @@ def make_bundle(
         "source": f"source = {json.dumps(list(sources))}\n" if sources else "",
         "until": f"{certificate.not_valid_after_utc:%Y-%m-%d}",
     }
-    part = output.with_name(f".{os.getpid()}-part-{output.name}")
+    temporary = output.with_name(f".{os.getpid()}-part-{output.name}")
     try:
-        with whole_file(folder / f"{name}.crt") as kept:
-            write_new(kept, certificate)
-            (part / "pki").mkdir(parents=True)
-            (part / "pki").chmod(0o700)
+        with atomic_write(folder / f"{name}.crt") as copy:
+            write_new(copy, certificate)
+            (temporary / "pki").mkdir(parents=True)
+            (temporary / "pki").chmod(0o700)
             for file, item in ((f"{name}.key", key), (f"{name}.crt", certificate), ("ca.crt", authority.certificate)):
-                write_new(part / "pki" / file, item)
+                write_new(temporary / "pki" / file, item)
             for file in ("nedbus.toml", "compose.yml", "README.txt"):
-                (part / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(facts))
-            part.rename(output)
+                (temporary / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(values))
+            temporary.rename(output)
     except OSError as exc:
         raise PkiError(f"cannot create {output}: {(exc.strerror or str(exc)).lower()}") from exc
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
     return sorted(path for path in output.rglob("*") if path.is_file())

@@ -13,9 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from nedbus.atomic_write import atomic_write
 from nedbus.errors import ConfigError, OutputError
 from nedbus.events import KINDS, SEVERITIES, Event, Severity, Times, format_utc, spans_of, unit_of
-from nedbus.whole_file import whole_file
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
 
@@ -93,7 +93,7 @@ def draw(
     if Path(path).suffix.lower() not in _SUFFIXES:
         raise ConfigError(str(path), f"not an image format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
-        with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
+        with atomic_write(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
             figure = draw_figure(streams, title=title, events=events, times=times)
             figure.savefig(part)  # a glyph that the font lacks is only a warning
     except OSError as exc:

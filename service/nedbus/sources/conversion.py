@@ -8,9 +8,9 @@ from typing import Final
 from pydantic import ValidationError
 
 from nedbus import recording
+from nedbus.atomic_write import atomic_write
 from nedbus.errors import OutputError
 from nedbus.log_event import about
-from nedbus.whole_file import whole_file
 from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
 
 from .source import ReplayRun
@@ -33,7 +33,7 @@ def convert(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[i
     """
     recording.check_recording(path)
     try:
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             return _write(run, part, source=source, on_progress=on_progress)
     except OSError as exc:
         cause = exc.__cause__ if isinstance(exc, OutputError) else exc

@@ -1,7 +1,7 @@
 """Zenoh transport: sessions, routers, TLS, queries, liveliness tokens, and the keys of rmw_zenoh."""
 
-from .alive_tokens import AliveTokens, alive_keys
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
+from .liveliness import LivelinessTokens, token_keys
 from .queries import MAX_REPLIES, Replies, query, send_query, wait_for_replies
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
@@ -28,6 +28,6 @@ from .session import (
     translate_error,
     translate_zenoh_errors,
 )
-from .tls import UNKNOWN_AUTHORITY, Tls, check_pem
+from .tls import UNKNOWN_CA, Tls, check_pem
 from .write_probe import Verdict, probe_writes
 from .zenoh_ext import Heartbeats, RetransmitRequest, follow_heartbeats, heartbeat_key, heartbeat_payload

@@ -33,7 +33,7 @@ def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
     return found["protocol"], found["host"].strip("[]"), int(found["port"])
 
 
-def explain_endpoints(endpoints: Sequence[str]) -> str | None:
+def resolution_error(endpoints: Sequence[str]) -> str | None:
     """Return an error text if name resolution fails for all endpoints, else None."""
     hosts = []
     for parts in map(split_endpoint, endpoints):

@@ -29,26 +29,26 @@ _PAUSES: Final = (0.0005, 0.01)  # s between polls for replies: first and longes
 
 
 class Replies:
-    """The replies to one query, polled by the thread that sent it."""
+    """The replies to one query. Not thread-safe."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
-        self.ended = False  # every reply was taken: all queryables have replied, or the timeout has passed
+        self.ended = False  # no more replies: all queryables have replied, or the timeout has passed
         self.failed = False  # at least one reply was an error, such as a timeout
         self._handler = handler
         self._end = time.monotonic() + timeout + _GRACE
 
-    def take(self) -> list[zenoh.Reply]:
+    def poll(self) -> list[zenoh.Reply]:
         """Return the replies received since the last call."""
-        taken: list[zenoh.Reply] = []
+        received: list[zenoh.Reply] = []
         try:
-            while len(taken) < MAX_REPLIES and (reply := self._handler.try_recv()) is not None:
-                taken.append(reply)
+            while len(received) < MAX_REPLIES and (reply := self._handler.try_recv()) is not None:
+                received.append(reply)
                 self.failed |= reply.ok is None
             if time.monotonic() > self._end:
                 self.ended = self.failed = True
         except zenoh.ZError:  # empty and closed
             self.ended = True
-        return taken
+        return received
 
 
 def send_query(session: Session, selector: str, *, timeout: float, capacity: int = 1024, **options: Any) -> Replies:
@@ -68,28 +68,28 @@ def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]
 
     At most 10,000 replies and 64 MB in total are accepted; the number of replies beyond that is logged.
     """
-    kept: list[RawSample] = []
+    accepted: list[RawSample] = []
     size = dropped = 0
     replies = wait_for_replies([send_query(session, selector, timeout=timeout)])
     for sample in filter(None, (reply.ok for reply in replies)):
         size += len(sample.payload) + len(str(sample.key_expr))
-        if size > MAX_QUERY_BYTES or len(kept) >= MAX_REPLIES:
+        if size > MAX_QUERY_BYTES or len(accepted) >= MAX_REPLIES:
             dropped += 1
         else:
-            kept.append(sample)
+            accepted.append(sample)
     if dropped:
         text = "%s: dropped %d replies beyond the limits of a query"
         _log.warning(text, selector, dropped, extra=about("incomplete"))
-    return kept
+    return accepted
 
 
 def wait_for_replies(queries: Sequence[Replies]) -> Iterator[zenoh.Reply]:
     """Yield replies as they arrive, until all queries have ended."""
     pause, longest = _PAUSES
     while pending := [replies for replies in queries if not replies.ended]:
-        taken = [reply for replies in pending for reply in replies.take()]
-        yield from taken
-        if not taken:
+        received = [reply for replies in pending for reply in replies.poll()]
+        yield from received
+        if not received:
             time.sleep(pause)
             pause = min(2 * pause, longest)
 

@@ -21,7 +21,7 @@ NO_HASH: Final = "TypeHashNotSupported"  # in place of a hash, in keys of ROS 2 
 BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # marks messages from nedbus, to prevent loops; ROS 2 ignores it
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10, as PX4 publishes
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
-_GID: Final = 16
+_GID: Final = 16  # bytes
 _MAX_KEY: Final = 512  # characters; twice the longest keys of PX4 and ROS 2
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
@@ -97,14 +97,14 @@ class PublisherToken:
         """Parse the token of a publisher; raise DecodeError for anything else."""
         parts = text.split("/")
         if len(parts) != 13 or parts[0] != "@ros2_lv" or parts[5] != "MP" or len(text) > LONGEST_TOKEN:
-            raise DecodeError("a liveliness token that is not that of a publisher")
+            raise DecodeError("a liveliness token that does not belong to a publisher")
         _, domain, session, _, _, _, _, _, node, topic, dds_type, type_hash, _ = parts
         name = topic.replace("%", "/").strip("/")
         return cls(text, session, node, TopicKey.parse(f"{domain}/{name}/{dds_type}/{type_hash}"))
 
     @property
     def gid(self) -> bytes | None:
-        """The gid of its messages, parsed from the node name of PX4, else None; all simulated PX4s share one."""
+        """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same."""
         found = _PX4_NODE.fullmatch(self.node)
         return bytes.fromhex(found[1]) if found else None
 

@@ -1,4 +1,4 @@
-"""Embedded Zenoh router, with default settings or a configuration file of `zenohd`, and the state of all routers."""
+"""Embedded Zenoh router, with default settings or a configuration file of `zenohd`; state of reachable routers."""
 
 import json
 import logging
@@ -72,7 +72,7 @@ def open_router(
         config = _read_config(config_file)
         if plugins := _get(config, "plugins"):
             text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
-            _log.warning(text, config_file, _names(plugins), extra=about("router"))
+            _log.warning(text, config_file, _plugin_names(plugins), extra=about("router"))
         for name, file in _tls_files(config).items():  # as Zenoh does not name the file in its error
             if not os.access(file, os.R_OK):
                 reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
@@ -87,14 +87,14 @@ def open_router(
     metadata = _get(config, "metadata")
     if metadata is None or isinstance(metadata, dict):  # any JSON value is allowed
         insert_settings(config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata")
-    allow_sessions(sessions)
+    raise_file_limit(sessions)
     try:
         return open_session(config)
     except zenoh.ZError as exc:
         raise ListenError(router_endpoints(listen, config_file), error_reason(exc)) from exc
 
 
-def allow_sessions(sessions: int) -> None:
+def raise_file_limit(sessions: int) -> None:
     """Raise the soft limit of open files to the hard limit; each session of a router is an open file.
 
     At the limit a router stops accepting connections without an error. A warning is logged if the limit is too low.
@@ -159,12 +159,12 @@ def _read_config(path: Path) -> zenoh.Config:
     config = _parse_config(path)
     plugins = _get(config, "plugins").items()
     if required := [name for name, settings in plugins if settings and settings.get("__required__")]:
-        reason = f"it requires {_names(required)}, but this router loads no plugins: run it with zenohd -c"
+        reason = f"it requires {_plugin_names(required)}, but this router loads no plugins: run it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
 
 
-def _names(plugins: Iterable[str]) -> str:
+def _plugin_names(plugins: Iterable[str]) -> str:
     return " and ".join(f"plugin {name}" for name in plugins)
 
 
@@ -213,12 +213,12 @@ def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
     """
     replies = query(session, "@/*/router", timeout=timeout)
     small = (reply for reply in replies if len(reply.payload) <= _MAX_STATE_BYTES)
-    states = filter(None, (read_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small))
+    states = filter(None, (parse_state(str(reply.key_expr), reply.payload.to_bytes()) for reply in small))
     by_zid = {state.zid: state for state in states}
     return [by_zid[zid] for zid in sorted(islice(by_zid, _MAX_ROUTERS))]
 
 
-def read_state(key: str, payload: bytes) -> RouterState | None:
+def parse_state(key: str, payload: bytes) -> RouterState | None:
     """Parse a reply of the admin space; return None if it is malformed, as any peer may reply."""
     found = _ADMIN_KEY.fullmatch(key)
     try:

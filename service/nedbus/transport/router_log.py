@@ -27,7 +27,9 @@ _log = logging.getLogger(__name__)
 _LINK_TIMEOUT: Final = 3.0  # s before a link that does not come up is logged
 _EXIT_TIMEOUT: Final = 1.0  # s; a child process may hold the pipe open
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
-_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # only those of a listener have a hint
+_REFUSED: Final = re.compile(
+    r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: "
+)  # only warnings of a listener have a hint
 _REASONS: Final = {  # by substring of Zenoh's text
     "certificate expired": "its certificate has expired",
     "BadSignature": "its certificate is signed by another CA",
@@ -78,7 +80,7 @@ class Uplinks:
                 _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link_lost"))
 
     def _is_linked(self, endpoint: str, dialled: Sequence[str]) -> bool:
-        """Return whether an endpoint is dialled; hosts are compared only if several endpoints share its port."""
+        """Return whether a link to an endpoint is open; compare hosts only if several endpoints share its port."""
         protocol, host, port = split_endpoint(endpoint) or (endpoint, "", 0)
         hosts = {each[1] for each in map(split_endpoint, dialled) if each and each[::2] == (protocol, port)}
         if not hosts or sum(each[::2] == (protocol, port) for each in map(split_endpoint, self._states) if each) == 1:

@@ -18,7 +18,7 @@ import zenoh
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 from nedbus.timings import TIMINGS
 
-from .endpoints import check_endpoints, explain_endpoints
+from .endpoints import check_endpoints, resolution_error
 from .tls import Tls
 
 Session = zenoh.Session
@@ -106,7 +106,7 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # For most failures Zenoh reports only "Unable to connect".
-    cause = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
+    cause = resolution_error(endpoints) or (tls.explain() if tls is not None else None)
     if not cause and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
         cause = "no certificate given: routers with mutual TLS require one (tls_certificate, tls_key)"
     raise ConnectError(endpoints, timeout, cause or ("" if "Unable to connect" in reason else reason))

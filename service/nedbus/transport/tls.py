@@ -11,12 +11,12 @@ from nedbus import clock
 from nedbus.errors import ConfigError
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
-UNKNOWN_AUTHORITY: Final = (7, 18, 19, 20, 21)
+UNKNOWN_CA: Final = (7, 18, 19, 20, 21)
 """OpenSSL's verification codes for a certificate that was signed by another CA."""
 _VERIFY_REASONS: Final = {  # by verification code of OpenSSL
     9: "or its CA is not valid yet: check the clock of this host",
     10: "or its CA has expired",
-    **dict.fromkeys(UNKNOWN_AUTHORITY, "is not signed by the CA in tls_ca"),
+    **dict.fromkeys(UNKNOWN_CA, "is not signed by the CA in tls_ca"),
 }
 
 
@@ -67,23 +67,23 @@ class Tls:
     def explain(self) -> str | None:
         """Return the reason why a router would reject these files, such as an expired certificate; else None.
 
-        Needs neither network nor other packages: performs a handshake in memory, with a server that trusts the CA.
+        Performs a TLS handshake in memory, with a server that trusts the CA.
         """
         try:
-            own, authority = self.context(), self.context(server=True)
+            ours, peer = self.context(), self.context(server=True)
         except OSError:
             return f"{self.ca} is not a CA certificate"
         if self.certificate is None:
-            if not authority.get_ca_certs():
+            if not peer.get_ca_certs():
                 return f"{self.ca} is not a CA certificate: it cannot sign others"
-            until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
+            until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in peer.get_ca_certs())
             return f"{self.ca} has expired" if until < clock.utc() else None
-        own.check_hostname = False
-        own.verify_mode = ssl.CERT_NONE  # the server is this process
-        authority.verify_mode = ssl.CERT_REQUIRED
+        ours.check_hostname = False
+        ours.verify_mode = ssl.CERT_NONE  # the server is this process
+        peer.verify_mode = ssl.CERT_REQUIRED
         to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-        client = own.wrap_bio(to_client, to_server)
-        server = authority.wrap_bio(to_server, to_client, server_side=True)
+        client = ours.wrap_bio(to_client, to_server)
+        server = peer.wrap_bio(to_server, to_client, server_side=True)
         for side in (client, server, client, server):  # the steps of a handshake
             try:
                 side.do_handshake()

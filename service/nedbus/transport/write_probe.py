@@ -1,7 +1,7 @@
 """Probe for write permission, as Zenoh drops forbidden messages without an error at the sender.
 
 One session subscribes to keys of the vehicles that are not topics, and another session publishes on them. The publisher
-has a matching subscriber once the router has announced it; a match without a received message means denied.
+has a matching subscriber once the router has announced it; if no message arrives then, the router denies it.
 """
 
 import secrets

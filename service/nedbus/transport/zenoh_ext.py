@@ -26,7 +26,7 @@ _SPARE: Final = 64  # slots for unexpected replies of other publishers
 
 
 def heartbeat_key(key: str, publisher: str) -> str:
-    """Return the key of heartbeats and cache of a publisher, which is named by `entity_name`."""
+    """Return the key of the heartbeats and the cache of a publisher, given by its `entity_name`."""
     return f"{key}/@adv/pub/{publisher.replace(':', '/')}/_"
 
 
@@ -61,10 +61,10 @@ def _parse_key(heartbeat: str) -> tuple[str, str] | None:
 
 
 class RetransmitRequest:
-    """A retransmission request to the cache of one advanced publisher, by sequence numbers; used by one thread.
+    """A request to the cache of one advanced publisher to retransmit samples. Not thread-safe.
 
-    `publisher`: its name from `entity_name`. The key has no wildcards, so a router looks it up instead of matching it
-    against the queryables of all publishers.
+    `publisher`: its `entity_name`; `numbers`: sequence numbers. The key has no wildcards, so a router looks it up
+    instead of matching it against the queryables of all publishers.
     """
 
     def __init__(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> None:
@@ -76,13 +76,13 @@ class RetransmitRequest:
 
     @property
     def ended(self) -> bool:
-        """True once all replies were taken, or the timeout has passed."""
+        """True once all replies were returned, or the timeout has passed."""
         return self._replies.ended
 
-    def take(self) -> dict[int, RawSample]:
+    def poll(self) -> dict[int, RawSample]:
         """Return the samples received since the last call, by sequence number."""
         samples: dict[int, RawSample] = {}
-        for sample in filter(None, (reply.ok for reply in self._replies.take())):
+        for sample in filter(None, (reply.ok for reply in self._replies.poll())):
             info = sample.source_info
             if info is None or info.source_sn not in self._numbers or str(sample.key_expr) != self._key:
                 continue

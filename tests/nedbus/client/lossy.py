@@ -41,7 +41,7 @@ class Lossy:
     def request(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
         self.requests.append((key, numbers.start, numbers.stop))
         if len(self.requests) <= self.unanswered:
-            return SimpleNamespace(ended=True, take=dict)
+            return SimpleNamespace(ended=True, poll=dict)
         self.open += 1
         self.max_open = max(self.max_open, self.open)
         return CountedRequest(RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self)
@@ -54,8 +54,8 @@ class CountedRequest:
         self._answers = answers
         self._lossy = lossy
 
-    def receive_timestamps(self) -> dict[int, RawSample]:
-        had_ended, taken = self._answers.ended, self._answers.take()
+    def poll(self) -> dict[int, RawSample]:
+        had_ended, taken = self._answers.ended, self._answers.poll()
         self._lossy.open -= self._answers.ended and not had_ended
         return taken
 

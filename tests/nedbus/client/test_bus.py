@@ -24,7 +24,7 @@ import zenoh
 import nedbus
 from nedbus import Mode
 from nedbus.timings import Timings
-from nedbus.transport import Session, alive_tokens, open_router
+from nedbus.transport import Session, liveliness, open_router
 from nedbus.transport.queries import Replies
 from nedbus_msgs import DEFAULT, Address
 from tests.flights.local_position import encode
@@ -146,8 +146,8 @@ def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkey
         queried.extend([key_expr] if "*" in key_expr else [])
         return original(session, key_expr, timeout)
 
-    original = alive_tokens._query_tokens
-    monkeypatch.setattr(alive_tokens, "_query_tokens", record_query)
+    original = liveliness._query_tokens
+    monkeypatch.setattr(liveliness, "_query_tokens", record_query)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
             other.publisher("estimator_local_position", vehicle=vehicle, instance=2)
@@ -163,7 +163,7 @@ def test_vehicles_are_listed_again_after_an_overflow(
     endpoint: str, bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If too many tokens change between calls, all are listed again: the list is complete, without closed vehicles."""
-    monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 20)
+    monkeypatch.setattr(liveliness, "_MAX_CHANGES", 20)
     gone = zenoh_session.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first vehicle")
     gone.undeclare()
@@ -179,7 +179,7 @@ def test_vehicles_beyond_the_limit_are_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A list truncated at the limit is incomplete, which is logged once; it is complete once all vehicles fit."""
-    monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 2)
+    monkeypatch.setattr(liveliness, "MAX_REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with nedbus.connect(endpoint) as other:
@@ -397,7 +397,7 @@ def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> No
     assert not isinstance(error.value, nedbus.AddressError)
     with pytest.raises(nedbus.AddressError, match="vehicle"):
         client.latest(vehicle="a/b")
-    with pytest.raises(nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .*a call for each of several"):
+    with pytest.raises(nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .*call once per vehicle"):
         client.subscribe(vehicle=["1", "2"])  # type: ignore[call-overload] # the mistake under test
     with pytest.raises(nedbus.AddressError, match="instance"):
         client.publisher("estimator_local_position", vehicle="1")

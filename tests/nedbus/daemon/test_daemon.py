@@ -87,7 +87,7 @@ def test_plain_zenoh_reader_receives_every_message(run_nedbus: Start, endpoint: 
         subscriber = session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(2000))
         source = f"ulog:{path}?speed=max&wait=1&topics=VehicleLocalPosition"
         service = run_nedbus("serve", "-c", endpoint, "--until-done", "-s", source)
-        samples = take(subscriber.handler, 1871)
+        samples = receive_samples(subscriber.handler, 1871)
         assert service.wait() == 0, service.err
     encodings = {str(sample.encoding) for sample in samples}
     missing = FIELD_TYPES.keys() - {*LAYOUTS["1.13"].fields, "hagl_max_z", "hagl_max_xy"}
@@ -101,7 +101,7 @@ def test_plain_zenoh_reader_receives_every_message(run_nedbus: Start, endpoint: 
     assert received == expected_rows(path)
 
 
-def take(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[zenoh.Sample]:
+def receive_samples(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[zenoh.Sample]:
     """Wait for a number of samples, and return them."""
     samples: list[zenoh.Sample] = []
 
@@ -198,9 +198,9 @@ def test_invalid_message_is_rejected_counted_and_reported(
     listener = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.RingChannel(10))
     service = run_nedbus("serve", "-c", endpoint, "-s", f"ulog:{path}?wait=1")
     with bus.subscribe(VLP, mode="every") as subscription:
-        taken = [subscription.receive(DEADLINE).message.timestamp for _ in range(8)]
-    assert taken == [0, 1, 2, 5, 6, 7, 8, 9]
-    report, _ = [json.loads(sample.payload.to_bytes()) for sample in take(listener.handler, 2)]
+        received = [subscription.receive(DEADLINE).message.timestamp for _ in range(8)]
+    assert received == [0, 1, 2, 5, 6, 7, 8, 9]
+    report, _ = [json.loads(sample.payload.to_bytes()) for sample in receive_samples(listener.handler, 2)]
     assert "z: must be finite while z_valid is true" in report["reason"]
     assert (report["fields"]["timestamp"], report["fields"]["z"]) == (3, "NaN")
     assert source_of(bus).rejected == 2

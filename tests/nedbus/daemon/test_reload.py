@@ -42,7 +42,7 @@ def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(VLP, mode="every") as subscription:
         times: dict[str, list[int]] = {}
 
-        def take_until(vehicle: str) -> None:
+        def receive_until(vehicle: str) -> None:
             begin = time.time_ns()
             while True:
                 sample = subscription.receive(DEADLINE)
@@ -51,14 +51,14 @@ def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path
                     return
 
         for number in range(1, 11):
-            take_until("0")
+            receive_until("0")
             write_settings(file, [*vehicles, "guest"] if number % 2 else vehicles)
             changed = "1 started, 0 stopped" if number % 2 else "0 started, 1 stopped"
             assert f"{changed}, 10 unchanged" in reload(service, number)
             if number % 2:
-                take_until("guest")
+                receive_until("guest")
         for vehicle in vehicles:
-            take_until(vehicle)
+            receive_until(vehicle)
         assert subscription.counts.lost == subscription.counts.dropped == 0
     assert times.keys() == {*vehicles, "guest"}
     for vehicle in vehicles:

@@ -412,14 +412,14 @@ def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
 
 
 def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
-    """Subject, hosts, issuer and expiry of the certificates of router, client and authority are reported."""
+    """Subject, hosts, issuer and expiry of the certificates of router, client and CA are reported."""
     findings = diagnose(run_router(), run_router("router-soon"), tls=tls_settings(pki, "reader"))
     assert has_no_faults(findings), findings
     router = r"the router presents router for 127\.0\.0\.1, localhost, issued by nedbus CA, valid until 20\d\d-"
     find(findings, "tls", "ok", router)
     find(findings, "tls", "warning", r"the router presents router-soon.*\d+ days left")
     find(findings, "certificate", "ok", "this client is reader, issued by nedbus CA")
-    find(findings, "certificate", "ok", "the authority is nedbus CA")
+    find(findings, "certificate", "ok", "the CA is nedbus CA")
 
 
 @pytest.mark.parametrize(
@@ -427,7 +427,7 @@ def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
     [
         (("router-expired", "reader", "ca.crt"), {"tls": "the router presents router-expired .*has expired"}),
         (("router-elsewhere", "reader", "ca.crt"), {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"}),
-        (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the authority in .*, but by nedbus CA"}),
+        (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the CA in .*, but by nedbus CA"}),
         (("router", None, "ca.crt"), {"tls": "it requires a client certificate, and none is given"}),
         (
             ("router", "expired", "ca.crt"),
@@ -455,13 +455,13 @@ def test_invalid_certificate_is_wrong(
 def test_wrong_protocol_and_wrong_tls_files_are_found(
     run_router: Run, pki: Path, endpoint: str, timings: Timings
 ) -> None:
-    """TLS to a TCP port, TCP to a TLS port, a missing authority, and a key of another certificate are wrong."""
+    """TLS to a TCP port, TCP to a TLS port, a missing CA, and a key of another certificate are wrong."""
     timings.doctor_open = 0.1
     secure = run_router()
     findings = diagnose(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
     find(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
     find(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
-    find(findings, "tls", "wrong", f"{secure}: .*no authority is given")
+    find(findings, "tls", "wrong", f"{secure}: .*no CA is given")
     for files, reason in (
         ({**tls_settings(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),

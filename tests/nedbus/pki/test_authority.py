@@ -49,16 +49,16 @@ CONFIG = certificates.CONFIG / "router-secure.json5"
 FLEET = [str(number) for number in range(1, 201)]
 SAMPLE = ("1", "99", "200")
 
-made = certificates.pki
+shared_pki = certificates.pki
 Join = Callable[..., nedbus.Bus]
 RunRouter = Callable[[Path], Callable[[], None]]
 
 
 @pytest.fixture
-def pki(made: Path, tmp_path: Path) -> Path:
+def pki(shared_pki: Path, tmp_path: Path) -> Path:
     """Copy a CA with certificates of routers, vehicles and readers, which the test may modify."""
     invalid = shutil.ignore_patterns("foreign", "*expired*", "router-soon*", "router-elsewhere*")
-    return Path(shutil.copytree(made, tmp_path / "pki", ignore=invalid))
+    return Path(shutil.copytree(shared_pki, tmp_path / "pki", ignore=invalid))
 
 
 @pytest.fixture
@@ -324,7 +324,7 @@ def test_renew_replaces_expiring_certificates_only(tmp_path: Path) -> None:
     assert (out, "no certificate expires within 30 days" in err) == ([], True)
     pki_command(0, "renew", str(folder), "operator", "--new-key", "--days", "10")
     assert states()["operator"] == ("client", "expires soon")
-    for name, reason in (("nobody", "has no certificate of 'nobody'"), ("alien", "in the folder of that authority")):
+    for name, reason in (("nobody", "has no certificate of 'nobody'"), ("alien", "in the folder of that CA")):
         assert reason in pki_command(1, "renew", str(folder), name)[1]
     assert [line.split()[0] for line in pki_command(0, "list", str(folder))[0]][:2] == ["NAME", "ca"]
 

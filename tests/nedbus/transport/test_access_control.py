@@ -76,7 +76,7 @@ def open_as(secure: str, pki: Path) -> Iterator[Open]:
         yield lambda name: opened.enter_context(open_client([secure], tls=client_tls(pki, name), timeout=DEADLINE))
 
 
-def test_reader_receives_everything_of_a_vehicle(join: Join) -> None:
+def test_reader_receives_all_data_of_a_vehicle(join: Join) -> None:
     """Data, liveliness, last values, recovery and acknowledgements work through the secure router."""
     publisher = join("vehicle-1").publisher(VLP, vehicle="1")
     publisher.publish(message(1))
@@ -351,7 +351,7 @@ def test_downsampled_stream_passes_the_secure_router(
 
 
 PERMISSION: Final = "nedbus.daemon.write_permission."
-SOON: Final = Timings(
+SHORT_TIMINGS: Final = Timings(
     probe_first=(0.1, 0.3), probe_confirm=0.3, probe_poll=0.3, probe=0.3, probe_unsure=0.3, probe_pause=0.3
 )
 
@@ -372,7 +372,7 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
 
     router, pages = start_router(), HttpClient(free_port())
     options = (*tls_options(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
-    service = start_with_timings(start, SOON, "serve", "-c", endpoint, *options)
+    service = start_with_timings(start, SHORT_TIMINGS, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses vehicle 2\n")
     wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
     assert (pages.request("/healthz"), pages.request("/readyz")) == (refused, refused)

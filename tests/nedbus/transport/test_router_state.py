@@ -26,7 +26,7 @@ from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import RouterState, Session, open_client, open_router, query_routers, read_router_config, router
-from nedbus.transport.router import allow_sessions, read_state
+from nedbus.transport.router import parse_state, raise_file_limit
 from tests.peers.certificates import CONFIG
 from tests.peers.certificates import write_config as write_shipped
 from tests.peers.ports import free_endpoint
@@ -146,17 +146,17 @@ def test_malformed_router_file_raises(tmp_path: Path) -> None:
 )
 def test_malformed_state_replies_are_ignored(key: str, answer: bytes) -> None:
     """A reply is ignored unless it has a session list and a key with a Zenoh id of at most 32 hexadecimal digits."""
-    assert read_state(key, answer) is None
+    assert parse_state(key, answer) is None
 
 
 @pytest.mark.parametrize("limit", [True, False, 0, -1, 0.5, 1e3, "1000", None, [1000], {}, 2**33])
 def test_invalid_session_limit_is_unknown(limit: object) -> None:
     """With an invalid limit the sessions are reported, and the limit is None."""
     answer = json.dumps({"sessions": [{}, {}], "metadata": {"max_sessions": limit}}).encode()
-    assert read_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
+    assert parse_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
     for metadata in (limit, [limit], None):
         answer = json.dumps({"sessions": [{}, {}], "metadata": metadata}).encode()
-        assert read_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
+        assert parse_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
 
 
 def test_large_and_many_state_replies_are_bounded(
@@ -337,7 +337,7 @@ def test_soft_limit_of_open_files_is_raised(
     """The soft limit is raised to the hard limit; a warning is logged if that is too low."""
     monkeypatch.setattr(router, "resource", fake)
     with caplog.at_level(logging.WARNING):
-        allow_sessions(1000)
+        raise_file_limit(1000)
     assert fake.limits[0] == soft
     assert bool(caplog.records) is warns
     if warns:

@@ -92,6 +92,8 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
     if as_json:
         write(json.dumps(rows, indent=2))
         return
+    for row in rows:
+        row |= {name: row[name].replace("authority", "CA") for name in ("use", "state")}
     cells = [
         [row["name"], row["use"], row["until"][:10], str(row["days_left"]), ", ".join([row["state"], *row["hosts"]])]
         for row in rows

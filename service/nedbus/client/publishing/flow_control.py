@@ -94,7 +94,7 @@ class _Request:
     def poll(self, now: float) -> bool:
         """Receive replies; return True once all readers have replied or left."""
         for query in self.queries.copy():
-            for reply in query.take():
+            for reply in query.poll():
                 if reply.ok is None:  # timeout
                     self.queries.discard(query)
                     continue

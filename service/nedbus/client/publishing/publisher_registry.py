@@ -17,7 +17,7 @@ from nedbus.client.discovery import VehicleDirectory
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
-from nedbus.transport import Session, alive_keys, translate_zenoh_errors
+from nedbus.transport import Session, token_keys, translate_zenoh_errors
 from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
 
 from .downsampler import MatchingListener
@@ -116,7 +116,7 @@ class PublisherRegistry:
 
         After a query for the session's own token, Zenoh 1.10 sometimes lists that token forever.
         """
-        alive_keys(self._session, f"{self.prefix}/{address.vehicle}/@alive", timeout=_TOKENS_TIMEOUT)
+        token_keys(self._session, f"{self.prefix}/{address.vehicle}/@alive", timeout=_TOKENS_TIMEOUT)
 
     def has_subscriber(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""

@@ -18,7 +18,7 @@ from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
-from nedbus.transport import AliveTokens, RawSample, Session, send_query
+from nedbus.transport import LivelinessTokens, RawSample, Session, send_query
 from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key, get_topic
 
 from .decoder import Arrival, Decoder, detach
@@ -85,7 +85,7 @@ class MaxRateReceiver(Receiver):
     def __init__(self, session: Session, queue: MaxRateQueue) -> None:
         self._prefix, self._rate_queue, selection = queue.decoder.prefix, queue, queue.selection
         self._awaiting: dict[Address, float] = {}  # time at which the token of a stream without a message appeared [s]
-        self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=self._prefix))
+        self._tokens = LivelinessTokens(session, selection.alive_key_expr(prefix=self._prefix))
         self._last = send_query(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
         super().__init__(session, queue, history=False)
         self._undeclares.append(self._tokens.undeclare)
@@ -94,7 +94,7 @@ class MaxRateReceiver(Receiver):
     def _poll(self, now: float) -> float:
         pause = super()._poll(now)
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
-            found = [reply.ok for reply in self._last.take() if reply.ok is not None]
+            found = [reply.ok for reply in self._last.poll() if reply.ok is not None]
             # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
                 self._rate_queue.put_last(live)
@@ -102,7 +102,7 @@ class MaxRateReceiver(Receiver):
         return pause if self._last.ended else min(pause, _LAST_POLL)
 
     def _check_publishers(self, now: float) -> None:
-        for token, alive in self._tokens.take():
+        for token, alive in self._tokens.poll():
             with suppress(AddressError):  # not a nedbus key
                 address = address_of_alive_key(token, prefix=self._prefix)
                 topic = get_topic(address.topic)

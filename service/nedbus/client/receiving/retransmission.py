@@ -77,7 +77,7 @@ class Retransmission:
             self._undeclare()
 
     def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
-        found = {number: raw for number, raw in answers.take().items() if len(raw.payload) <= PAYLOAD_LIMIT}
+        found = {number: raw for number, raw in answers.poll().items() if len(raw.payload) <= PAYLOAD_LIMIT}
         ended, key = answers.ended, writer.stream.wire_key
         if ended:
             del self._open[writer]

@@ -22,8 +22,8 @@ from nedbus.transport import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
     PX4_TYPES,
-    AliveTokens,
     Attachment,
+    LivelinessTokens,
     PublisherToken,
     Session,
     Tls,
@@ -96,7 +96,7 @@ class Px4ZenohNode:
     def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
         self._session, self._streams = session, streams
         self._pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        self._tokens = AliveTokens(session, px4_publishers_key_expr(domain))
+        self._tokens = LivelinessTokens(session, px4_publishers_key_expr(domain))
         self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
         self._subscriptions: dict[TopicKey, zenoh.LivelinessToken] = {}
@@ -123,7 +123,7 @@ class Px4ZenohNode:
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=TIMINGS.source_tick)
-            for token, alive in self._tokens.take():  # declared before the sample was sent
+            for token, alive in self._tokens.poll():  # declared before the sample was sent
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
             if (now := time.monotonic()) >= next_report:

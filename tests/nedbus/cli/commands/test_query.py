@@ -18,7 +18,7 @@ from nedbus.cli.commands.pki import pki
 from nedbus.client import Subscription
 from nedbus.settings import Settings
 from nedbus.timings import Timings
-from nedbus.transport import alive_tokens, open_router
+from nedbus.transport import liveliness, open_router
 from nedbus_msgs import ANY
 from tests.flights.local_position import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
@@ -91,7 +91,7 @@ def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
 
 def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """If replies are missing, the list shows the others with a warning and exits with 1."""
-    monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 1)
+    monkeypatch.setattr(liveliness, "MAX_REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1
@@ -103,7 +103,7 @@ def test_late_list_is_not_reported_as_empty(
     bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """Before the router has replied, `list` does not claim that no vehicle is published."""
-    monkeypatch.setattr(alive_tokens.AliveTokens, "take", lambda _: [])
+    monkeypatch.setattr(liveliness.LivelinessTokens, "poll", lambda _: [])
     timings.list_timeout = 0.01
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1

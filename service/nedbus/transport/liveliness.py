@@ -18,24 +18,24 @@ from .session import Session, translate_zenoh_errors
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 131_072  # replies; large, as Zenoh holds its session lock while it waits for a free slot
-_MAX_CHANGES: Final = 16_384  # queued changes, more than the tokens that are kept
+_MAX_CHANGES: Final = 16_384  # queued changes; more than the tokens stored
 _MAX_KEY_LENGTH: Final = MAX_QUERY_BYTES // MAX_REPLIES
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
 
 
-def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
+def token_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of matching liveliness tokens, unique and sorted, at most 10,000."""
     replies = wait_for_replies([_query_tokens(session, key_expr, timeout)])
     return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_REPLIES]
 
 
-class AliveTokens:
-    """The liveliness tokens that match a key expression; used by one thread.
+class LivelinessTokens:
+    """The liveliness tokens that match a key expression. Not thread-safe.
 
     A router sends a new subscriber all tokens at once, then each change. The time for the list grows with the square of
     its length: a second for 4,000 tokens. A query on a key without a token (the probe) marks the end of the list, as
-    its reply follows the tokens. An overflow of the queue of changes causes a new subscription. At most 10,000 tokens
-    are kept; a warning is logged if there are more.
+    its reply follows the tokens. If the queue of changes overflows, the tokens are subscribed again. At most 10,000 are
+    stored; a warning is logged if there are more.
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
@@ -48,7 +48,7 @@ class AliveTokens:
 
     @property
     def complete(self) -> bool:
-        """True if the last `take` completed the list of tokens."""
+        """True if all matching tokens are known."""
         return not self.is_listing and self._retry == math.inf
 
     @property
@@ -60,11 +60,11 @@ class AliveTokens:
         """End the subscription."""
         self._subscriber.undeclare()
 
-    def take(self) -> list[tuple[str, bool]]:
-        """Return the changes since the last call, in order: the key of a token, and True if it appeared."""
+    def poll(self) -> list[tuple[str, bool]]:
+        """Return the changes since the last call, in order: the key of a token, and True if it was declared."""
         is_listed = False
         if self._probe is not None:  # read before the changes, as its reply follows all tokens
-            self._probe.take()
+            self._probe.poll()
             is_listed = self._probe.ended and not self._probe.failed
             if self._probe.ended:
                 self._probe = self._send_probe() if self._probe.failed else None

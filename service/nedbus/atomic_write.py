@@ -1,4 +1,4 @@
-"""Atomic file writes: the complete file or nothing."""
+"""Atomic file writes."""
 
 import errno
 import os
@@ -8,10 +8,10 @@ from pathlib import Path
 
 
 @contextmanager
-def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file in the same folder, and rename it to `path` on success.
+def atomic_write(path: Path, *, replace: bool = False) -> Iterator[Path]:
+    """Yield the path of a temporary file in the same folder, and rename the file to `path` on success.
 
-    On failure the temporary file is removed, and with `replace` the previous file is unchanged.
+    On failure the temporary file is removed, and an existing file is unchanged.
 
     Raises FileExistsError if the file exists and `replace` is false, OSError if it cannot be written.
     """
@@ -22,19 +22,19 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     if target.exists() and not target.is_file():
         yield target  # a device or a pipe
         return
-    part = target.with_name(f".{os.getpid()}-part-{target.name}")
+    temporary = target.with_name(f".{os.getpid()}-part-{target.name}")
     try:
-        yield part
-        with part.open("rb") as file:
+        yield temporary
+        with temporary.open("rb") as file:
             os.fsync(file.fileno())
         if replace:
-            part.replace(target)
+            temporary.replace(target)
             return
         try:
-            target.hardlink_to(part)
+            target.hardlink_to(temporary)
         except FileExistsError:  # another process created it first
             raise exists from None
         except OSError:  # a file system without hard links, such as FAT on SD cards
-            part.rename(target)
+            temporary.rename(target)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
