@@ -180,7 +180,7 @@ class LogReceiver:
         elif vehicle is not None and (ms := getattr(message, "time_boot_ms", None)) is not None:
             if is_reboot(ms, vehicle.newest):
                 vehicle.client.on_reboot()
-                vehicle.newest = ms
+                vehicle.reassembly, vehicle.newest = Reassembly(), ms
             vehicle.newest = max(ms, vehicle.newest)
         return received
 

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import random
+import socket
 import struct
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from functools import cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.sources.mavlink.link import open_link
 from nedbus.sources.mavlink.log_reassembly import Chunk
+from nedbus.sources.mavlink.reader import LinkReader, LogReceiver, Received
+from nedbus.sources.options import MavlinkOptions
+from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
+from tests.waits import DEADLINE
 
 from .counting_reassembly import CountingReassembly
 
@@ -52,12 +60,26 @@ def test_retransmitted_first_message_begins_no_new_stream() -> None:
     assert reassembly.lost == 0
 
 
-def test_same_first_message_begins_stream_after_reset() -> None:
-    """After a reboot a header with the same bytes begins a new stream."""
-    reassembly = CountingReassembly()
-    begin(reassembly)
-    reassembly.reset()
-    begin(reassembly)
+def test_same_first_message_begins_new_stream_after_reboot() -> None:
+    """After a reboot, a header with the same bytes begins a new stream; without one it is a retransmission."""
+    ids, port, encoder = (245, 191), free_port(), dialect.MAVLink(None, 1, 1)
+    header = dialect.MAVLink_logging_data_acked_message(*ids, 0, SIZE, 0, [*HEADER.ljust(SIZE, b"\0")])
+    heartbeat = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+    times = [dialect.MAVLink_system_time_message(0, ms) for ms in (9000, 100)]
+    with (
+        closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+    ):
+        options, reader = MavlinkOptions(log=frozenset({"1"})), LinkReader(link, name="link")
+        receiver = LogReceiver(reader, options, lambda *_: None, system=ids[0], component=ids[1])
+        with closing(receiver):
+            messages: list[Any] = [heartbeat, header, header, *times, heartbeat, header]
+            for message in messages:
+                vehicle.sendto(message.pack(encoder), ("127.0.0.1", port))
+            received: list[Received] = []
+            while len(received) < len(messages):
+                received += [each for each in receiver.read(DEADLINE) if isinstance(each, Received)]
+    assert [each.chunk.begins for each in received if each.chunk] == [True, False, True]
 
 
 def test_stream_joined_midway_has_no_definitions() -> None:
