@@ -117,7 +117,7 @@ class LogStream:
             self._round_trip = now - sent
             self._clock = vehicle_time - (sent + now) / 2, now
 
-    def log_changes(self, now: float) -> None:
+    def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
         status, address = self._client.status, Address(self._name, DEFAULT_TOPIC)
         if not self.is_streaming:

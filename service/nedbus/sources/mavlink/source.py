@@ -97,7 +97,7 @@ class _LinkSession:
                 next_requests = now + TIMINGS.source_tick
                 self._send_requests(now)
                 for log in self._logs.values():
-                    log.log_changes(now)
+                    log.log_changes()
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
                 # Routers and vehicles send only to components that have announced themselves.
