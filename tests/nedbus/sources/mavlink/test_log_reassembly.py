@@ -32,7 +32,7 @@ SIZE: Final = 249
 
 needs_recordings = [
     pytest.mark.logs,
-    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
+    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
 ]
 
 
@@ -148,7 +148,7 @@ def test_sequence_wraps_without_loss() -> None:
     assert reassembly.counts.total() == 2**16 + 2
 
 
-def test_largest_loss_is_half_of_sequence() -> None:
+def test_largest_loss_is_half_of_sequence_range() -> None:
     """A step of 32,768 is the largest loss; a larger one is a late message, unless the next ones continue it."""
     reassembly = CountingReassembly()
     begin(reassembly)
@@ -158,8 +158,8 @@ def test_largest_loss_is_half_of_sequence() -> None:
     assert add(reassembly, plain(2**15 + 1)) == Chunk("duplicate")
 
 
-def test_stream_resumes_after_loss_of_more_than_half_of_sequence() -> None:
-    """A long run of consecutive old numbers is the live stream: all messages in between were lost."""
+def test_stream_resumes_after_loss_of_more_than_half_of_sequence_range() -> None:
+    """A long run of consecutive old sequence numbers continues the stream: all messages in between were lost."""
     reassembly = CountingReassembly()
     begin(reassembly)
     chunks = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
@@ -197,7 +197,7 @@ def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], Count
 
 
 class Impaired(NamedTuple):
-    """Messages in order of arrival, and the indices of those in the original list that arrive in order."""
+    """`messages`: in order of arrival; `in_order`: original indices of the messages that do not arrive late."""
 
     messages: list[Message]
     in_order: set[int]
@@ -332,7 +332,7 @@ class TestRecordings:
     ("loss", "burst", "reorder"), [(0.03, 1, 0.0), (0.05, 1, 0.0), (0.05, 20, 0.0), (0.0, 1, 0.02), (0.03, 5, 0.02)]
 )
 class TestImpairedLink:
-    """The same flight with messages dropped and reordered."""
+    """A recorded flight with messages dropped and reordered."""
 
     pytestmark = needs_recordings
 
