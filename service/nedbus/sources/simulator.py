@@ -41,7 +41,7 @@ _GRAVITY: Final = 9.80665  # m/s^2
 
 _ALTITUDE: Final = 20.0  # m
 _CLIMB: Final = 10.0  # s to this altitude
-_SIZE: Final = 40.0  # m
+_SIZE: Final = 40.0  # m, from the centre of a figure to each end
 _STEP: Final = 1e-3  # s, for the derivatives
 
 _Status: Final = MESSAGES["VehicleStatus"].model
@@ -354,7 +354,7 @@ def _messages(
     chosen: Mapping[Address, tuple[range, Fields]], seed: int, ticks: int | None, origin: tuple[float, float, float]
 ) -> Iterator[SourceMessage]:
     direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
-    absent = {}  # the fields of PX4's newest layout, as "not provided"
+    absent = {}  # fields of PX4's newest layout, with values that mean "not provided"
     for address in chosen:
         layout = BY_TOPIC[address.topic].layout_of_release("main")
         absent[address] = {name: kind.absent for name, kind in layout.types.items()} if layout else {}

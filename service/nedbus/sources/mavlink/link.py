@@ -14,7 +14,7 @@ from nedbus.errors import ConfigError, SourceError
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 Peer = Any  # remote address, as returned by the socket
 
-_CHANGES: Final = 5  # address changes within the window; a reconnect causes one, and a reordered packet two more
+_CHANGES: Final = 5  # of the address within the window: two senders. A reconnect is one, a reordered packet two more
 _WINDOW: Final = 5.0  # s
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes

@@ -78,7 +78,7 @@ class LogStreamClient:
     Log `status` when it changes; repeated attempts with the same outcome do not change it.
 
     `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
-    Without "take", a rejected client stops only a stream addressed to its own ids: that of an earlier process.
+    Without "take", a rejected client stops only a stream addressed to its own ids, left by an earlier process.
     `system`, `component`: the MAVLink ids of this client.
     `header_seconds`: duration of the last header; None until it is complete.
     """

@@ -26,8 +26,8 @@ class Chunk(NamedTuple):
 
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
     `begins`: a new stream begins with `data`: it needs a new parser.
-    `lost`: number of messages lost before this one: the parser must discard its partial record before `data`. It is
-    exact for gaps of less than 65,536 messages, and a lower bound otherwise.
+    `lost`: number of messages lost before this one, exact for gaps of less than 65,536, and a lower bound otherwise.
+    After a loss the parser must discard its partial record before `data`.
     """
 
     verdict: Verdict

@@ -207,7 +207,7 @@ class LogStream:
 
 
 class LogFile:
-    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, as on a full disk."""
+    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, such as on a full disk."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)

@@ -21,7 +21,7 @@ from .vehicle import Vehicle
 _LOOKAHEAD: Final = 1000  # messages read when a file is opened, for the initial list of addresses
 _MAX_GAP: Final = 60_000_000  # us; a longer step is a pause or a damaged time, and is skipped
 _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
-_LONGEST: Final = _HEAD.size + 290  # bytes of a record
+_MAX_RECORD: Final = _HEAD.size + 290  # bytes of a record
 _OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}  # bytes of a frame without payload
 _SIGNATURE: Final = 13  # bytes
 
@@ -76,7 +76,7 @@ class TlogReader:
         """Yield each frame with its time [us]; after damage, search for two consecutive records."""
         with open_flight(self._path) as file:
             data, is_found = b"", True
-            while data := data + file.read(2 * _LONGEST - len(data)):
+            while data := data + file.read(2 * _MAX_RECORD - len(data)):
                 length = _record_length(data)
                 is_found = bool(length) and (is_found or len(data) == length or _record_length(data[length:]) > 0)
                 if not is_found or length > len(data):

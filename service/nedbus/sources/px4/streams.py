@@ -28,7 +28,7 @@ _MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a ga
 _TIMEOUT: Final = 3.0  # s without messages after which another publisher may use the address
 _EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
 _SETTLE_TIME: Final = 1.0  # s during which messages may still arrive after a publisher's token is gone
-_SILENCE: Final = 5.0  # s without messages, or periods of the nominal rate if that is longer
+_SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after which a topic without messages is silent
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each its own namespace or domain"
 
