@@ -19,7 +19,6 @@ from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
 
 _MAX_BUFFER: Final = 2**16  # bytes that the parser of a TCP or serial link may buffer
-_LOG_MESSAGES: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
 _MAX_WAITING: Final = 16_384  # messages queued for `read`; later ones are dropped, and counted as lost
 _MAX_READ: Final = 100  # messages per call
 _TICK: Final = 0.05  # s, the longest wait of the thread
@@ -152,7 +151,7 @@ class LogReceiver:
         """Acknowledge a message and reassemble its data; if the queue is full, drop it like a lost message."""
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self.vehicles.get(received.system)
-        if kind in _LOG_MESSAGES:
+        if kind.startswith("LOGGING_DATA"):
             target = message.target_system, message.target_component
             if vehicle is None or not vehicle.client.accepts(*target):
                 if target != self._ids:
@@ -164,7 +163,7 @@ class LogReceiver:
                 fields = message.sequence, message.length, message.first_message_offset, message.data
                 chunk = vehicle.reassembly.add(*fields)
                 received, begins = received._replace(chunk=chunk), chunk.begins
-            is_acked = kind == _LOG_MESSAGES[0]
+            is_acked = kind == "LOGGING_DATA_ACKED"
             self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
         elif kind == "HEARTBEAT":
             if vehicle is None:
