@@ -135,7 +135,7 @@ class UlogParser:
     def _consume_data(self, at: int) -> int:
         """Consume consecutive data messages except the last, whose successor needs inspection; return its position."""
         buffer, known, records = self._buffer, self._known, self._records
-        make = tuple.__new__  # takes half the time of a NamedTuple's constructor
+        make = tuple.__new__  # needs half the time of a NamedTuple's constructor
         found = known.get(buffer[at : at + _DATA_HEADER])
         mark = buffer.find(SYNC, at) if found else -1
         while found is not None:
