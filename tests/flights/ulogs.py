@@ -23,7 +23,7 @@ def _type(name: str, field_types: Mapping[str, str]) -> str:
 
 
 @cache
-def account_of(log: Path) -> FileEvents:
+def cached_events(log: Path) -> FileEvents:
     """Return the events of a real log, cached per worker: reading a large one takes more than a second."""
     return read_file_events(log)
 

@@ -11,7 +11,7 @@ from typing import Any, Final, cast
 from nedbus import clock
 from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
@@ -45,7 +45,7 @@ class SourceOutput:
     """Publish the messages of a source, called `name` in the log and configured as `text`; `now`: monotonic [s]."""
 
     def __init__(
-        self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
+        self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], event_log: EventLog
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
@@ -57,7 +57,7 @@ class SourceOutput:
         self._kind = text.partition(":")[0]
         self._registry = registry
         self._now = now
-        self._account = account
+        self._event_log = event_log
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # addresses logged as silent
@@ -137,8 +137,8 @@ class SourceOutput:
         self.published += 1
         stream.health.add(fields, received=self._now_ns(), lost=message.lost)
         if message.dropout:
-            self._account.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
-        self._account.add(message.address, fields, clock.steady(), lost=message.lost)
+            self._event_log.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
+        self._event_log.add(message.address, fields, clock.steady(), lost=message.lost)
 
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
@@ -196,7 +196,7 @@ class SourceOutput:
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
-            is_known = address.vehicle in self._account.vehicles and stream.last_received is not None
+            is_known = address.vehicle in self._event_log.vehicles and stream.last_received is not None
             if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]
         self._is_full = False
@@ -220,7 +220,7 @@ class SourceOutput:
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
-            self._account.reject(rejection.address, reason, clock.steady())
+            self._event_log.reject(rejection.address, reason, clock.steady())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, unavailable: UnavailableTopics) -> None:
@@ -268,7 +268,7 @@ class SourceOutput:
             extra = about("rejected", message.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
-        self._account.reject(message.address, reason, clock.steady())
+        self._event_log.reject(message.address, reason, clock.steady())
         self._registry.reject(message.address, report)
 
 

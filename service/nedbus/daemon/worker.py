@@ -10,7 +10,7 @@ from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
@@ -77,7 +77,7 @@ class Worker:
         *,
         router: Session | None = None,
         clock: Clock | None = None,
-        account: Account,
+        event_log: EventLog,
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
@@ -90,7 +90,7 @@ class Worker:
         self._clock = clock or Clock()
         self._retry = retry or isinstance(self.source, LiveSource)
         self._on_end = on_end
-        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, account)
+        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, event_log)
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None
@@ -203,7 +203,7 @@ class Worker:
         if source.options.wait and last is None:
             self._state = "waiting"
             _log.info("%s: waiting for a subscriber", self._name, extra=about("replay_waiting", source=self._name))
-            while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
+            while not self._registry.has_subscriber(run.addresses) and not self._clock.wait(_READER_POLL):
                 pass
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=speed is None)

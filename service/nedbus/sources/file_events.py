@@ -14,7 +14,7 @@ from typing import Final, cast
 
 from nedbus import recording
 from nedbus.errors import InvalidMessageError, SourceError
-from nedbus.events import AIR_DATA, EKF_SELECTOR, Account, Times
+from nedbus.events import AIR_DATA, EKF_SELECTOR, EventLog, Times
 from nedbus_msgs import BY_TOPIC, TOPICS, codec_of, upgrade_fields
 
 from .kinds import parse_source, source_text_of_file
@@ -31,7 +31,7 @@ _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not set
 class FileEvents:
     """Events of complete files; `end`: time of the last message. Times are seconds since the first message."""
 
-    account: Account
+    event_log: EventLog
     times: Times
     end: float
     warnings: tuple[str, ...]
@@ -112,15 +112,15 @@ class Flights:
 
 def read_file_events(*paths: Path) -> FileEvents:
     """Detect the events in files; raises like `Flights`."""
-    flights, account, due = Flights(paths), Account(MAX_FILE_EVENTS), 0.0
-    for message, _, _ in follow(flights.messages(), account, ended=flights.ended):
+    flights, event_log, due = Flights(paths), EventLog(MAX_FILE_EVENTS), 0.0
+    for message, _, _ in follow(flights.messages(), event_log, ended=flights.ended):
         due = message.due
-    account.label_first_events()
-    return FileEvents(account, flights.times, due, flights.warnings)
+    event_log.label_first_events()
+    return FileEvents(event_log, flights.times, due, flights.warnings)
 
 
 def follow(
-    messages: Iterable[SourceMessage], account: Account, *, ended: Collection[str] = ()
+    messages: Iterable[SourceMessage], event_log: EventLog, *, ended: Collection[str] = ()
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
     """Detect events in a replay; yield each message with its rejection reason or its payload.
 
@@ -129,14 +129,14 @@ def follow(
     checked = due = 0.0
 
     def update(time: float) -> None:
-        mains = (account.vehicles[name].main for name in ended if name in account.vehicles)
-        account.update(time, {main: "ended" for main in mains if main})
+        mains = (event_log.vehicles[name].main for name in ended if name in event_log.vehicles)
+        event_log.update(time, {main: "ended" for main in mains if main})
 
     for message in messages:
         if message.dropout:
-            account.add_dropout(message.address.vehicle, message.dropout, due)
+            event_log.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
-        if due - checked >= _CHECK_INTERVAL and account.vehicles.keys() <= set(ended):
+        if due - checked >= _CHECK_INTERVAL and event_log.vehicles.keys() <= set(ended):
             checked = due  # no vehicle is active between two files
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
@@ -146,11 +146,11 @@ def follow(
             try:
                 fields = upgrade_fields(definition, message.fields)
                 payload = codec_of(definition).encode_fields(fields)
-                account.add(message.address, fields, due)
+                event_log.add(message.address, fields, due)
             except InvalidMessageError as exc:
                 reason = exc.reason
         if reason is not None:
-            account.reject(message.address, reason, due)
+            event_log.reject(message.address, reason, due)
         yield message, reason, payload
     update(due)
-    account.settle(due + _SETTLE_TIME)
+    event_log.settle(due + _SETTLE_TIME)

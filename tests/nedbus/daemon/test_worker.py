@@ -13,7 +13,7 @@ from nedbus.client import PublisherRegistry
 from nedbus.daemon import PlannedSource
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.health import SourceStatus
 from nedbus.sources import Rejection, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.sources.options import RecordedOptions
@@ -76,7 +76,7 @@ class FakeRegistry:
         )
         return self.publishers[address]
 
-    def is_read(self, _: object) -> bool:
+    def has_subscriber(self, _: object) -> bool:
         return self.clock.seconds >= self.readers_at
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
@@ -147,7 +147,7 @@ class Harness:
             ),
             cast("PublisherRegistry", self.registry),
             clock=cast("Clock", clock),
-            account=Account(),
+            event_log=EventLog(),
             retry=retry,
             on_end=self._count_end,
         )

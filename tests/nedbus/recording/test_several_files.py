@@ -81,9 +81,9 @@ def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
     """The gap between two flights of a vehicle does not matter."""
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
     second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
-    account = read_file_events(first, second)
-    assert [event.vehicle for event in account.account.events_since(0)[0]] == ["a", "a", "b", "b"]
-    assert math.isclose(account.end, 3e8 - 60 + 9.9, abs_tol=0.01)
+    event_log = read_file_events(first, second)
+    assert [event.vehicle for event in event_log.event_log.events_since(0)[0]] == ["a", "a", "b", "b"]
+    assert math.isclose(event_log.end, 3e8 - 60 + 9.9, abs_tol=0.01)
 
 
 def test_file_without_utc_raises_among_several(tmp_path: Path, swarm: list[str]) -> None:

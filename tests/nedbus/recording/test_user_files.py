@@ -40,7 +40,7 @@ def dues(name: str) -> tuple[float, float]:
 
 def events(name: str) -> set[tuple[str, str]]:
     """Return kind and severity of all events."""
-    return {(each.kind, each.severity) for each in account(name).account.events}
+    return {(each.kind, each.severity) for each in account(name).event_log.events}
 
 
 def account(name: str) -> FileEvents:
@@ -83,7 +83,7 @@ def test_end_of_fake_position_is_the_cause() -> None:
     lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in lines if "BAD    xy not valid" in line)
     assert invalid.startswith("   154.300")
-    assert "no horizontal aiding: fake position ended, nothing else is fused (200 ms before)" in invalid
+    assert "no horizontal aiding: EKF stopped fusing fake position (200 ms before)" in invalid
 
 
 @pytest.mark.parametrize(

@@ -282,7 +282,7 @@ def test_old_log_without_release_is_not_damaged(tmp_path: Path) -> None:
     path = write_old_log(tmp_path / "a.ulg", [6])
     converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)
-    assert "mode Position to Return" in run_command("events", str(path)).out
+    assert "mode changed from Position to Return" in run_command("events", str(path)).out
 
 
 def test_dropout_is_an_event(tmp_path: Path) -> None:
@@ -295,7 +295,7 @@ def test_dropout_is_an_event(tmp_path: Path) -> None:
                 writer.put("O", struct.pack("<H", 5000))
             writer.add(VLP, message(time, **VALID))
         lines = run_command("events", str(writer.write(tmp_path / "a.ulg"))).out
-        assert ("the logger recorded nothing for 5.0 s" in lines, "silent" in lines) == (is_recorded, not is_recorded)
+        assert ("logging dropout of 5.0 s" in lines, "silent" in lines) == (is_recorded, not is_recorded)
 
 
 def test_event_before_the_first_timestamp_has_a_time_since_boot(tmp_path: Path) -> None:

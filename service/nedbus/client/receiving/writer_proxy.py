@@ -24,8 +24,8 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the las
 
 
 @dataclass(slots=True, eq=False)
-class Account:
-    """Counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
+class LossCounters:
+    """Loss counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
 
     lost: int = 0
     dropped: int = 0  # by a full ring or queue
@@ -43,12 +43,12 @@ class Request:
 
     stop: int  # one past the highest number known to be sent
     due: float = 0.0
-    deadline: float | None = None  # the gap is lost then; each delivery resets it
+    deadline: float | None = None  # when the gap counts as lost; each delivery resets it
     attempts: int = 0
     requested: range | None = None  # numbers of the open query
     first_available: int | None = None  # lowest number answered; the publisher caches everything from there on
     last_answered: bool = False  # the highest requested number was answered
-    probe: int | None = None  # number to request again; an answer proves that `candidate` is the lowest in the cache
+    probe: int | None = None  # number requested again; an answer proves that `candidate` is the lowest in the cache
     candidate: int | None = None
 
 
@@ -59,7 +59,7 @@ class WriterProxy:
     stream: KeyState
     name: str  # `zid` and `eid` combined
     expected: int  # the next number
-    account: Account
+    counters: LossCounters
     zid: object = None  # this and the next are set by the first message
     eid: int | None = None
     history_end: int = 0  # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
@@ -76,7 +76,7 @@ class WriterProxy:
         step = (number - self.expected) % NUMBERS
         if step > MAX_GAP:
             if NUMBERS - step <= _MAX_REORDERED:
-                self.account.discarded += 1
+                self.counters.discarded += 1
                 return
             self.give_up()
             self.expected = number
@@ -109,12 +109,12 @@ class WriterProxy:
         if request.deadline is None:
             request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
         request.attempts += 1
-        self.account.requesting[self] = self.account.requesting.pop(self)
+        self.counters.requesting[self] = self.counters.requesting.pop(self)
         request.requested = range(max(self.expected, last - MAX_REPLIES + 1), last + 1)
         return request.requested
 
     def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> None:
-        """Accept answers to the open request and deliver what is in order; `ended`: these were the last."""
+        """Accept answers to the open request and deliver what is in order; `ended`: no more answers follow."""
         request = self.request
         if request is None:
             return
@@ -125,18 +125,18 @@ class WriterProxy:
             lowest = request.first_available
             request.first_available = min(found) if lowest is None else min(lowest, *found)
             request.last_answered |= request.requested is not None and request.requested[-1] in found
-        if self.history_end <= self.expected:  # else wait for the end, which tells the lowest number available
+        if self.history_end <= self.expected:  # else wait for the end, which reveals the lowest number available
             self._release()
         if ended and request.requested is not None:
             last, request.requested = request.requested[-1], None
-            over = request.deadline is not None and now >= request.deadline
+            expired = request.deadline is not None and now >= request.deadline
             if request.last_answered:
                 self.unresponsive = False
-                self._confirm_lowest(request, over=over)
+                self._confirm_lowest(request, expired=expired)
             elif request.probe is not None:
                 request.probe = request.stop - 1  # the probe may have left the cache
             self._release()
-            if over:
+            if expired:
                 self.unresponsive = request.first_available is None
                 self.give_up(last)
             request.last_answered = False
@@ -148,16 +148,16 @@ class WriterProxy:
             self._count_gap(min(self.held, default=self.request.stop))
             self._release()
 
-    def has(self, number: int) -> bool:
+    def is_settled(self, number: int) -> bool:
         """Return True if this message has arrived or counts as lost."""
         return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 
-    def _confirm_lowest(self, request: Request, *, over: bool) -> None:
-        """Give up numbers below the lowest one answered, after a probe: lower ones may have been answered but lost."""
+    def _confirm_lowest(self, request: Request, *, expired: bool) -> None:
+        """Give up numbers below the lowest answered one, once a probe has shown that no lower answer was lost."""
         lowest = request.first_available
         if lowest is None or lowest <= self.expected:
             return
-        if lowest != request.candidate and not over:
+        if lowest != request.candidate and not expired:
             request.probe = request.candidate = lowest
         else:
             request.probe = None
@@ -165,25 +165,25 @@ class WriterProxy:
 
     def _hold(self, number: int, arrival: Arrival) -> None:
         if number in self.held:
-            self.account.discarded += 1
+            self.counters.discarded += 1
         else:
             self.held[number] = detach(arrival)
-            self.account.held += 1
+            self.counters.held += 1
 
     def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
-            self.account.requesting[self] = None
-            self.account.opened += 1
+            self.counters.requesting[self] = None
+            self.counters.opened += 1
         self.request.stop = max(self.request.stop, stop)
 
     def _count_gap(self, number: int, *, overflowed: bool = False) -> None:
         certain = max(self.expected, min(self.history_end, number))
         lost = (number - certain) % NUMBERS
         if overflowed:
-            self.account.dropped += lost
+            self.counters.dropped += lost
         else:
-            self.account.lost += lost
+            self.counters.lost += lost
             self.stream.gap += lost
         self.expected = number
 
@@ -192,7 +192,7 @@ class WriterProxy:
         self.history_end = 0
         stream, payload, raw, _, received = arrival
         if payload:
-            self.account.delivered.append((stream, payload, raw, stream.gap, received))
+            self.counters.delivered.append((stream, payload, raw, stream.gap, received))
             stream.gap = 0
 
     def _release(self) -> None:
@@ -200,9 +200,9 @@ class WriterProxy:
         if request is None:
             return
         while (arrival := self.held.pop(self.expected, None)) is not None:
-            self.account.held -= 1
+            self.counters.held -= 1
             self._deliver(arrival)
             request.deadline, request.attempts = None, 0
         if self.expected >= request.stop:
             self.request = None
-            del self.account.requesting[self]
+            del self.counters.requesting[self]

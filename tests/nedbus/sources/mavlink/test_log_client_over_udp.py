@@ -147,7 +147,7 @@ def test_denied_start_is_reported() -> None:
 
 def test_stream_of_another_client_is_rejected() -> None:
     """Its data is rejected even if it arrives on the same link."""
-    with Link().play("default_topics", owner=OTHERS, is_owner_heard=True) as link:
+    with Link().play("default_topics", owner=OTHERS, is_owner_on_link=True) as link:
         link.run(lambda: link.rejected > 20)
     assert link.states[1:] == [("starting", None), ("refused", "taken")]
     assert set(link.peer.commands) == {START}
@@ -173,14 +173,14 @@ class TestAbnormalStreams:
     @pytest.mark.parametrize("is_heard", [True, False])
     def test_log_take_takes_over_stream(self, is_heard: bool) -> None:
         """With log=take the other client's stream ends, and this client's begins."""
-        with Link("take").play("flight1", owner=OTHERS, is_owner_heard=is_heard) as link:
+        with Link("take").play("flight1", owner=OTHERS, is_owner_on_link=is_heard) as link:
             link.expect_states(*STARTED)
         # STOP takes longer while an acknowledgement of the other client is missing.
         assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
 
     def test_stream_of_earlier_process_is_restarted(self) -> None:
         """It has the same ids, so its data arrives, but without definitions."""
-        with Link().play("flight1", owner=OURS, is_owner_heard=True) as link:
+        with Link().play("flight1", owner=OURS, is_owner_on_link=True) as link:
             link.expect_states(("starting", None), ("refused", "taken"), *STARTED)
         assert link.reassembly.counts["no_definitions"]
 
@@ -188,7 +188,7 @@ class TestAbnormalStreams:
         """The last messages are acknowledged, and the stream is not restarted at once."""
         with Link("armed").play("flight1") as link:
             link.expect_states(*STARTED)
-            link.peer.cause("foreign_stop")
+            link.peer.trigger("foreign_stop")
             link.expect_states(*STARTED, ("ended", "stopped_elsewhere"))
         assert link.reassembly.lost == 0
 
@@ -196,7 +196,7 @@ class TestAbnormalStreams:
         """The header arrives again with another start time, followed by the same data."""
         with Link("armed").play("flight1") as link:
             link.expect_states(*STARTED)
-            link.peer.cause("reboot")
+            link.peer.trigger("reboot")
             link.expect_states(*STARTED, ("idle", None), *STARTED)
         assert (link.peer.streams, link.reassembly.lost) == (2, 0)
 
@@ -204,9 +204,9 @@ class TestAbnormalStreams:
         """Messages sent while the link is silent for some seconds are counted as lost."""
         with Link("armed").play("flight1") as link:
             link.expect_states(*STARTED)
-            link.peer.cause("vanish")
+            link.peer.trigger("vanish")
             link.expect_states(*STARTED, ("ended", "link_lost"))
-            link.peer.cause("return")
+            link.peer.trigger("return")
             link.run(lambda: link.reassembly.lost)
         assert link.states[-1] == ("streaming", None)
         assert link.peer.commands == [START]

@@ -17,7 +17,7 @@ from nedbus.errors import OutputError
 from nedbus.sources.mavlink.log_stream import LogFile
 from tests.flights.ulogs import write_log
 from tests.nedbus.ulog.test_parser import small_log
-from tests.peers.processes import unmeasured
+from tests.peers.processes import without_coverage
 
 BEGIN: Final = 1500
 """Bytes that hold the definitions and some messages of the small log."""
@@ -89,7 +89,7 @@ def test_killed_process_leaves_valid_log(tmp_path: Path) -> None:
     log, chance = path.read_bytes(), random.Random(1)
     command = [sys.executable, "-c", SAVE, os.fspath(path)]
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=unmeasured()
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=without_coverage()
     ) as process:
         assert process.stdin
         assert process.stdout

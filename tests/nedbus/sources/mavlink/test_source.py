@@ -31,8 +31,8 @@ from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.nedbus.sources.mavlink import mavlink_peer
 from tests.peers.command_line import run_command
-from tests.peers.http_pages import Pages
-from tests.peers.listening import Listener, status_of_source
+from tests.peers.http_client import HttpClient
+from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
@@ -126,12 +126,12 @@ def test_validity_without_estimator_status_is_unknown(
     run_nedbus: Start, bus: nedbus.Bus, port: int, endpoint: str
 ) -> None:
     """Each command reports unknown validity for a vehicle without ESTIMATOR_STATUS, such as ArduPilot by default."""
-    pages = Pages(free_port())
+    pages = HttpClient(free_port())
     run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
     expected = {
         "list": "validity unknown", "info": "validity unknown", "echo --once": "validity unknown",
         "hz --count 2": "validity unknown",
-        "health --expect 9 --valid xy": "the validity of xy is unknown, as the vehicle does not send it",
+        "health --expect 9 --valid xy": "validity of xy is unknown: the vehicle does not send it",
     }  # fmt: skip
     done = threading.Event()
 
@@ -184,8 +184,8 @@ def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: ned
             assert sample.message.timestamp == line["time_boot_ms"] * 1000
             assert [getattr(sample.message, name) for name in NED] == [line[name] for name in NED]
             assert "heading" in sample.missing or abs(sample.message.heading) <= math.pi + 1e-6
-    wait_for(lambda: status_of_source(bus).published == len(sent), what="the last one to be counted")
-    now = status_of_source(bus)
+    wait_for(lambda: source_status(bus).published == len(sent), what="the last one to be counted")
+    now = source_status(bus)
     assert (*now.addresses, *now.stale) == (f"7/{VLP}",), "stale after 3 s"
     assert (now.rejected, now.reboots, now.retries) == (0, 1, 0)
     # Losses before the first packet, around the reboot and after the last position cannot be counted.
@@ -344,7 +344,7 @@ def test_serial_port_is_received_until_it_disappears() -> None:
     radio, port = os.openpty()
     tty.setraw(port)
     with Listener(f"mavlink:serial:{os.ttyname(port)}?baud=115200") as listener:
-        listener.turn()  # it sends a heartbeat
+        listener.step()  # it sends a heartbeat
         assert os.read(radio, 1)[0] == dialect.PROTOCOL_MARKER_V2
         os.write(radio, local_position(1000).pack(dialect.MAVLink(None, 9, 1)))
         assert listener.receive()[0].fields["y"] == 1.0

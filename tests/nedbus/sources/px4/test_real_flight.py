@@ -33,7 +33,7 @@ from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
 from tests.nedbus.sources.mavlink.test_source import port
-from tests.peers.listening import Listener, status_of_source
+from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.peers.zenohd import start_zenohd
@@ -164,7 +164,7 @@ def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
     """Wait until the service has published or rejected `count` messages; it counts each one after sending it."""
 
     def is_counted() -> bool:
-        now = status_of_source(bus)
+        now = source_status(bus)
         return now.published + now.rejected == count
 
     wait_for(is_counted, what=f"{count} messages")
@@ -232,7 +232,7 @@ def test_positions_of_flight_equal_log(where: str) -> None:
                 window.setdefault(sent.address, []).append(sent.cdr)
                 total += 1
         wait_until_counted(bus, total)
-        now = status_of_source(bus)
+        now = source_status(bus)
         assert (now.published, now.rejected, now.lost, now.reboots) == (total, 0, 0, 0)
         assert (total, every.counts.lost) == (26_514, 0)
     assert equal == {
@@ -305,8 +305,8 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
             if total % WINDOW == 0:
                 read_all()
         read_all()
-        wait_for(lambda: status_of_source(bus).published >= total, what="the last one to be counted")
-        now = status_of_source(bus)
+        wait_for(lambda: source_status(bus).published >= total, what="the last one to be counted")
+        now = source_status(bus)
         assert (total, now.rejected, now.lost, now.reboots) == (69_605, 0, 11, 0)
         assert (now.not_carried, now.silent) == ((), ())
         assert every.counts == nedbus.Counts(received=every.counts.received)
@@ -338,11 +338,11 @@ def test_topics_lost_by_default_pubcsv_are_reported_silent(where: str) -> None:
             px4.send(sent)
             last = sent
         with repeating(lambda: px4.send(last)):
-            wait_for(lambda: set(status_of_source(bus).silent) == silent, what="silent topics")
+            wait_for(lambda: set(source_status(bus).silent) == silent, what="silent topics")
             with changing_timings() as timings:
                 timings.listen = 0.1
                 findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__)
-            unsupported = status_of_source(bus).not_carried
+            unsupported = source_status(bus).not_carried
     assert list(unsupported) == sorted(unsupported)
     assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(unsupported)
     [loss] = [each for each in findings if "silent while other topics arrive" in each.seen]
@@ -376,7 +376,7 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
             played = play(bus, (first, other), part, played)
         received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
         assert sorted(received) == sorted(sent.cdr for sent in alone)
-        now = status_of_source(bus)
+        now = source_status(bus)
         assert (now.published, now.rejected) == (len(alone), played - len(alone))
         assert (now.lost, now.reboots, every.counts.lost) == (0, 0, 0)
         assert len(now.warnings) == 4
@@ -392,7 +392,7 @@ def test_restarted_px4_counts_as_one_reboot(where: str) -> None:
         for played in (0, len(messages)):
             with Px4(where) as px4:
                 play(bus, [px4], lines, played)
-        now = status_of_source(bus)
+        now = source_status(bus)
         assert (now.published, now.rejected, now.lost, now.reboots) == (2 * len(messages), 0, 0, 1)
 
 

@@ -1,4 +1,4 @@
-"""Messages without a file in nedbus: from a log through a service to readers that query their definition."""
+"""Messages that nedbus does not define, read with the definition queried from their publisher."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ import nedbus
 from nedbus.transport import Session
 from nedbus_msgs import Definition, define_msg, field_type, short_hash
 from tests.nedbus_msgs.messages.test_messages import write_wheels
-from tests.peers.answering import answering, reply_with
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.peers.queryables import answer_queries, reply_with
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 COUNT = 500
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("form", ["models", "rows", "batches"])
-def test_message_of_a_log_is_read_without_a_file(
+def test_message_with_queried_definition_is_read_completely(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
-    """No message is lost during the lookup, in any form; the values are those of the log."""
+    """No message is lost during the lookup of its definition, in any form; the values are those of the log."""
     log = write_wheels(tmp_path / "rover.ulg", COUNT)
     with bus.subscribe("wheel_encoders", mode="every") as subscription:
         run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
@@ -66,20 +66,23 @@ def test_message_of_a_log_is_read_without_a_file(
         {"fields": []},
     ],
 )
-def test_hostile_description_harms_no_other_stream(
-    client: nedbus.Bus, bus: nedbus.Bus, raw: Session, answer: bytes | dict[str, Any]
+def test_hostile_definition_affects_no_other_stream(
+    client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session, answer: bytes | dict[str, Any]
 ) -> None:
-    """If a peer sends a wrong description, its own message is invalid, and others are read."""
+    """If a peer replies with an invalid definition, only its own message is invalid."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
-    with suppress(ValueError):  # most hashes are right, so that the description itself is rejected
+    with suppress(ValueError):  # the right hash, if the definition has one: it is rejected for another reason
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/peer/Evil"
-    with answering(raw, schema, reply_with({schema: payload})), client.subscribe("*", mode="every") as subscription:
+    with (
+        answer_queries(zenoh_session, schema, reply_with({schema: payload})),
+        client.subscribe("*", mode="every") as subscription,
+    ):
         good = bus.publisher("vehicle_attitude", vehicle="1")
-        wait_for_reader(raw, "nedbus/7/evil")
+        wait_for_matching(zenoh_session, "nedbus/7/evil")
         encoding = f"application/msgpack;px4_msgs/Evil;hash={identity}"
-        raw.put("nedbus/7/evil", msgpack.packb([0, 1, 2]), encoding=encoding)
+        zenoh_session.put("nedbus/7/evil", msgpack.packb([0, 1, 2]), encoding=encoding)
         good.publish({"timestamp": 5})
         assert subscription.receive(DEADLINE).message == nedbus.VehicleAttitude(timestamp=5)
 
@@ -88,11 +91,11 @@ def test_hostile_description_harms_no_other_stream(
                 subscription.receive(0.1)
             return subscription.counts.invalid == 1
 
-        wait_for(is_rejected, what="the other one, of another priority")
+        wait_for(is_rejected, what="the invalid message, which has another priority")
 
 
 def read_once(endpoint: str, topic: str, form: str) -> int:
-    """Connect, read the last message in a form, close, and return its timestamp."""
+    """Connect, read the last message in the given form, close, and return its timestamp."""
     with nedbus.connect(endpoint) as reader:
         if form == "latest":
             return int(reader.latest(topic)[0].message.timestamp)
@@ -102,8 +105,8 @@ def read_once(endpoint: str, topic: str, form: str) -> int:
             return int(subscription.receive_batch(DEADLINE).messages["timestamp"][0])
 
 
-def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
-    """Of readers that connect, read a message without a file and close, no definition remains, in any form."""
+def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
+    """Closing a bus frees the definitions that it looked up, for all forms of reading."""
     definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
     publisher = bus.publisher("comes_and_goes", vehicle="1", definition=definition)
     publisher.publish({"timestamp": 1})
@@ -114,21 +117,21 @@ def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> Non
         found = [each for each in gc.get_objects() if isinstance(each, Definition) and each.name == definition.name]
         return len(found) == 1
 
-    wait_for(is_freed, what="the definitions of closed readers")
+    wait_for(is_freed, what="the definitions of closed readers to be freed")
 
 
-def test_message_of_unknown_encoding_says_so(
-    client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+def test_encoding_without_name_and_hash_is_invalid(
+    client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Without name and hash in its encoding a message cannot be looked up, and the error says so."""
+    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log has the reason."""
     with client.subscribe("wheel_encoders") as subscription:
-        wait_for_reader(raw, "nedbus/7/wheel_encoders")
-        raw.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
+        wait_for_matching(zenoh_session, "nedbus/7/wheel_encoders")
+        zenoh_session.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
 
         def is_counted() -> bool:
             with pytest.raises(nedbus.NoDataError):
                 subscription.receive(0.05)
             return subscription.counts.invalid == 1
 
-        wait_for(is_counted, what="it to be counted")
-    assert "the encoding 'text/plain' has no name and hash of a message" in caplog.text
+        wait_for(is_counted, what="the count of the invalid message")
+    assert "the encoding 'text/plain' has no message name and hash" in caplog.text
