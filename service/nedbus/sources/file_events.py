@@ -21,7 +21,7 @@ from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
 from .source import ReplayRun, ReplaySource, SourceMessage
 
-MAX_FILE_EVENTS: Final = 100_000  # events; the oldest are discarded
+MAX_FILE_EVENTS: Final = 100_000  # the oldest ones are discarded
 _LOOKAHEAD: Final = 1000  # messages read to determine the start time of a file
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
@@ -67,7 +67,7 @@ class Flights:
         """Damage, omissions and renamed vehicles so far."""
         found = []
         for path, run, names in self._files:
-            reason = "here, as several files have a vehicle"
+            reason = "here, because several files have a vehicle"
             renamed = [f"vehicle {own} is named {name} {reason} {own}" for own, name in names.items() if own != name]
             found += [f"{path}: {text}" for text in (*renamed, *run.warnings)]
         return tuple(found)

@@ -12,7 +12,7 @@ from .options import RecordedOptions
 from .source import ReplayRun, SourceMessage
 
 _MAX_GAP: Final = 60 * 10**9  # ns; a longer step is a pause or a damaged time, and is skipped
-_REORDERED: Final = 8192  # messages in the reorder buffer
+_REORDER_BUFFER: Final = 8192  # messages
 _INPUT: Final = "mcap-input"  # `sample.source` of messages to a vehicle
 
 
@@ -74,7 +74,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
-    """Sort messages by log time, as writers batch them by stream; flush when it goes back by over _MAX_GAP."""
+    """Sort messages by log time, because writers batch them by stream; flush when it goes back by over _MAX_GAP."""
     waiting: list[tuple[int, int, RecordedMessage]] = []
     newest = 0
     for number, recorded in messages:
@@ -84,7 +84,7 @@ def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple
             newest = 0
         newest = max(newest, recorded.logged)
         heappush(waiting, (recorded.logged, number, recorded))
-        if len(waiting) > _REORDERED:
+        if len(waiting) > _REORDER_BUFFER:
             yield heappop(waiting)[1:]
     while waiting:
         yield heappop(waiting)[1:]

@@ -32,16 +32,16 @@ _BOOT: Final = 10_000_000  # us since boot at the start
 _HEADING_RESET: Final = 15.0  # s into a lap
 _MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
 _Z_RESET: Final = 90.0  # s into a lap
-_HEADING_DISTURBED: Final = _LAP - 5.0  # s into a lap, when the error appears that the next heading reset corrects
+_HEADING_DISTURBED: Final = _LAP - 5.0  # s into a lap: start of the heading error that the next heading reset corrects
 _Z_STEP: Final = 1.0  # m, up and down in turn
-_DRIFT: Final = 0.02  # m/s^2, half the acceleration of the error in dead reckoning
+_DRIFT: Final = 0.02  # m/s^2, half the acceleration of the position error in dead reckoning
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
 _SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
 _GRAVITY: Final = 9.80665  # m/s^2
 
 _ALTITUDE: Final = 20.0  # m
 _CLIMB: Final = 10.0  # s to this altitude
-_SIZE: Final = 40.0  # m
+_SIZE: Final = 40.0  # m, from the centre of a figure to each end
 _STEP: Final = 1e-3  # s, for the derivatives
 
 _Status: Final = MESSAGES["VehicleStatus"].model
@@ -49,8 +49,8 @@ _Gps: Final = MESSAGES["SensorGps"].model
 _ARMED: Final = _BOOT - 1_000_000  # us since boot
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
-_ENDURANCE: Final = 1200.0  # s until the battery is replaced by a full one, at a fifth of its charge
-_BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: start of 2026
+_ENDURANCE: Final = 1200.0  # s until the battery, a fifth full, is replaced by a full one
+_BOOT_UTC: Final = 1_767_225_600_000_000  # us of Unix time at boot: start of 2026
 
 Vector = tuple[float, ...]  # north, east, down
 
@@ -77,8 +77,8 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float] =
 
 
 def _position(time: float, direction: float) -> Vector:
-    part = min(1.0, max(0.0, time / _CLIMB))
-    climb = part**3 * (10 - 15 * part + 6 * part**2)  # from 0 to 1 with continuous acceleration
+    progress = min(1.0, max(0.0, time / _CLIMB))
+    climb = progress**3 * (10 - 15 * progress + 6 * progress**2)  # from 0 to 1 with continuous acceleration
     # The phase starts slowly after the climb and then advances evenly, one figure a minute.
     late = max(0.0, time - 8.0)
     phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
@@ -297,11 +297,11 @@ def gps(time: float, truth: Truth) -> dict[str, object]:
         "hdop": 0.7 if fix else 100.0, "vdop": 1.1 if fix else 100.0, "satellites_used": 14 if fix else 0,
         "vel_ned_valid": fix, "vel_n_m_s": vx, "vel_e_m_s": vy, "vel_d_m_s": vz,
         "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
-        "time_utc_usec": _BOOTED_AT + now if is_started else 0,
+        "time_utc_usec": _BOOT_UTC + now if is_started else 0,
     }  # fmt: skip
 
 
-Fields = Callable[[float, Truth], dict[str, object]]  # of a message, from time since start and truth
+Fields = Callable[[float, Truth], dict[str, object]]  # (time since the start [s], truth) to the fields of a message
 
 
 def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
@@ -354,7 +354,7 @@ def _messages(
     chosen: Mapping[Address, tuple[range, Fields]], seed: int, ticks: int | None, origin: tuple[float, float, float]
 ) -> Iterator[SourceMessage]:
     direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
-    absent = {}  # the fields of PX4's newest layout, as "not provided"
+    absent = {}  # fields of PX4's newest layout, with values that mean "not provided"
     for address in chosen:
         layout = BY_TOPIC[address.topic].layout_of_release("main")
         absent[address] = {name: kind.absent for name, kind in layout.types.items()} if layout else {}

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Final, cast
 
@@ -16,7 +16,7 @@ from .source import ReplayRun, SourceMessage
 _LOOKAHEAD: Final = 1000  # messages read when a log is opened, for the initial list of addresses
 _MAX_STEP: Final = 1_000_000  # us; a longer step must be confirmed by the next message
 _MAX_GAP: Final = 60_000_000  # us; a longer step is skipped
-_MAX_BEHIND: Final = 1000  # consecutive messages that are older by more than that, after which the clock is set back
+_MAX_BEHIND: Final = 1000  # consecutive messages older than the clock by more than _MAX_GAP, which then set it back
 
 
 def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:
@@ -26,7 +26,7 @@ def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> Repl
     run = ReplayRun(iter(()), {}, None, "", position=0)
     messages = _read(reader, run, path, options)
     ahead = list(islice(messages, _LOOKAHEAD))
-    run.messages = (message for part in (ahead, messages) for message in part)
+    run.messages = chain(ahead, messages)
     run.total, run.boot_utc = path.stat().st_size, reader.boot_utc
     streams = list(reader.streams.values())
     layouts = " and ".join(sorted({_layout_name(each) for each in streams if each.definition is DEFAULT}))
@@ -58,8 +58,8 @@ class _Clock:
     """Replay clock: follows the timestamps of a log from the start of logging, and ignores outliers."""
 
     def __init__(self) -> None:
-        self.gaps = 0  # steps that were skipped as too long
-        self.unordered: Counter[Address] = Counter()  # timestamps
+        self.gaps = 0  # steps that were too long, and skipped
+        self.unordered: Counter[Address] = Counter()  # timestamps out of order
         self._now = self._due = self._behind = 0  # us; messages
         self._is_running = False
 
@@ -114,7 +114,7 @@ def _warnings_of(reader: UlogReader) -> list[str]:
 
 
 def _is_newer(stream: LoggedStream) -> bool:
-    """Return whether the log may be newer than nedbus: it has all fields of the newest known layout."""
+    """Return whether a stream has all fields of the newest known layout, as in a log newer than nedbus."""
     newest = [layout for layout in stream.definition.layouts.values() if layout.name != ALL][-1]
     return newest.types.keys() <= set(stream.names)
 

@@ -20,7 +20,7 @@ FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
 _MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
-_MAX_ALL_FIELDS: Final = 8192  # of all messages, including rejected ones: 45 us each; a real log has 1,500
+_MAX_ALL_FIELDS: Final = 8192  # of all messages, including rejected ones, as each costs 45 us; a real log has 1,500
 _MAX_FIELDS: Final = 1000  # of one message, including nested fields and padding; a real one has 100
 _MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
@@ -73,21 +73,21 @@ class PayloadLayout:
 
 
 class Formats:
-    """The format definitions of a log and their layouts; a hostile one may be recursive, or expand to gigabytes."""
+    """The format definitions of a log and their layouts; a hostile format may be recursive, or expand to gigabytes."""
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}
         self._layouts: dict[str, PayloadLayout] = {}
-        self._free = _MAX_FORMATS
-        self._left = _MAX_ALL_FIELDS
+        self._free_characters = _MAX_FORMATS
+        self._free_fields = _MAX_ALL_FIELDS
 
     def add(self, name: str, text: str) -> None:
         """Store a format definition; raise ValueError if it contradicts an earlier one, or there are too many."""
         if self._texts.get(name, text) != text:
             raise ValueError(f"{name} is defined twice, with different fields")
         if name not in self._texts:
-            self._free -= len(name) + len(text)
-            if self._free < 0:
+            self._free_characters -= len(name) + len(text)
+            if self._free_characters < 0:
                 raise ValueError(f"the format definitions have more than {_MAX_FORMATS} characters")
             self._texts[name] = text
 
@@ -105,8 +105,8 @@ class Formats:
         for number, (field, c_type, length) in enumerate(self._expand(name), 1):
             base = BASIC_TYPES[c_type]
             start, offset = offset, offset + base.size * (length or 1)
-            self._left -= 1
-            if self._left < 0:
+            self._free_fields -= 1
+            if self._free_fields < 0:
                 raise ValueError(f"the messages of the log have more than {_MAX_ALL_FIELDS} fields")
             if number > _MAX_FIELDS or offset > _MAX_SIZE:
                 raise ValueError(f"it has more than {_MAX_FIELDS} fields or {_MAX_SIZE} bytes")

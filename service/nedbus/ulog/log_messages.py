@@ -1,7 +1,7 @@
 """PX4's logged strings and events as `log_message` messages, without duplicates.
 
-The event metadata in a log is untrusted; its format: https://github.com/mavlink/libevents. It turns the id and the
-arguments of an event into a sentence.
+A log has event metadata, which turns the id and the arguments of an event into a sentence; it is untrusted.
+Its format: https://github.com/mavlink/libevents
 """
 
 import json
@@ -27,10 +27,10 @@ LOG_MESSAGE: Final = Subscription(-1, 0, "log_message", _LAYOUT)
 
 _TOPICS: Final = ("", "event", "vehicle_status")
 _INFO: Final = 6
-_PROTOCOL: Final = 8  # log level; from here on, events are for ground stations, not for display
+_PROTOCOL: Final = 8  # log level from which on events are for ground stations, not for display
 _ALL_MODES: Final = 2**32 - 1
 _WINDOW: Final = 50_000  # us between an event and its logged string; 4 ms were seen
-_MAX_A_SECOND: Final = 100  # messages; PX4 logs 20 at boot
+_MAX_PER_SECOND: Final = 100  # messages; PX4 logs 20 at boot
 _MAX_BYTES: Final = 127
 _MAX_CHARACTERS: Final = 1000  # read, including colour codes
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
@@ -156,14 +156,14 @@ class RateLimit:
         if abs(time - self._begin) >= 1_000_000:
             self._begin, self._count = time, 0
         self._count += 1
-        self.omitted += self._count > _MAX_A_SECOND
-        return self._count <= _MAX_A_SECOND
+        self.omitted += self._count > _MAX_PER_SECOND
+        return self._count <= _MAX_PER_SECOND
 
 
 class LogMessageBuilder:
     """Adds `log_message` messages to the records of a log or a stream.
 
-    A logged string with a trailing tab duplicates an event, logged before it in more detail: only the event is kept.
+    A logged string with a trailing tab duplicates an event, logged before it in more detail, and is dropped.
     PX4 reports all failed checks when one changes: only new ones become messages, with severity info if they do not
     affect the current mode.
 
@@ -175,7 +175,7 @@ class LogMessageBuilder:
         self.problem = ""
         self._packed = b""
         self._metadata: _EventMetadata | None = None
-        self._events: deque[tuple[int, str]] = deque(maxlen=100)  # unmatched events: time, words of a check
+        self._events: deque[tuple[int, str]] = deque(maxlen=100)  # unmatched events: time, first words of a check
         self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log an event twice
         self._failed: dict[str, tuple[int, int]] = {}  # checks in the current report: level, blocked modes
         self._earlier: dict[str, tuple[int, int]] = {}
@@ -221,7 +221,7 @@ class LogMessageBuilder:
             modes = _ALL_MODES if event.modes is None else event.modes
             affects_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
             shown, known = level if affects_mode else max(level, _INFO), self._failed.get(text, self._earlier.get(text))
-            if len(self._failed) < _MAX_A_SECOND:
+            if len(self._failed) < _MAX_PER_SECOND:
                 self._failed[text] = shown, modes if level < _INFO else 0
             if known and known[0] <= shown:
                 return None
@@ -242,9 +242,9 @@ class LogMessageBuilder:
     def _is_duplicate(self, record: LoggedText) -> bool:
         """Return whether an event has already reported this text; each event matches one text."""
         words = {_first_words(record.text), "" if record.text.endswith("\t") else "-"}
-        for each in self._events:
-            if abs(each[0] - record.timestamp) <= _WINDOW and each[1] in words:
-                self._events.remove(each)
+        for timestamp, check in self._events:
+            if abs(timestamp - record.timestamp) <= _WINDOW and check in words:
+                self._events.remove((timestamp, check))
                 return True
         return False
 

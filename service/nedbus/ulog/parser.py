@@ -133,9 +133,9 @@ class UlogParser:
             self._end_damage()
 
     def _consume_data(self, at: int) -> int:
-        """Consume consecutive data messages but the last, whose successor needs inspection; return its position."""
+        """Consume consecutive data messages except the last, whose successor needs inspection; return its position."""
         buffer, known, records = self._buffer, self._known, self._records
-        make = tuple.__new__  # half the time of calling a NamedTuple
+        make = tuple.__new__  # needs half the time of a NamedTuple's constructor
         found = known.get(buffer[at : at + _DATA_HEADER])
         mark = buffer.find(SYNC, at) if found else -1
         while found is not None:

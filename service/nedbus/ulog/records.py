@@ -120,7 +120,7 @@ _UNRESOLVED: Final = PayloadLayout((), 0, 0)
 
 
 def read_header(data: bytes) -> Header:
-    """Parse the 16-byte file header; raise UlogError if it is not that of a ULog."""
+    """Parse the 16-byte file header; raise UlogError for other data."""
     if len(data) < 16 or not data.startswith(b"ULog\x01\x12\x35"):
         raise UlogError("it does not begin with ULog's magic bytes")
     return Header(data[7], int.from_bytes(data[8:16], "little"))

@@ -56,7 +56,9 @@ def test_events_of_several_files_share_utc(swarm: list[str]) -> None:
     shown = run_command("events", "--json", *swarm)
     assert shown.exit_code == 0, shown.err
     for path, name in zip(swarm, ("a_1", "b", "c"), strict=True):
-        assert f"{path}: vehicle 1 is named {name} here, as several files have a vehicle 1" in shown.err.splitlines()
+        assert (
+            f"{path}: vehicle 1 is named {name} here, because several files have a vehicle 1" in shown.err.splitlines()
+        )
     found = [json.loads(line) for line in shown.out.splitlines()]
     assert {(each["vehicle"], each["time"]) for each in found} == {("b", "2025-10-09T08:54:25.000+00:00")}
     assert run_command("events", "-v", "a_1", *swarm).out == ""

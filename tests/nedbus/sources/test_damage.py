@@ -177,7 +177,7 @@ def make_logs(folder: Path) -> list[Path]:
 
 
 def rows_of(path: Path) -> dict[Address, MessageArray]:
-    """Return the messages of a log except log_message, as one flipped bit of the metadata alters all events."""
+    """Return the messages of a log except log_message, because one flipped bit of the metadata alters all events."""
     return {
         address: nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
         for address in nedbus.addresses_of(path)
@@ -186,7 +186,7 @@ def rows_of(path: Path) -> dict[Address, MessageArray]:
 
 
 def count_rows(streams: dict[Address, MessageArray], missing: Mapping[str, set[str]]) -> Counter[tuple[str, bytes]]:
-    """Count the messages of each topic by the values of all fields in the log; names of vehicles are values."""
+    """Count the messages of each topic by the values of all logged fields; damage may change the vehicle's name."""
     found: Counter[tuple[str, bytes]] = Counter()
     for address, messages in streams.items():
         fields = [name for name in messages.dtype.names or () if name not in missing.get(address.topic, ())]
@@ -273,7 +273,7 @@ def rewrite_index(path: Path, field: str, value: int) -> None:
     + [("chunk_length", each) for each in (10_000, 2**40, 2**62, 2**63, 2**64 - 1)],
 )
 def test_invalid_index_is_ignored(tmp_path: Path, field: str, value: int) -> None:
-    """With chunks outside the file, or two at one place, the file is read without its index, and nothing is lost."""
+    """An index with overlapping chunks, or chunks outside the file, is not used, and no message is lost."""
     path = write_recording(tmp_path / "a.mcap", finish=True)
     original = payloads_of(path)[0]
     rewrite_index(path, field, value)
@@ -326,7 +326,7 @@ def test_oversized_chunk_is_skipped(
 
 
 def test_number_of_damage_warnings_is_limited(tmp_path: Path) -> None:
-    """A file with a thousand damaged places causes a hundred warnings, and one that there are more."""
+    """A file with a thousand damaged places causes a hundred warnings; a last one says that more are omitted."""
     path = write_recording(tmp_path / "a.mcap", finish=False)
     place = struct.pack("<BQ", Opcode.MESSAGE_INDEX, 6) + bytes(6)
     path.write_bytes(path.read_bytes()[:-50] + (place + struct.pack("<BQ", 0x80, 0)) * 1000)
@@ -411,7 +411,7 @@ INVALID = {
 
 @pytest.mark.parametrize("invalid", INVALID.values(), ids=INVALID)
 def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: pytest.LogCaptureFixture) -> None:
-    """It is rejected with its position, and counted; the others are replayed, converted and read."""
+    """The message is rejected with its position, and counted; the others are replayed, converted and read."""
     path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), invalid, payload(3)])
     run = open_replay(f"mcap:{path}")
     messages = list(run.messages)

@@ -208,7 +208,7 @@ def test_attitude_is_consistent_with_estimate(
 def test_global_position_fits_local_position(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
-    """It is the projected position of the estimate, and valid while that is valid."""
+    """The global position is the projected local position, and valid whenever that is valid."""
     estimates = {message.timestamp: message for message in streams[VLP]}
     assert others["vehicle_global_position"][0].timestamp == 12_000_000  # the origin is known
     for message in others["vehicle_global_position"]:

@@ -196,7 +196,7 @@ def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> 
     ],
 )
 def test_unreadable_log_raises(tmp_path: Path, write: Callable[[Path], object], reason: str) -> None:
-    """The error names the file and the problem, also for a log of other topics."""
+    """The error names the file and the problem, even for a log of other topics."""
     path = tmp_path / "a.ulg"
     write(path)
     with pytest.raises(SourceError, match=reason) as info:

@@ -97,7 +97,7 @@ class Log(UlogWriter):
 @pytest.mark.logs
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
 def test_real_log_yields_each_string_and_event_once(path: Path) -> None:
-    """As pyulog decodes them, each event, and each string without an event, is one message; all others are checks."""
+    """Each event of pyulog, and each string without an event, is one message; all other messages are failed checks."""
     log = ULog(str(path))
     logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
@@ -206,7 +206,7 @@ def test_invalid_event_metadata_loses_only_events(metadata: bytes) -> None:
 
 
 def test_only_first_event_metadata_is_used() -> None:
-    """Thousands of metadata messages in a log would each need a decompression."""
+    """Later metadata is ignored, because each of thousands would need a decompression."""
     log = Log()
     log.event(1, 1, b"\2")
     for piece in (b"", b"damaged", lzma.compress(b"{}")):

@@ -14,7 +14,7 @@ from nedbus.errors import ConfigError, SourceError
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 Peer = Any  # remote address, as returned by the socket
 
-_CHANGES: Final = 5  # address changes within the window; a reconnect causes one, and a reordered packet two more
+_CHANGES: Final = 5  # of the address within the window: two senders. A reconnect is one, a reordered packet two more
 _WINDOW: Final = 5.0  # s
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
@@ -47,13 +47,13 @@ class _UdpLink:
         """Yield received datagrams with their senders; wait up to `timeout` seconds for the first."""
         if not _is_ready(self._socket, timeout):
             return
-        with suppress(BlockingIOError, ConnectionError):  # the peer is not listening yet
+        with suppress(BlockingIOError, ConnectionError):  # ICMP: the peer is not listening yet
             for _ in range(_MAX_DATAGRAMS):
                 yield self._socket.recvfrom(_MAX_READ)
 
     def send(self, data: bytes, peer: Peer) -> None:
         """Send without blocking; drop the data if that fails."""
-        with suppress(OSError):  # a temporary loss; otherwise the vehicle times out
+        with suppress(OSError):  # temporary, or the vehicle times out
             self._socket.sendto(data, peer)
 
 

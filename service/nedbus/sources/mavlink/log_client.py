@@ -12,10 +12,10 @@ COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_C
 
 _TRIES: Final = 3  # per unanswered command
 _RESTARTS: Final = 2  # after START was accepted, but no data arrived
-_ESTIMATED: Final = 32  # messages of a header after which its duration is estimated
-_EXPECTED: Final = 400  # messages of a header; 274 to 410 were measured
-_STOP_TAIL: Final = 10  # LOGGING_DATA_ACKED in a row; silence after them means STOP. PX4 sends 44 then, else at most 2
-_DECAY: Final = 0.98  # per message, of the longest interval between messages
+_MIN_COUNT: Final = 32  # messages of a header from which its duration is estimated
+_EXPECTED_COUNT: Final = 400  # messages of a header; 274 to 410 were measured
+_STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
+_DECAY: Final = 0.98  # factor per message on the longest interval between messages
 
 
 LogReason = Literal[
@@ -78,7 +78,7 @@ class LogStreamClient:
     Log `status` when it changes; repeated attempts with the same outcome do not change it.
 
     `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
-    Without "take", a rejected client stops only a stream addressed to its own ids: that of an earlier process.
+    Without "take", a rejected client stops only a stream addressed to its own ids, left by an earlier process.
     `system`, `component`: the MAVLink ids of this client.
     `header_seconds`: duration of the last header; None until it is complete.
     """
@@ -93,13 +93,13 @@ class LogStreamClient:
     def _reset(self) -> None:
         self.status = LogStatus("idle")
         self._awaited: Literal["start", "stop", "data"] | None = None
-        self._due = 0.0  # timeout of that wait, or else time of the next START
+        self._due = 0.0  # deadline of the awaited event, or else time of the next START
         self._tries = self._restarts = 0
         self._has_sent_command = self._took_over = False
-        self._has_header = False  # of the current stream, at least in part: its data can be decoded
+        self._has_header = False  # definitions of the current stream have arrived, at least in part
         self._header_messages = self._acked_in_row = 0
-        self._header_start = self._interval = 0.0  # `_interval`: the longest recent one
-        self._header_pause = 0.0  # longest in the header; excluded from the round trip, as it may be a burst of losses
+        self._header_start = self._interval = 0.0  # `_interval`: longest recent one between messages
+        self._header_pause = 0.0  # longest in the header; not in the round trip, because it may be a burst of losses
         self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 
@@ -133,7 +133,7 @@ class LogStreamClient:
         self._interval = max(now - self._last_data, _DECAY * self._interval)
         self._last_data = now
         self._acked_in_row = self._acked_in_row + is_new if acked else 0
-        # PX4 obeys STOP only after the header, unless an acknowledgement is missing.
+        # During the header PX4 obeys STOP only if an acknowledgement is missing.
         is_aborted = self._awaited == "stop" and reason == "slow_link"
         commands = [Command("acknowledge", sequence)] if acked and not is_aborted else []
         if self._awaited == "stop" or state in ("stopping", "stopped"):
@@ -245,8 +245,8 @@ class LogStreamClient:
         """Stop a stream whose header takes too long, or is expected to."""
         elapsed, count = now - self._header_start, self._header_messages
         round_trip = (elapsed - self._header_pause) / max(1, count - 2)
-        expected = elapsed + round_trip * max(0, _EXPECTED - count)
-        if (expected if count >= _ESTIMATED else elapsed) <= TIMINGS.log_header:
+        expected = elapsed + round_trip * max(0, _EXPECTED_COUNT - count)
+        if (expected if count >= _MIN_COUNT else elapsed) <= TIMINGS.log_header:
             return []
         self._has_header = False
         self._enter("refused", "slow_link", now, expected, 1e3 * round_trip)
@@ -259,7 +259,7 @@ class LogStreamClient:
                 return self._send("stop", now)
             if state in ("header", "streaming"):
                 self._enter("starting", "silent", now, now - self._last_data)
-            elif self.status.reason != "no_data":  # which is kept while START is retried
+            elif self.status.reason != "no_data":  # "no_data" stays while START is retried
                 self._enter("starting", None, now)
             self._awaited, self._has_header, self._due = "data", False, now + TIMINGS.log_answer
         elif state == "stopping":
@@ -283,7 +283,7 @@ class LogStreamClient:
             if is_repeated:
                 return self._send("stop", now, tries=self._tries)
             self._end_stop(now)
-        elif state == "stopping":  # START was not answered: no stream to stop
+        elif state == "stopping":  # START was not answered, so there is no stream to stop
             self._enter("stopped", None, now)
         elif awaited == "data" and not is_lost:
             self._restarts += 1

@@ -26,8 +26,8 @@ class Chunk(NamedTuple):
 
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
     `begins`: a new stream begins with `data`: it needs a new parser.
-    `lost`: number of messages lost before this one: the parser must discard its partial record before `data`. It is
-    exact for gaps of less than 65,536 messages, and a lower bound otherwise.
+    `lost`: number of messages lost before this one, exact for gaps of less than 65,536, and a lower bound otherwise.
+    After a loss the parser must discard its partial record before `data`.
     """
 
     verdict: Verdict
@@ -37,17 +37,14 @@ class Chunk(NamedTuple):
 
 
 class Reassembly:
-    """Reassembles the successive ULog streams of one vehicle.
+    """Reassembles the successive ULog streams of one vehicle since its boot.
 
+    After a reboot use a new one: the header may have the same bytes as before.
     A lost message contains at most 249 bytes; each gap loses at least one ULog record.
     """
 
     def __init__(self) -> None:
         self._old_next = self._old_run = 0
-        self.reset()
-
-    def reset(self) -> None:
-        """Reset after a reboot of the vehicle: the next stream may begin with the same bytes."""
         self._first = b""  # data of the first message, to distinguish its retransmission from a new stream
         self._last: int | None = None  # sequence; None before the first stream
         self._synchronised = False

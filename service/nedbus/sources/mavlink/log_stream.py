@@ -21,7 +21,7 @@ from .log_reassembly import Chunk
 
 _log = logging.getLogger(__name__)
 
-_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; that of converted ones is `mavlink`
+_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted ones have `mavlink`
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
@@ -34,7 +34,7 @@ _MAX_SAME_NAME: Final = 100
 
 
 class LogStream:
-    """The stream of one vehicle, on the thread of the source; `client` runs on that of the link."""
+    """ULog stream of one vehicle, used on the thread of the source; `client` is used on the thread of the link."""
 
     def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
         self._name, self._client = name, client
@@ -54,7 +54,7 @@ class LogStream:
         self._restart()
 
     def _restart(self) -> None:
-        """Discard the definitions: those of the next stream may differ."""
+        """Discard the definitions, which may differ in the next stream."""
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[int, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
@@ -84,13 +84,13 @@ class LogStream:
             return
         self._received += len(chunk.data)
         self._window_bytes += len(chunk.data)
-        known, before, omitted = self._parser, self._parser.undecodable, self._texts.limit.omitted
+        undecodable, omitted = self._parser.undecodable, self._texts.limit.omitted
         try:
-            records = known.feed(chunk.data)
+            records = self._parser.feed(chunk.data)
         except ulog.UlogError as exc:
             yield Rejection(f"{self._name} ULog stream", str(exc))
             return
-        self._undecodable += known.undecodable - before
+        self._undecodable += self._parser.undecodable - undecodable
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
                 stream = self._streams.get(record.subscription.message_id)
@@ -117,7 +117,7 @@ class LogStream:
             self._round_trip = now - sent
             self._clock = vehicle_time - (sent + now) / 2, now
 
-    def log_changes(self, now: float) -> None:
+    def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
         status, address = self._client.status, Address(self._name, DEFAULT_TOPIC)
         if not self.is_streaming:
@@ -149,7 +149,7 @@ class LogStream:
         )  # fmt: skip
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the saved file."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -183,7 +183,7 @@ class LogStream:
         least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
         self._at_least += least
         self._unreported += least
-        # Includes the message that ends the gap, and the record that it cut.
+        # Include the message that ends the gap, and the record that the gap cut.
         self._at_most += math.ceil(_CHUNK_SIZE * (lost + 1) / smallest) + 1
         self._parser.gap()
 
@@ -207,7 +207,7 @@ class LogStream:
 
 
 class LogFile:
-    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, as on a full disk."""
+    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, such as on a full disk."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)

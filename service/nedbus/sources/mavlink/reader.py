@@ -18,9 +18,8 @@ from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
 
-_MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
-_KINDS: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
-_MAX_WAITING: Final = 16_384  # messages read ahead; more are lost, as the sequence numbers of both protocols show
+_MAX_BUFFER: Final = 2**16  # bytes that the parser of a TCP or serial link may buffer
+_MAX_WAITING: Final = 16_384  # messages queued for `read`; later ones are dropped, and counted as lost
 _MAX_READ: Final = 100  # messages per call
 _TICK: Final = 0.05  # s, the longest wait of the thread
 _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
@@ -63,12 +62,12 @@ def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterat
         if message.get_type() == "BAD_DATA":
             yield Rejection(name, f"{len(raw)} bytes that are not MAVLink")
             continue
-        # For a message that the dialect lacks, only the header can be parsed.
+        # Only the header of a message can be parsed if the dialect lacks its definition.
         sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
         reason = ignore_reason(system, component)
         if not reason:
             yield Received(message, system, sequence, peer, now)
-        elif not ((system and component) or message.get_type().startswith("UNKNOWN")):  # others, as cameras, are normal
+        elif not ((system and component) or message.get_type().startswith("UNKNOWN")):  # cameras etc. are normal
             yield Rejection(f"{name} system {system} component {component}", reason)
 
 
@@ -91,7 +90,7 @@ class _Vehicle:
 class LogReceiver:
     """Reads a link on a dedicated thread, which acknowledges PX4's log stream even while publishing blocks.
 
-    `send`: sends a MAVLink message to a peer, without blocking. `vehicles`: those that have sent a heartbeat.
+    `send`: sends a MAVLink message to a peer, without blocking. `vehicles`: by system id, from the first heartbeat on.
     """
 
     def __init__(
@@ -141,18 +140,18 @@ class LogReceiver:
 
     def _step(self) -> None:
         for item in self._reader.read(_TICK):
-            has_room = self._waiting.qsize() < _MAX_WAITING
-            received = self._process(item, has_room=has_room) if isinstance(item, Received) else item
-            if has_room:
+            is_full = self._waiting.qsize() >= _MAX_WAITING
+            received = self._process(item, is_full=is_full) if isinstance(item, Received) else item
+            if not is_full:
                 self._waiting.put(received)
         for vehicle in self.vehicles.values():
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
-    def _process(self, received: Received, *, has_room: bool) -> Received | Rejection:
-        """Acknowledge a message and reassemble its data; if the queue is full, drop it as if the link had lost it."""
+    def _process(self, received: Received, *, is_full: bool) -> Received | Rejection:
+        """Acknowledge a message and reassemble its data; if the queue is full, drop it like a lost message."""
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self.vehicles.get(received.system)
-        if kind in _KINDS:
+        if kind.startswith("LOGGING_DATA"):
             target = message.target_system, message.target_component
             if vehicle is None or not vehicle.client.accepts(*target):
                 if target != self._ids:
@@ -160,11 +159,11 @@ class LogReceiver:
                 where = f"{self._reader.name} system {received.system}"
                 return Rejection(where, f"{kind} of a stream that was not requested")
             begins = False
-            if has_room:
+            if not is_full:
                 fields = message.sequence, message.length, message.first_message_offset, message.data
                 chunk = vehicle.reassembly.add(*fields)
                 received, begins = received._replace(chunk=chunk), chunk.begins
-            is_acked = kind == _KINDS[0]
+            is_acked = kind == "LOGGING_DATA_ACKED"
             self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
         elif kind == "HEARTBEAT":
             if vehicle is None:
@@ -180,7 +179,7 @@ class LogReceiver:
         elif vehicle is not None and (ms := getattr(message, "time_boot_ms", None)) is not None:
             if is_reboot(ms, vehicle.newest):
                 vehicle.client.on_reboot()
-                vehicle.newest = ms
+                vehicle.reassembly, vehicle.newest = Reassembly(), ms
             vehicle.newest = max(ms, vehicle.newest)
         return received
 

@@ -63,7 +63,7 @@ class MavlinkSource:
 
 
 class _LinkSession:
-    """One open link: convert messages, request streams, send heartbeats; with `log=`, publish the ULog streams."""
+    """One open link: convert messages, request them, send heartbeats; with `log=`, decode the ULog streams."""
 
     def __init__(self, link: Link, options: MavlinkOptions, *, name: str) -> None:
         self._link, self._options, self._name = link, options, name
@@ -97,7 +97,7 @@ class _LinkSession:
                 next_requests = now + TIMINGS.source_tick
                 self._send_requests(now)
                 for log in self._logs.values():
-                    log.log_changes(now)
+                    log.log_changes()
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
                 # Routers and vehicles send only to components that have announced themselves.
@@ -159,6 +159,6 @@ class _LinkSession:
                 self._send(message, self._peers[system])
 
     def _send(self, message: Any, peer: Peer) -> None:
-        with self._sending:  # the reading thread sends acknowledgements
+        with self._sending:  # the thread of LogReceiver sends acknowledgements
             self._link.send(message.pack(self._sender), peer)
             self._sender.seq = (self._sender.seq + 1) % 256

@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -21,7 +21,7 @@ from .vehicle import Vehicle
 _LOOKAHEAD: Final = 1000  # messages read when a file is opened, for the initial list of addresses
 _MAX_GAP: Final = 60_000_000  # us; a longer step is a pause or a damaged time, and is skipped
 _HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
-_LONGEST: Final = _HEAD.size + 290  # bytes of a record
+_MAX_RECORD: Final = _HEAD.size + 290  # bytes of a record
 _OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}  # bytes of a frame without payload
 _SIGNATURE: Final = 13  # bytes
 
@@ -31,7 +31,7 @@ class TlogReader:
 
     def __init__(self, path: Path, topics: Collection[str] | None = None, *, vehicle: str | None = None) -> None:
         self._path, self._options, self._vehicle = path, MavlinkOptions(topics=tuple(topics or ())), vehicle
-        self.definitions: dict[Address, Definition[Any] | None] = {}  # of each address so far
+        self.definitions: dict[Address, Definition[Any] | None] = {}  # of the addresses so far
         self._boots: set[int] = set()  # Unix times [us]
         self.damaged = self.position = 0  # bytes
 
@@ -73,12 +73,12 @@ class TlogReader:
             raise SourceError(str(self._path), "; ".join([reason, *self.warnings]))
 
     def _frames(self) -> Iterator[tuple[int, bytes]]:
-        """Yield each frame with its time [us]; after damage, search for two consecutive ones."""
+        """Yield each frame with its time [us]; after damage, search for two consecutive records."""
         with open_flight(self._path) as file:
             data, is_found = b"", True
-            while data := data + file.read(2 * _LONGEST - len(data)):
-                length = _length(data)
-                is_found = bool(length) and (is_found or len(data) == length or _length(data[length:]) > 0)
+            while data := data + file.read(2 * _MAX_RECORD - len(data)):
+                length = _record_length(data)
+                is_found = bool(length) and (is_found or len(data) == length or _record_length(data[length:]) > 0)
                 if not is_found or length > len(data):
                     self.damaged += 1
                     self.position, data = self.position + 1, data[1:]
@@ -95,7 +95,7 @@ def open_tlog(file: str, options: RecordedOptions, _: str) -> ReplayRun:
     messages = _read(reader, run, path, options)
     ahead = list(islice(messages, _LOOKAHEAD))
     vehicles = sorted({address.vehicle for address in reader.definitions})
-    run.messages = (message for part in (ahead, messages) for message in part)
+    run.messages = chain(ahead, messages)
     run.total = path.stat().st_size
     run.summary = f"vehicle {', '.join(vehicles)}, {run.total / 1e6:.1f} MB"
     return run
@@ -111,7 +111,7 @@ def _read(reader: TlogReader, run: ReplayRun, path: Path, options: RecordedOptio
         run.damage = f"{path}: messages lost to damage: {'; '.join(reader.warnings)}"
 
 
-def _length(data: bytes) -> int:
+def _record_length(data: bytes) -> int:
     """Return the length of the record at the start of these bytes, 0 if there is none."""
     if len(data) < _HEAD.size + 1:
         return 0

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 _VALUE_TIMEOUT: Final = 2.0  # s for which a received value is merged into the estimate
 _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS once a second
 _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
-_FIRST_ROUNDS: Final = 3  # initial transmissions of each request, as links lose some
+_FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose some
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
@@ -50,7 +50,7 @@ STREAMS: Final = {
 """Messages to request, in order: bytes per message (MAVLink 2, from PX4), Hz (0 for `rate`), topics that need it."""
 
 _MIN_RATE: Final = 2.0  # Hz, on a saturated link
-_USABLE_PART: Final = 0.9  # share of a link; the rest is for heartbeats and answers
+_USABLE_SHARE: Final = 0.9  # of a link's bandwidth; the rest is for heartbeats and answers
 _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bits
 
 
@@ -65,7 +65,7 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
         if not set(needed.split()).isdisjoint(topics)
     }
     others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
-    free = _USABLE_PART * baud / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    free = _USABLE_SHARE * baud / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
     for index, number in enumerate(others):
         level = free / sum(STREAMS[each][0] for each in others[index:])
         wanted[number] = min(wanted[number], max(_MIN_RATE, level))
@@ -92,8 +92,8 @@ class Vehicle:
 
     def _reset(self, now: float) -> None:
         """Discard all state and request everything again, after silence or a reboot."""
-        self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
-        self._last: dict[Address, int] = {}  # timestamps
+        self._stored: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
+        self._last: dict[Address, int] = {}  # newest timestamps
         self._sequence: int | None = None
         self._texts = _StatusTexts()
         self._started = now
@@ -102,7 +102,7 @@ class Vehicle:
         self._next_round = now + _REQUEST_INTERVAL
 
     def track_sequence(self, sequence: int, now: float, *, counted: int = 0) -> None:
-        """Count the messages of any type lost before this one; `counted`: those that the ULog stream has counted."""
+        """Count the messages of any type lost before this one; `counted`: those already counted by the ULog stream."""
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
@@ -116,7 +116,7 @@ class Vehicle:
     def next_request(self, now: float) -> tuple[int, float] | None:
         """Return id and rate [Hz] of the next message to request, rate 0 for a single one; None if none is due.
 
-        Each message is requested three times, and then again until it arrives.
+        Each message is requested three times, and then every 5 s until it arrives.
         """
         if now - self._last_message > _SILENCE_TIMEOUT:
             return None
@@ -141,16 +141,16 @@ class Vehicle:
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
-        is_double = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
-        self._remember(kind, message, timestamp, now)
+        is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
+        self._store_fields(kind, message, timestamp, now)
         if kind == "STATUSTEXT" and LOG_MESSAGE.name in self._topics:
             if not self._text_limit.admits(round(now * 1e6)):
                 address = Address(self._name, LOG_MESSAGE.name)
                 return Rejection(str(address), "more than 100 texts a second", address)
             self._texts.add(message, now)
         if fields_of is None and self._newest is not None:
-            topic, timestamp, fields_of = LOG_MESSAGE.name, self._newest * 1000, lambda _: self._texts.take(now)
-        if fields_of is None or topic not in self._topics or is_double or timestamp is None:
+            topic, timestamp, fields_of = LOG_MESSAGE.name, self._newest * 1000, lambda _: self._texts.pop(now)
+        if fields_of is None or topic not in self._topics or is_redundant or timestamp is None:
             return None
         fields = {name: value for name, value in fields_of(message).items() if value is not None}
         if not fields:
@@ -162,27 +162,27 @@ class Vehicle:
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
-        self._complete(topic, fields, timestamp, now)
+        self._add_stored_fields(topic, fields, timestamp, now)
         lost, rebooted, self.lost, self._rebooted = self.lost, self._rebooted, 0, False
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
-    def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
+    def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
-                self._keep("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
+                self._store("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
             case "ATTITUDE" if math.isfinite(message.yaw):
-                self._keep("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
+                self._store("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
-                self._keep("origin", math.inf, xy_global=True, z_global=True, **known)
+                self._store("origin", math.inf, xy_global=True, z_global=True, **known)
                 self._arrivals[ORIGIN] = math.inf  # it is sent once for each request
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance) and message.bottom_clearance >= 0
                 bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
-                self._keep("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
+                self._store("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
             case "ODOMETRY":
                 covariance, known = message.velocity_covariance, {}
                 north, east, down = covariance[0], covariance[6], covariance[11]
@@ -190,29 +190,29 @@ class Vehicle:
                     known["evh"] = math.sqrt(north + east)
                 if math.isfinite(down) and down >= 0:
                     known["evv"] = math.sqrt(down)
-                self._keep("velocity", now + _VALUE_TIMEOUT, **known)
+                self._store("velocity", now + _VALUE_TIMEOUT, **known)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
                 known = {name: value for name, value in deviations.items() if math.isfinite(value)}
                 valid = _validity(message.flags)
-                self._keep("status", now + _STATUS_TIMEOUT, **valid, **known)
+                self._store("status", now + _STATUS_TIMEOUT, **valid, **known)
                 is_global = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS)
                 on_globe = {"lat_lon_valid": valid["xy_valid"] and is_global, "alt_valid": valid["z_valid"]}
-                self._keep("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
+                self._store("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
                 names = [f"onboard_control_sensors_{part}" for part in ("present", "enabled", "health")]
-                self._keep("sensors", now + _STATUS_TIMEOUT, **{name: getattr(message, name) for name in names})
+                self._store("sensors", now + _STATUS_TIMEOUT, **{name: getattr(message, name) for name in names})
             case "SYSTEM_TIME" if timestamp is not None and is_unix_time(message.time_unix_usec):
-                self._keep("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
+                self._store("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
 
-    def _keep(self, name: str, until: float, **fields: object) -> None:
-        self._kept[name] = fields, until
+    def _store(self, name: str, until: float, **fields: object) -> None:
+        self._stored[name] = fields, until
 
     def _recall(self, name: str, now: float) -> dict[str, object]:
-        fields, until = self._kept.get(name, ({}, 0.0))
+        fields, until = self._stored.get(name, ({}, 0.0))
         return fields if now <= until else {}
 
-    def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
+    def _add_stored_fields(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
         match topic:
             case "vehicle_local_position":
                 for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
@@ -281,8 +281,8 @@ class _StatusTexts:
         if not message.id or len(data) < _CHUNK or b"\0" in data:
             self._finish()
 
-    def take(self, now: float) -> dict[str, object]:
-        """Return the fields of the next text that is complete or has timed out, else {}."""
+    def pop(self, now: float) -> dict[str, object]:
+        """Remove the next text that is complete or has timed out; return its fields, or {} if there is none."""
         if self._next and now - self._time > _CHUNK_TIMEOUT:
             self._finish("...")
         return self._waiting.popleft() if self._waiting else {}

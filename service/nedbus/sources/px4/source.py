@@ -53,7 +53,7 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohSource:
-    """All publishers of px4_msgs on a router: the service's own, at the endpoints `routers`, or another one."""
+    """All publishers of px4_msgs on the router at `endpoint`, or by default on that of the service, at `routers`."""
 
     def __init__(
         self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
@@ -64,7 +64,7 @@ class Px4ZenohSource:
         self._is_own = not endpoint or endpoint in routers
         self._tls = tls
         self._options = options
-        self._given = _read_definitions(options.msg)
+        self._supplied = _read_definitions(options.msg)
         self._vehicle = options.vehicle or vehicle
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
@@ -80,7 +80,7 @@ class Px4ZenohSource:
                     reason = "no Zenoh router answers: start one, or set another one with px4-zenoh:tcp/HOST:7447"
                     raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
                 closing.callback(session.close)
-            streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
+            streams = StreamRegistry(self._options, vehicle=self._vehicle, supplied=self._supplied)
             node = Px4ZenohNode(session, streams, domain=self._options.domain)
             closing.callback(node.close)
             yield from node.run()  # the session reconnects automatically

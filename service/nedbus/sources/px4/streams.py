@@ -28,7 +28,7 @@ _MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a ga
 _TIMEOUT: Final = 3.0  # s without messages after which another publisher may use the address
 _EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
 _SETTLE_TIME: Final = 1.0  # s during which messages may still arrive after a publisher's token is gone
-_SILENCE: Final = 5.0  # s without messages, or periods of the nominal rate if that is longer
+_SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after which a topic without messages is silent
 _MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each its own namespace or domain"
 
@@ -101,9 +101,9 @@ class Px4Stream:
 class StreamRegistry:
     """All keys with publishers or messages, and the stream that owns each address."""
 
-    def __init__(self, options: Px4ZenohOptions, *, vehicle: str, given: Definitions | None = None) -> None:
+    def __init__(self, options: Px4ZenohOptions, *, vehicle: str, supplied: Definitions | None = None) -> None:
         self._options = options
-        self._given = given or {}
+        self._supplied = supplied or {}
         self._vehicle = vehicle
         self._streams: dict[str, Px4Stream] = {}
         self._owners: dict[Address, Px4Stream] = {}
@@ -174,7 +174,7 @@ class StreamRegistry:
         if stream.is_input or not restarted:
             return lost, False
         known = self._reboots.get(stream.address.vehicle, 0)
-        is_first = stream.reboots == known  # of its vehicle's streams to restart
+        is_first = stream.reboots == known  # its vehicle's first stream to restart
         self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
         return lost, is_first
 
@@ -228,10 +228,10 @@ class StreamRegistry:
 
     def _unsupported_name(self, key: TopicKey, topic: str) -> str | None:
         options, name = self._options, _message_name(key)
-        is_known = key.dds_type in _by_dds_type() or key.dds_type in self._given
+        is_known = key.dds_type in _by_dds_type() or key.dds_type in self._supplied
         if options.chosen_topics is None:
             return None if is_known else name
-        if topic in options.chosen_topics or (not options.topics and key.dds_type in self._given):
+        if topic in options.chosen_topics or (not options.topics and key.dds_type in self._supplied):
             return None
         return "" if options.topics else f"{name} on {topic}" if is_known else name
 
@@ -245,22 +245,23 @@ class StreamRegistry:
         return "-".join(filter(None, [of_domain, namespace.replace("/", "-")])) or self._vehicle
 
     def _layout_of(self, key: TopicKey, topic: str) -> tuple[Definition[Any], Layout]:
-        """Return definition and layout for the type hash of a key, else those that the user supplied."""
-        name, known, given = _message_name(key), _by_dds_type().get(key.dds_type), self._given.get(key.dds_type, {})
+        """Return nedbus's definition and layout for the type hash of a key, else those supplied by the user."""
+        name, known = _message_name(key), _by_dds_type().get(key.dds_type)
+        supplied = self._supplied.get(key.dds_type, {})
         expected = BY_TOPIC.get(topic)
         if expected is not None and expected is not known:
             raise NotAcceptedError(f"{topic} has messages of type {expected.name}, not {name}")
         found = message_of_type_hash(key.type_hash)
         if found is not None and found[0] is known:
             return found
-        own = given.get(key.type_hash)
-        if own is None and key.type_hash == NO_HASH and len(given) == 1:
-            [own] = given.values()
+        own = supplied.get(key.type_hash)
+        if own is None and key.type_hash == NO_HASH and len(supplied) == 1:
+            [own] = supplied.values()
         if own is not None:
             return known or own, own.current
         hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
-        if given:
-            hashes = " or ".join(given)
+        if supplied:
+            hashes = " or ".join(supplied)
             reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}: use the file of this PX4"
         elif known is None:
             reason = f"{name} with the type hash {key.type_hash} is unknown: {hint}"

@@ -1,8 +1,8 @@
-"""Simulated MAVLink 2 vehicle for tests: one UDP socket, one process, the streams of a PX4 from a file of rows.
+"""Simulated MAVLink 2 vehicle for tests: a process that sends the streams of a PX4 over UDP, with values from a file.
 
 Each position sent is a JSON line on stdout with its float32 values; the last line has the number of dropped packets.
 The same arguments produce the same packets in the same order; commands are not answered.
-Unlike PX4, it sends GLOBAL_POSITION_INT (the heading) without an origin, too, and repeats GPS_GLOBAL_ORIGIN.
+Unlike PX4, it sends GLOBAL_POSITION_INT (the heading) even without an origin, and repeats GPS_GLOBAL_ORIGIN.
 """
 
 import argparse

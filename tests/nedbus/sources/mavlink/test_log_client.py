@@ -23,7 +23,7 @@ REJECTED: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
 IN_PROGRESS: Final = dialect.MAV_RESULT_IN_PROGRESS
 
 Log = Literal["1", "armed", "take"]
-Reason = tuple[LogState, LogReason | None]
+StateAndReason = tuple[LogState, LogReason | None]
 
 
 class Session:
@@ -33,7 +33,7 @@ class Session:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
         self.autopilot, self.armed, self.now = autopilot, armed, 1000.0
         self.sent: list[Command] = []
-        self.states: list[Reason] = [("idle", None)]
+        self.states: list[StateAndReason] = [("idle", None)]
         self.texts: list[str] = []
         self._next = 0
 
@@ -363,7 +363,7 @@ class TestHeader:
 
     @pytest.mark.parametrize("round_trip", [0.03, 0.08, 0.2, 3.0])
     def test_long_round_trip_aborts_header(self, session: Session, round_trip: float) -> None:
-        """The first messages decide; acknowledgements cease, as PX4 obeys STOP only then or after the header."""
+        """The first messages decide; acknowledgements cease, because during the header PX4 obeys STOP only then."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         began = session.now
@@ -591,7 +591,7 @@ class Replay:
     def __init__(self, name: str, begin: float, end: float, ids: tuple[int, int], *log: Log) -> None:
         self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1])
         self.reassembly = CountingReassembly()
-        self.states: list[Reason] = [("idle", None)]
+        self.states: list[StateAndReason] = [("idle", None)]
         self.acknowledged: list[int] = []
         self.recorded: list[int] = []
         self._boot, last = 0, begin
@@ -601,14 +601,14 @@ class Replay:
             if begin <= now < end:
                 while last + 0.1 < now:
                     last += 0.1
-                    self._note(self.client.tick(last))
+                    self._add(self.client.tick(last))
                 for message in parser.parse_buffer(frame) or []:
                     if is_sent and message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1:
-                        self._note([*self._handle(message, now), *self.client.tick(now)])
+                        self._add([*self._handle(message, now), *self.client.tick(now)])
                     elif not is_sent and message.get_type() == "LOGGING_ACK":
                         self.recorded.append(message.sequence)
 
-    def _note(self, commands: list[Command]) -> None:
+    def _add(self, commands: list[Command]) -> None:
         self.acknowledged += [each.sequence for each in commands if each.kind == "acknowledge"]
         if self.client.status[:2] != self.states[-1]:
             self.states.append(self.client.status[:2])
@@ -628,16 +628,16 @@ class Replay:
         elif (ms := getattr(message, "time_boot_ms", None)) is not None:
             if ms < self._boot - 1000:
                 client.on_reboot()
-                self._note([])
+                self._add([])
             self._boot = ms
 
 
 @pytest.mark.logs
-@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there")
+@pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist")
 class TestRecordedSessions:
     """Replays of recorded sessions of a real PX4 with two clients."""
 
-    STARTED: Final[list[Reason]] = [("starting", None), ("header", None), ("streaming", None)]
+    STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("streaming", None)]
 
     def test_flight_is_acknowledged_like_recorded_client(self) -> None:
         """The acknowledgements are the recorded ones in the same order, including late topics and those after STOP."""
@@ -656,7 +656,7 @@ class TestRecordedSessions:
     def test_stream_continues_after_client_stops_reading(self) -> None:
         """Pauses of 5 s and 12 s without reading lose 615 and 3,433 messages, and the stream continues."""
         replay = Replay("session", 26.2, 52.0, (245, 190))
-        outage: list[Reason] = [("ended", "link_lost"), ("streaming", None)]
+        outage: list[StateAndReason] = [("ended", "link_lost"), ("streaming", None)]
         assert replay.states[1:] == [*self.STARTED, *outage, *outage]
         assert replay.reassembly.lost == 615 + 3433
 

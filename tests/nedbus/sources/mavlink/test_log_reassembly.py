@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import random
+import socket
 import struct
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from functools import cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.sources.mavlink.link import open_link
 from nedbus.sources.mavlink.log_reassembly import Chunk
+from nedbus.sources.mavlink.reader import LinkReader, LogReceiver, Received
+from nedbus.sources.options import MavlinkOptions
+from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
+from tests.waits import DEADLINE
 
 from .counting_reassembly import CountingReassembly
 
@@ -24,7 +32,7 @@ SIZE: Final = 249
 
 needs_recordings = [
     pytest.mark.logs,
-    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
+    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
 ]
 
 
@@ -52,12 +60,26 @@ def test_retransmitted_first_message_begins_no_new_stream() -> None:
     assert reassembly.lost == 0
 
 
-def test_same_first_message_begins_stream_after_reset() -> None:
-    """After a reboot a header with the same bytes begins a new stream."""
-    reassembly = CountingReassembly()
-    begin(reassembly)
-    reassembly.reset()
-    begin(reassembly)
+def test_same_first_message_begins_new_stream_after_reboot() -> None:
+    """After a reboot, a header with the same bytes begins a new stream; without one it is a retransmission."""
+    ids, port, encoder = (245, 191), free_port(), dialect.MAVLink(None, 1, 1)
+    header = dialect.MAVLink_logging_data_acked_message(*ids, 0, SIZE, 0, [*HEADER.ljust(SIZE, b"\0")])
+    heartbeat = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+    times = [dialect.MAVLink_system_time_message(0, ms) for ms in (9000, 100)]
+    with (
+        closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+    ):
+        options, reader = MavlinkOptions(log=frozenset({"1"})), LinkReader(link, name="link")
+        receiver = LogReceiver(reader, options, lambda *_: None, system=ids[0], component=ids[1])
+        with closing(receiver):
+            messages: list[Any] = [heartbeat, header, header, *times, heartbeat, header]
+            for message in messages:
+                vehicle.sendto(message.pack(encoder), ("127.0.0.1", port))
+            received: list[Received] = []
+            while len(received) < len(messages):
+                received += [each for each in receiver.read(DEADLINE) if isinstance(each, Received)]
+    assert [each.chunk.begins for each in received if each.chunk] == [True, False, True]
 
 
 def test_stream_joined_midway_has_no_definitions() -> None:
@@ -126,7 +148,7 @@ def test_sequence_wraps_without_loss() -> None:
     assert reassembly.counts.total() == 2**16 + 2
 
 
-def test_largest_loss_is_half_of_sequence() -> None:
+def test_largest_loss_is_half_of_sequence_range() -> None:
     """A step of 32,768 is the largest loss; a larger one is a late message, unless the next ones continue it."""
     reassembly = CountingReassembly()
     begin(reassembly)
@@ -136,8 +158,8 @@ def test_largest_loss_is_half_of_sequence() -> None:
     assert add(reassembly, plain(2**15 + 1)) == Chunk("duplicate")
 
 
-def test_stream_resumes_after_loss_of_more_than_half_of_sequence() -> None:
-    """A long run of consecutive old numbers is the live stream: all messages in between were lost."""
+def test_stream_resumes_after_loss_of_more_than_half_of_sequence_range() -> None:
+    """A long run of consecutive old sequence numbers continues the stream: all messages in between were lost."""
     reassembly = CountingReassembly()
     begin(reassembly)
     chunks = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
@@ -175,7 +197,7 @@ def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], Count
 
 
 class Impaired(NamedTuple):
-    """Messages in order of arrival, and the indices of those in the original list that arrive in order."""
+    """`messages`: in order of arrival; `in_order`: original indices of the messages that do not arrive late."""
 
     messages: list[Message]
     in_order: set[int]
@@ -310,7 +332,7 @@ class TestRecordings:
     ("loss", "burst", "reorder"), [(0.03, 1, 0.0), (0.05, 1, 0.0), (0.05, 20, 0.0), (0.0, 1, 0.02), (0.03, 5, 0.02)]
 )
 class TestImpairedLink:
-    """The same flight with messages dropped and reordered."""
+    """A recorded flight with messages dropped and reordered."""
 
     pytestmark = needs_recordings
 

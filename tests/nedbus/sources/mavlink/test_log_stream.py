@@ -50,7 +50,7 @@ def recorded_flight(test: Any) -> Any:
 
 @pytest.fixture(autouse=True)
 def long_timeouts(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
-    """Lengthen queues and timeouts, as a flight is sent as fast as it is read."""
+    """Lengthen queues and timeouts, because a flight is sent as fast as it is read."""
     timings.log_answer, timings.log_link, timings.log_header = DEADLINE, DEADLINE, 10 * DEADLINE
     monkeypatch.setattr(reader, "_MAX_WAITING", 1_000_000)
 
@@ -166,13 +166,13 @@ def test_published_stream_and_saved_file_equal_log_of_vehicle(tmp_path: Path) ->
 def test_log_messages_of_stream_equal_those_of_log() -> None:
     """Logged strings and events become the log_message of the log; STATUSTEXT is used only before the stream."""
     received = Received("log=1&topics=log_message", FLIGHT)
-    words = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
-    assert {each.source for each in words} == {"mavlink-ulog"}
+    texts = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
+    assert {each.source for each in texts} == {"mavlink-ulog"}
     logged = log_messages_in(STREAMS / "ulog_stream_flight1.ulg")
-    assert [tuple(each.fields.values()) for each in words] == [
-        each for each in logged if 7_000_000 < each[0] <= cast("int", words[-1].fields["timestamp"])
+    assert [tuple(each.fields.values()) for each in texts] == [
+        each for each in logged if 7_000_000 < each[0] <= cast("int", texts[-1].fields["timestamp"])
     ]
-    assert len(words) == 10
+    assert len(texts) == 10
 
 
 @recorded_flight
@@ -198,8 +198,8 @@ def test_stream_replaces_converted_topics() -> None:
 def test_losses_are_within_bounds(name: str, messages: int, lost: int, gaps: int, impairment: dict[str, Any]) -> None:
     """No value is wrong, and the number of missing messages is within the bounds, for recordings of a PX4 (SITL).
 
-    `messages`: in the recording before STOP; `lost`: before it was recorded, and missing in the log, too;
-    `gaps`: missing LOGGING_DATA, or their least number with an impairment.
+    `messages`: number in the recording before STOP; `lost`: number missing in both the recording and the log;
+    `gaps`: number of lost LOGGING_DATA; with an impairment, its lower bound.
     """
     received = Received("log=armed", STREAMS / f"ulog_stream_{name}.bin.gz", **impairment)
     assert received.stream, received.reasons

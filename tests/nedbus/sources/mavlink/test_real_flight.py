@@ -24,8 +24,8 @@ from tests.peers.px4_log_stream import STREAMS, datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
 TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
-UNTIMED: Final = 2.0  # s: maximum age in the log of the values of a message without a time
-OF_STATUS: Final = 1.2  # s: ESTIMATOR_STATUS comes once a second
+UNTIMED_AGE: Final = 2.0  # s: maximum age of the logged values that a message without a timestamp may have
+STATUS_AGE: Final = 1.2  # s: ESTIMATOR_STATUS is sent once a second
 RESOLUTION: Final = {
     "lat": 1e-7, "lon": 1e-7, "latitude_deg": 1e-7, "longitude_deg": 1e-7,
     "alt": 1e-3, "altitude_msl_m": 1e-3, "altitude_ellipsoid_m": 1e-3, "eph": 1e-3, "epv": 1e-3,
@@ -49,7 +49,7 @@ FIELDS: Final = {  # converted, by topic
 
 pytestmark = [
     pytest.mark.logs,
-    pytest.mark.skipif(not LOG.exists(), reason=f"no recordings of a PX4: {PX4} is not there"),
+    pytest.mark.skipif(not LOG.exists(), reason=f"no recordings of a PX4: {PX4} does not exist"),
 ]
 
 
@@ -95,8 +95,8 @@ def test_converted_messages_equal_log() -> None:
             for name in fields.keys() - NOT_IN_THE_LOG - {"timestamp"}:
                 of_status = topic == "vehicle_global_position" and name not in ("lat", "lon", "alt")
                 if of_status and name in ("eph", "epv"):
-                    continue  # from times that the log lacks
-                age = OF_STATUS if of_status else 0.0 if has_time else UNTIMED
+                    continue  # of times that are not in the log
+                age = STATUS_AGE if of_status else 0.0 if has_time else UNTIMED_AGE
                 since = min(until - 1, bisect(times[topic, instance], now - age * 1e6))
                 candidates = [getattr(row, name) for row in of_topic[since:until]]
                 value = getattr(model, name)

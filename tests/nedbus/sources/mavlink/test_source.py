@@ -128,7 +128,7 @@ def test_validity_without_estimator_status_is_unknown(
     """Each command reports unknown validity for a vehicle without ESTIMATOR_STATUS, such as ArduPilot by default."""
     pages = HttpClient(free_port())
     run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
-    asked = {
+    expected = {
         "list": "validity unknown", "info": "validity unknown", "echo --once": "validity unknown",
         "hz --count 2": "validity unknown",
         "health --expect 9 --valid xy": "validity of xy is unknown: the vehicle does not send it",
@@ -149,7 +149,7 @@ def test_validity_without_estimator_status_is_unknown(
         sending = pool.submit(send)
         try:
             wait_for(lambda: pages.values("nedbus_messages_published_total", topic=VLP), what="positions")
-            for command, text in asked.items():
+            for command, text in expected.items():
                 shown = run_command(*command.split(), "-c", endpoint)
                 assert text in shown.out + shown.err, (command, shown)
                 assert "invalid," not in shown.out, command

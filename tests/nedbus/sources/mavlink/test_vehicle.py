@@ -146,7 +146,7 @@ def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
 
 
 def test_unanswered_requests_are_repeated(vehicle: Vehicle, caplog: pytest.LogCaptureFixture) -> None:
-    """Each message is requested three times, then every few seconds; each one but the origin is logged once."""
+    """Each message is requested three times, then every few seconds; each one except the origin is logged once."""
     caplog.set_level("INFO")
     requested = [number for number, _ in requests_of(vehicle, range(100, 200))]
     assert requested[:12] == [*NEEDED, ORIGIN] * 2
@@ -157,7 +157,7 @@ def test_unanswered_requests_are_repeated(vehicle: Vehicle, caplog: pytest.LogCa
 
 
 def test_arriving_messages_are_requested_three_times(vehicle: Vehicle) -> None:
-    """As links lose requests there are three rounds; afterwards only missing messages are requested."""
+    """Links lose requests, so there are three rounds; afterwards only missing messages are requested."""
     origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
     assert vehicle.next_request(99.0) is None  # no message received yet
     requested = []

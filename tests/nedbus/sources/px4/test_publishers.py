@@ -76,7 +76,7 @@ def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRe
             send(streams, stream, number, 100.2 + number)
     streams.remove_publisher(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="the same gid"):
-        send(streams, stream, 900, 201.9)  # its last messages arrive after its token
+        send(streams, stream, 900, 201.9)  # its last messages may arrive after its token is gone
     assert send(streams, stream, 30, 202.1) == (0, False)
     assert send(streams, stream, 31, 202.2) == (0, False)
 
@@ -152,7 +152,7 @@ def test_reboot_is_counted_once_per_vehicle(streams: StreamRegistry) -> None:
 
 
 def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
-    """The number of tokens tracked for one peer is bounded, and withdrawn tokens are removed."""
+    """The number of tokens stored for one key is bounded, and withdrawn tokens are removed."""
     tokens = [node(str(number)) for number in range(100)]
     for token in tokens:
         streams.add_publisher(token, 0.0)
@@ -181,11 +181,11 @@ def test_silent_keys_without_publisher_are_removed(streams: StreamRegistry) -> N
     streams.add_publisher(token, 0.0)
     for number in range(3000):
         now = float(number)
-        came = streams.on_message(
+        stream = streams.on_message(
             str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now
         )
-        streams.wire_format_of(came)
-        send(streams, came, 1, now)
+        streams.wire_format_of(stream)
+        send(streams, stream, 1, now)
         streams.report(now)
     sizes = len(streams._streams), len(streams._owners), len(streams._reboots)
     assert sizes == (61, 60, 0)

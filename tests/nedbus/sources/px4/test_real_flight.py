@@ -58,7 +58,7 @@ FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
 pytestmark = [
     pytest.mark.logs,
     pytest.mark.timeout(300),
-    pytest.mark.skipif(not LOG.exists(), reason=f"no recordings of a PX4: {PX4} is not there"),
+    pytest.mark.skipif(not LOG.exists(), reason=f"no recordings of a PX4: {PX4} does not exist"),
 ]
 
 
@@ -292,7 +292,7 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
                 fields = sample.message.__dict__
                 before, last[sample.address] = last.get(sample.address), repr(fields)
                 if before == repr(fields) and not get_topic(sample.topic).rate:
-                    continue  # topics without a rate are published again if the service is held up for 3 s
+                    continue  # topics without a rate are republished if the service stalls for 3 s
                 received += 1
                 row = logged.get((sample.topic, sample.address.instance or 0, fields["timestamp"]))
                 if row is not None:
@@ -418,9 +418,9 @@ def is_position(datagram: bytes) -> bool:
 
 
 def count_late_flags(name: str, rate: float) -> int:
-    """Return how many positions of a flight have a flag other than the logged one, with statuses at this rate.
+    """Return how many positions that a real PX4 sent in a flight get a flag that differs from the logged one.
 
-    The positions are those sent by a real PX4; a status has the flags logged at its time.
+    ESTIMATOR_STATUS is simulated at this rate [Hz], with the flags logged at its time.
     """
     logged = {}
     for message in open_replay(f"ulog:{PX4 / name}.ulg").messages:

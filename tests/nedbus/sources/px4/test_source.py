@@ -143,14 +143,15 @@ def test_layout_is_selected_by_type_hash(listener: Listener, zenoh_session: Sess
         sent = [message(each, x=0.1 * each, xy_valid=True, y=-1.0, hagl_max_z=5.0) for each in range(1, 11)]
         for each in sent:
             px4.put(each)
-        taken = listener.receive(10)
-        assert all(each.fields.keys() == {*LAYOUTS[layout].fields} for each in taken)
-        received = [(upgrade(each.fields), each.lost) for each in taken]
-        assert received == [(upgrade(downgrade(each, layout)), 0) for each in sent]
+        received = listener.receive(10)
+        assert all(each.fields.keys() == {*LAYOUTS[layout].fields} for each in received)
+        assert [(upgrade(each.fields), each.lost) for each in received] == [
+            (upgrade(downgrade(each, layout)), 0) for each in sent
+        ]
 
 
 def test_topic_names_map_to_addresses(listener: Listener, zenoh_session: Session) -> None:
-    """All four topics, instances as users name them, and versioned topics have their addresses."""
+    """Topics, instances in either notation, and versioned topics map to the addresses of the service."""
     px4 = Px4(zenoh_session)
     names = {
         "vehicle_local_position_v1": "1/vehicle_local_position",
@@ -266,11 +267,11 @@ def test_user_definition_decodes_newer_layout(
     newer = define_msg("VehicleLocalPosition", text)
     px4 = Px4(zenoh_session)
     px4.type_hash = hash_of(newer.current, ROS2_TYPE)
-    without, given, other = listen(), listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"), listen(f"?msg={tmp_path}")
+    without, supplied, other = listen(), listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"), listen(f"?msg={tmp_path}")
     fields = {**downgrade(message(1, x=0.5), "1.16"), "altitude_good_for_lock": True}
     for _ in range(2):
         px4.raw(encode_with(newer, fields, newer.current))
-    assert [upgrade(each.fields).x for each in given.receive(2)] == [0.5, 0.5]
+    assert [upgrade(each.fields).x for each in supplied.receive(2)] == [0.5, 0.5]
     assert caplog.text.count("altitude_good_for_lock") == 1
     without.step_until(lambda: without.rejections, what="the rejection")
     for word in ("VehicleLocalPosition", px4.type_hash, "px4-zenoh:?msg=VehicleLocalPosition.msg"):
@@ -330,7 +331,7 @@ def test_invalid_msg_file_raises(tmp_path: Path, text: str, where: str, reason: 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
 def test_msg_file_encoding_is_detected(tmp_path: Path, encoding: str) -> None:
-    """A byte order mark or Latin-1 is accepted, also in the file of a nested message."""
+    """A byte order mark or Latin-1 is accepted, even in the file of a nested message."""
     (tmp_path / "Esc.msg").write_text("float32 rpm # 10 °\n", encoding=encoding)
     (tmp_path / "EscStatus.msg").write_text("uint64 timestamp # °\nEsc[2] esc\n", encoding=encoding)
     parse_source(f"px4-zenoh:?msg={tmp_path}/EscStatus.msg").open_source(vehicle="1")
@@ -417,8 +418,8 @@ def test_oversized_samples_are_not_queued(listener: Listener, zenoh_session: Ses
 def test_ended_source_undeclares_its_subscriber(zenoh_session: Session, endpoint: str) -> None:
     """A source borrows the service's session, and leaves no subscriber in it."""
     probe = zenoh_session.declare_publisher(Px4(zenoh_session).key())
-    with plain_session(endpoint) as lent:
-        with Listener("px4-zenoh:", router=lent):
+    with plain_session(endpoint) as session:
+        with Listener("px4-zenoh:", router=session):
             wait_for(lambda: is_read(probe), what="the subscriber")
         wait_for(lambda: not is_read(probe), what="the subscriber to be undeclared")
 
@@ -437,7 +438,7 @@ def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
 
 
 def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: Path) -> None:
-    """The service's router may have a configuration file, or also connect to a router that is down."""
+    """The service's router may have a configuration file, or connect to another router that is down."""
     own, down = free_endpoint(), free_endpoint()
     file = tmp_path / "router.json5"
     listen = f'listen: {{endpoints: ["{own}"]}}'

@@ -32,9 +32,9 @@ def test_key_and_attachment_round_trip() -> None:
         assert Attachment.parse(bytes(attachment)) == attachment
 
 
-def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16", way: str = "out") -> str:
+def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16", direction: str = "out") -> str:
     """Return PX4's key of vehicle_local_position."""
-    topic = f"{namespace and namespace + '/'}fmu/{way}/{VLP}"
+    topic = f"{namespace and namespace + '/'}fmu/{direction}/{VLP}"
     return str(TopicKey(domain, topic, dds_type(ROS2_TYPE), type_hash(layout)))
 
 
@@ -91,7 +91,7 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
 @pytest.mark.parametrize("namespace", ["", "px4_1"])
 def test_input_has_the_vehicle_of_its_namespace(streams: StreamRegistry, namespace: str) -> None:
     """/fmu/in/... belongs to the vehicle of /fmu/out/...; a restart of its publisher is not a reboot of the vehicle."""
-    stream = streams.on_message(key(namespace=namespace, way="in"), 100.0)
+    stream = streams.on_message(key(namespace=namespace, direction="in"), 100.0)
     assert (str(stream.address), stream.is_input) == (f"{namespace or 1}/{VLP}", True)
     for sequence in (10, 1):
         assert streams.accept(stream, Attachment(sequence, 0, GID), 100.0) == (0, False)

@@ -19,13 +19,13 @@ from tests.peers.px4_log_stream import START, STOP, STREAMS, Px4LogStream, Recor
 from tests.waits import DEADLINE
 
 from .counting_reassembly import CountingReassembly
-from .test_log_client import OTHERS, OURS, Log, Reason
+from .test_log_client import OTHERS, OURS, Log, StateAndReason
 
-STARTED: Final[list[Reason]] = [("starting", None), ("header", None), ("streaming", None)]
+STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("streaming", None)]
 
 pytestmark = [
     pytest.mark.logs,
-    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
+    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
 ]
 
 recording = cache(lambda name: read_recording(STREAMS / f"ulog_stream_{name}.bin.gz"))
@@ -39,12 +39,12 @@ def recorded_bytes(name: str) -> int:
 
 
 class Link:
-    """A client on a UDP port, with what it received, and each state with its reason."""
+    """A client on a UDP port; counts what it receives, and collects each state with its reason."""
 
     def __init__(self, *log: Log, acknowledges: bool = True) -> None:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
         self.reassembly = CountingReassembly()
-        self.states: list[Reason] = [("idle", None)]
+        self.states: list[StateAndReason] = [("idle", None)]
         self.bytes = self.rejected = 0
         self.peer: Px4LogStream
         self._acknowledges = acknowledges
@@ -56,8 +56,8 @@ class Link:
         self._boot = 0
 
     @contextmanager
-    def to(self, name: str, **options: Any) -> Iterator[Link]:
-        """Start the vehicle."""
+    def play(self, name: str, **options: Any) -> Iterator[Link]:
+        """Start a vehicle that plays a recording."""
         with self._socket, Px4LogStream(recording(name), self._socket.getsockname()[1], **options) as self.peer:
             yield self
 
@@ -75,7 +75,7 @@ class Link:
             if client.status[:2] != self.states[-1]:
                 self.states.append(client.status[:2])
 
-    def run_to(self, *states: Reason) -> None:
+    def expect_states(self, *states: StateAndReason) -> None:
         """Receive until the state has changed this often, and compare the changes."""
         self.run(lambda: len(self.states) > len(states))
         assert self.states[1:] == [*states]
@@ -117,7 +117,7 @@ class Link:
 
 def test_recorded_stream_arrives_completely() -> None:
     """At full speed all bytes of the recording arrive; only its own 11 lost messages are missing."""
-    with Link("armed").to("default_topics", speed=None) as link:
+    with Link("armed").play("default_topics", speed=None) as link:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
     assert link.peer.commands == [START, STOP]
@@ -132,7 +132,7 @@ def test_recorded_stream_arrives_completely() -> None:
 )
 def test_loss_count_equals_dropped_and_late_messages(impairment: dict[str, float]) -> None:
     """Exactly the dropped and late messages count as lost; acknowledged messages always arrive."""
-    with Link("armed").to("flight1", speed=None, seed=7, **impairment) as link:
+    with Link("armed").play("flight1", speed=None, seed=7, **impairment) as link:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
     assert link.reassembly.lost == link.peer.dropped + link.peer.late
@@ -141,13 +141,13 @@ def test_loss_count_equals_dropped_and_late_messages(impairment: dict[str, float
 
 def test_denied_start_is_reported() -> None:
     """PX4 denies the stream on a link that is too slow."""
-    with Link().to("default_topics", refusal=dialect.MAV_RESULT_DENIED) as link:
-        link.run_to(("starting", None), ("refused", "bandwidth"))
+    with Link().play("default_topics", refusal=dialect.MAV_RESULT_DENIED) as link:
+        link.expect_states(("starting", None), ("refused", "bandwidth"))
 
 
 def test_stream_of_another_client_is_rejected() -> None:
     """Its data is rejected even if it arrives on the same link."""
-    with Link().to("default_topics", owner=OTHERS, is_owner_on_link=True) as link:
+    with Link().play("default_topics", owner=OTHERS, is_owner_on_link=True) as link:
         link.run(lambda: link.rejected > 20)
     assert link.states[1:] == [("starting", None), ("refused", "taken")]
     assert set(link.peer.commands) == {START}
@@ -159,53 +159,53 @@ class TestAbnormalStreams:
 
     def test_unacknowledged_message_stalls_stream(self) -> None:
         """PX4 sends the message 50 times, and then nothing."""
-        with Link(acknowledges=False).to("flight1") as link:
-            link.run_to(("starting", None), ("header", None), ("ended", "stalled"))
+        with Link(acknowledges=False).play("flight1") as link:
+            link.expect_states(("starting", None), ("header", None), ("ended", "stalled"))
             link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last ones may arrive later
         assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
     def test_start_without_data_is_repeated(self) -> None:
         """The logger gives up after 2.5 s, and accepts the next START."""
-        with Link().to("flight1", unsent=1) as link:
-            link.run_to(*STARTED)
+        with Link().play("flight1", unsent=1) as link:
+            link.expect_states(*STARTED)
         assert [each for each in link.peer.commands if each == START] == [START, START]
 
     @pytest.mark.parametrize("is_heard", [True, False])
     def test_log_take_takes_over_stream(self, is_heard: bool) -> None:
         """With log=take the other client's stream ends, and this client's begins."""
-        with Link("take").to("flight1", owner=OTHERS, is_owner_on_link=is_heard) as link:
-            link.run_to(*STARTED)
+        with Link("take").play("flight1", owner=OTHERS, is_owner_on_link=is_heard) as link:
+            link.expect_states(*STARTED)
         # STOP takes longer while an acknowledgement of the other client is missing.
         assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
 
     def test_stream_of_earlier_process_is_restarted(self) -> None:
         """It has the same ids, so its data arrives, but without definitions."""
-        with Link().to("flight1", owner=OURS, is_owner_on_link=True) as link:
-            link.run_to(("starting", None), ("refused", "taken"), *STARTED)
+        with Link().play("flight1", owner=OURS, is_owner_on_link=True) as link:
+            link.expect_states(("starting", None), ("refused", "taken"), *STARTED)
         assert link.reassembly.counts["no_definitions"]
 
     def test_stop_by_another_client_is_detected(self) -> None:
         """The last messages are acknowledged, and the stream is not restarted at once."""
-        with Link("armed").to("flight1") as link:
-            link.run_to(*STARTED)
+        with Link("armed").play("flight1") as link:
+            link.expect_states(*STARTED)
             link.peer.trigger("foreign_stop")
-            link.run_to(*STARTED, ("ended", "stopped_elsewhere"))
+            link.expect_states(*STARTED, ("ended", "stopped_elsewhere"))
         assert link.reassembly.lost == 0
 
     def test_reboot_triggers_new_stream(self) -> None:
         """The header arrives again with another start time, followed by the same data."""
-        with Link("armed").to("flight1") as link:
-            link.run_to(*STARTED)
+        with Link("armed").play("flight1") as link:
+            link.expect_states(*STARTED)
             link.peer.trigger("reboot")
-            link.run_to(*STARTED, ("idle", None), *STARTED)
+            link.expect_states(*STARTED, ("idle", None), *STARTED)
         assert (link.peer.streams, link.reassembly.lost) == (2, 0)
 
     def test_stream_survives_link_outage(self) -> None:
         """Messages sent while the link is silent for some seconds are counted as lost."""
-        with Link("armed").to("flight1") as link:
-            link.run_to(*STARTED)
+        with Link("armed").play("flight1") as link:
+            link.expect_states(*STARTED)
             link.peer.trigger("vanish")
-            link.run_to(*STARTED, ("ended", "link_lost"))
+            link.expect_states(*STARTED, ("ended", "link_lost"))
             link.peer.trigger("return")
             link.run(lambda: link.reassembly.lost)
         assert link.states[-1] == ("streaming", None)
@@ -213,8 +213,8 @@ class TestAbnormalStreams:
 
     def test_long_round_trip_aborts_header(self) -> None:
         """At 80 ms the header would take half a minute."""
-        with Link().to("flight1", round_trip=0.08) as link:
-            link.run_to(("starting", None), ("header", None), ("refused", "slow_link"))
+        with Link().play("flight1", round_trip=0.08) as link:
+            link.expect_states(("starting", None), ("header", None), ("refused", "slow_link"))
             measured = re.search(r"at (\d+) ms for each", link.client.status.text)
             assert measured
             assert int(measured[1]) >= 80
