@@ -30,7 +30,7 @@ _SOURCE: Final = """name => {
 
 _ROWS: Final = """rows => rows.map(row => ({
   vehicle: row.dataset.with, grade: row.children[0].className, state: row.children[2].textContent,
-  chosen: row.getAttribute("aria-selected") == "true",
+  chosen: row.getAttribute("aria-current") == "true",
 }))"""
 _ALL: Final = """
 const all = (root, found = []) => {

@@ -41,7 +41,7 @@ QUAD: Final = Address("quad", VLP)
 NOON: Final = 1_700_000_000.0
 """Seconds since the Unix epoch: 22:13:20 UTC."""
 _ROW: Final = re.compile(
-    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-selected="(?P<chosen>\w+)">'
+    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-current="(?P<chosen>\w+)">'
     r'<span class="(?P<grade>\w+)">.*?<span class="\w+">(?P<text>[^<]*)</span>'
     r'<span class="quiet">(?P<since>[^<]*)</span><span class="mode">(?P<mode>[^<]*)</span>'
     r'<span>(?P<battery>[^<]*)</span><span class="gps">(?P<gps>[^<]*)</span></div>'
