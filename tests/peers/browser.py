@@ -202,7 +202,7 @@ class Tab:
         """The address that a person sees; playwright's own is that of a while ago."""
         return str(self.page.evaluate("location.href"))
 
-    def part(self, name: str) -> str:
+    def panel(self, name: str) -> str:
         """Return the text of a part of the page, as a person sees it."""
         return self.page.locator(f"div.{name} .bk-clearfix").first.inner_text()
 

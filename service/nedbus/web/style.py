@@ -49,14 +49,14 @@ class Style:
 
     @property
     def colours(self) -> dict[str, str]:
-        """Colours by their names in CSS and in the plot theme."""
+        """Colours by name in CSS and in the plot theme."""
         plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
         return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
 
 
 @cache
 def panels() -> jinja2.Template:
-    """Return the template of `panels.html`; its context is a style, a timeline and the timeline's `moment`."""
+    """Return the template of `panels.html`; its context has a style, a timeline and its `format_time`."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=to_age, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)
