@@ -53,7 +53,7 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
 
 
 def test_slowly_recovered_samples_are_held_back() -> None:
-    """Over a slow link the backlog shrinks slowly; its samples are held back all the same."""
+    """Over a slow link the backlog shrinks slowly; its samples are held back, too."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))
@@ -97,7 +97,7 @@ def test_clock_drift_does_not_make_samples_late() -> None:
 
 
 def test_restarted_publisher_has_a_new_clock() -> None:
-    """A vehicle that restarts with a clock from 1970 is current at once; a forgotten one, too."""
+    """Samples of a vehicle that restarts with a clock from 1970, or was forgotten, are current at once."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     assert late.admits(sample(SECOND, by=8), arrived=SECOND)
