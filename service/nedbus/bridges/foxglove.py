@@ -94,15 +94,11 @@ class FoxgloveServer:
         if sample.topic == DEFAULT_TOPIC:
             self._log_position(sample.vehicle, sample.message, time_ns)
 
-    def close(self) -> None:
-        """Stop the server and disconnect its clients."""
-        self._server.stop()
-
     def __enter__(self) -> FoxgloveServer:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.close()
+        self._server.stop()
 
     def _log_fields(self, address: Address, message: Message, time_ns: int) -> None:
         definition = message.DEFINITION
