@@ -64,7 +64,7 @@ class EventTimeline:
             self.unit = unit_of("boot" if utc is None else "vehicle")
 
     def format_time(self, seconds: float) -> str:
-        """Format an event time on the clock of the axes, without its name."""
+        """Format an event time on the clock of the axes."""
         seconds += self.clock_offset
         return to_clock(seconds) if self.unit == "UTC" else f"{seconds:.1f}"
 
@@ -74,9 +74,9 @@ class EventTimeline:
         return f"{self.format_time(seconds)} {self.unit}{since}"
 
     def story(self, vehicle: str, now: float, at: Event | float | None, active: Sequence[Condition]) -> Story | None:
-        """Return the story of an event or time; if `at` is None, of the current state, else of the latest condition.
+        """Return the story of the event or time `at`; if None, of the current state or the latest recent condition.
 
-        `active`: the active conditions, first the one that the state shows.
+        `active`: the active conditions; the first determines the state.
         """
         self._refresh()
         if at is None and active:

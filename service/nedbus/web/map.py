@@ -58,8 +58,8 @@ class Map:
         for each in sorted(snapshot.vehicles, key=lambda each: each.number):
             for stream in each.streams:
                 if stream is each.main or (self.truth and stream.address.topic == TRUTH):
-                    long = overview.streams.get(stream.address) if self.is_long else None
-                    tracks[stream.address] = long.long if long is not None else stream.stream.minute, each.number
+                    stored = overview.streams.get(stream.address) if self.is_long else None
+                    tracks[stream.address] = stored.long if stored is not None else stream.stream.minute, each.number
         self._tracks.update(tracks)
         placed = [(each, position) for each in snapshot.vehicles if (position := each.main.stream.valid) is not None]
         focused = [(each, position) for each, position in placed if each is chosen]

@@ -50,7 +50,9 @@ _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
 _MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, including expiring ones
 _MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
 _PING: Final = 15.0  # s between WebSocket pings; without a pong before the next one, the connection is closed
-_UNUSED_LIFETIME: Final = 15_000  # ms that the server keeps a disconnected page, for a browser that reconnects
+_UNUSED_LIFETIME: Final = (
+    15_000  # ms that a page is kept without a connection, for example while its browser is suspended
+)
 
 
 @dataclass(frozen=True, slots=True)
