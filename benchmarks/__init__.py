@@ -1,1 +1,1 @@
-"""Measurements: run them with `make bench`."""
+"""Benchmarks; `make bench` runs them."""

@@ -1,6 +1,6 @@
-"""CPU time that events cost per message: python -m benchmarks.events [FILE]... [--vs CHECKOUT].
+"""CPU time of event detection per message: python -m benchmarks.events [FILE]... [--vs CHECKOUT].
 
-With two checkouts, they take turns in one run. The bar: at most 10 % more than before a change.
+Two checkouts are measured alternately in one run. Target: a change adds at most 10 %.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Final
 
 from tests.flights.replays import convert_replay
 
-from .processes import HERE, Checkout, end, expect, tell
+from .processes import HERE, Checkout, end, expect, resume
 
 ADD: Final = """
 import sys, time
 from pathlib import Path
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.sources import parse_source, source_text_of_file
 from nedbus.errors import InvalidMessageError
 from nedbus_msgs import BY_TOPIC, upgrade_fields
@@ -35,10 +35,10 @@ def read():
 messages = list(read())
 print(len(messages), flush=True)
 for _ in sys.stdin:
-    account, start = Account(), time.process_time()
+    event_log, start = EventLog(), time.process_time()
     for address, fields, due in messages:
-        account.add(address, fields, due)
-    account.settle(due)
+        event_log.add(address, fields, due)
+    event_log.settle(due)
     print(1e6 * (time.process_time() - start) / len(messages), flush=True)
 """  # for each line on stdin: us per message
 
@@ -60,19 +60,19 @@ def main() -> None:
 
 
 def measure(path: Path, checkouts: tuple[Checkout, ...], rounds: int) -> None:
-    """Add the messages of a file to accounts, and print the time of each checkout and the ratio."""
+    """Detect the events of a file with each checkout, and print the times and their ratio."""
     running = [checkout.start("-c", ADD, str(path)) for checkout in checkouts]
     try:
         (count, *_), times = [int(expect(process)) for process in running], [list[float]() for _ in running]
         for _ in range(rounds):
-            for process, own in zip(running, times, strict=True):
-                tell(process)
-                own.append(float(expect(process)))
+            for process, measured in zip(running, times, strict=True):
+                resume(process)
+                measured.append(float(expect(process)))
     finally:
         end(*running)
-    costs = [f"{min(own):.2f} us (median {statistics.median(own):.2f})" for own in times]
+    costs = [f"{min(measured):.2f} us (median {statistics.median(measured):.2f})" for measured in times]
     ratio = f", {min(times[0]) / min(times[1]) - 1:+.1%}" if len(times) > 1 else ""
-    print(f"{path.name}, {count} messages: {' against '.join(costs)} for each{ratio}", flush=True)
+    print(f"{path.name}, {count} messages: {' vs. '.join(costs)} per message{ratio}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """A fleet at 100 Hz in one process: python -m benchmarks.fleet VEHICLES SECONDS ENDPOINT [noise].
 
-It prints "ready", waits for a line, publishes, and prints by how many seconds it was late at most.
-With noise no two messages are alike, so that a file of them is not compressed better than that of a real flight.
+It prints "ready", waits for a line, publishes, and prints its maximum delay in seconds.
+With `noise` no two messages are alike, so a recording compresses no better than that of a real flight.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NOISY: Final = (
 
 
 def main() -> None:
-    """Publish as the arguments say."""
+    """Publish according to the arguments."""
     vehicles, seconds, endpoint = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
     noise = sys.argv[4:] == ["noise"]
     messages = np.repeat(nedbus.to_array([nedbus.VehicleLocalPosition(**FIELDS)]), vehicles if noise else 1)
@@ -41,15 +41,15 @@ def main() -> None:
             late = max(late, -wait)
             if wait > 0:
                 time.sleep(wait)
-            # This process stands for as many hosts as there are vehicles: what each would encode is encoded at once.
+            # One process simulates the hosts of all vehicles: encode their messages at once.
             for publisher, payload in zip(publishers, payloads * (vehicles // len(payloads)), strict=True):
-                publisher._put(payload, FIELD_TYPES.keys())  # noqa: SLF001 - what `publish` does with it
+                publisher._put(payload, FIELD_TYPES.keys())  # noqa: SLF001 - as in `publish`
         print(f"{late:.3f}", flush=True)
         sys.stdin.readline()
 
 
 def _encode(messages: Any, tick: int, random: np.random.Generator | None) -> list[bytes]:
-    """Return the payloads of a tick; all vehicles send the same one without noise."""
+    """Return the payloads of a tick; without noise one for all vehicles."""
     messages["timestamp"] = 10_000_000 + tick * 10_000
     messages["timestamp_sample"] = messages["timestamp"] - 5_000
     if random is not None:

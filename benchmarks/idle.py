@@ -1,9 +1,9 @@
-"""CPU time, wake-ups and threads of processes at rest: python -m benchmarks.idle [--vs CHECKOUT].
+"""CPU time, wake-ups and threads of idle processes: python -m benchmarks.idle [--vs CHECKOUT].
 
-The bars: a service with one simulated vehicle and no reader: below 10 % of a core and below 120 MB;
+Targets: a service with one simulated vehicle and no reader: below 10 % of a core and below 120 MB;
 100 buses with a publisher at 1 Hz each: at most 4 % of a core, 400 context switches a second, 5 Python threads, and a
 median of 50 ms for `latest()`;
-a service with nothing to publish, and a subscription that waits: at most 25 wake-ups a second each.
+a service with nothing to publish, and an idle subscription: at most 25 wake-ups a second each.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from .processes import HERE, Checkout, Process, expect
 
 NAMES: Final = """
 import json, os, threading
-def tell():
+def resume():
     while os.read(0, 1):
         print(json.dumps({each.native_id: each.name for each in threading.enumerate()}), flush=True)
-threading.Thread(target=tell, name="benchmark", daemon=True).start()
-"""  # of the Python threads, for each line on stdin: Linux knows only those of Zenoh's
+threading.Thread(target=resume, name="benchmark", daemon=True).start()
+"""  # print the names of the Python threads for each line on stdin: Linux has only the names of Zenoh's threads
 BUSES: Final = """
 import sys, time
 import nedbus
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def measure_at_rest(checkout: Checkout, seconds: float) -> None:
-    """Measure services without readers, a subscription that waits, and many buses."""
+    """Measure services without readers, an idle subscription, and many buses."""
     with tempfile.TemporaryDirectory() as folder:
         ended = f"ulog:{write_log(Path(folder) / 'flight.ulg', range(0, 100_000, 10_000), x=1.0)}"
         for source, name in (("sim:", "one simulated vehicle"), (ended, "ended replay"), ("px4-zenoh:", "no PX4 yet")):
@@ -79,7 +79,7 @@ def measure_at_rest(checkout: Checkout, seconds: float) -> None:
     with processes.router(checkout) as (_, endpoint), nedbus.connect(endpoint) as bus:
         waiting = checkout.start("-c", NAMES + WAITING, endpoint)
         expect(waiting)
-        print(f"one subscription that waits: {measure(waiting, seconds)}", flush=True)
+        print(f"one idle subscription: {measure(waiting, seconds)}", flush=True)
         processes.end(waiting)
         process, times = checkout.start("-c", NAMES + BUSES, endpoint, "100", "v"), []
         expect(process)
@@ -88,18 +88,18 @@ def measure_at_rest(checkout: Checkout, seconds: float) -> None:
             begin = time.perf_counter()
             assert bus.latest(vehicle=f"v{number}"), "latest() found nothing"
             times.append(1e3 * (time.perf_counter() - begin))
-            time.sleep(0.37)  # beyond any common period of the threads
+            time.sleep(0.37)  # no multiple of a period of the threads
         processes.end(process)
         print(f"    latest(): {statistics.median(times):.1f} ms, at most {max(times):.1f} ms", flush=True)
 
 
 def measure(process: Process, seconds: float) -> str:
-    """Return CPU in percent of a core over some seconds, memory, threads, and wake-ups a second by thread."""
-    time.sleep(2.0)  # what it did before has ended
+    """Measure for `seconds`: CPU in percent of a core, memory, threads, and wake-ups per second and thread."""
+    time.sleep(2.0)  # startup work ends
     (used,), before, start = processes.cpu_seconds(process), switches(process), time.monotonic()
     time.sleep(seconds)
     (used_after,), after, passed = processes.cpu_seconds(process), switches(process), time.monotonic() - start
-    processes.tell(process)
+    processes.resume(process)
     python = {int(thread): name for thread, name in json.loads(expect(process)).items() if name != "benchmark"}
     threads, wakes, forced = Counter[str](), Counter[str](), 0
     for thread in before.keys() & after.keys():

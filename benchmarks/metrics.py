@@ -1,9 +1,9 @@
-"""Costs of metrics: the time of a page with 200 streams, and what a scrape every second takes from publishing.
+"""Cost of metrics: the response time with 200 streams, and the effect of one scrape a second on publishing.
 
-The bars: /metrics with 200 streams in under 50 ms (the median of 20 requests), and less than 2 % of effect on what is
-published: on its rate, and on the CPU time of the threads that publish, for each message.
-One service publishes 40 simulated vehicles of 5 streams each. Some seconds with scrapes and some without take turns,
-so that what else the machine does hits both: each pair of neighbours gives one ratio, of which the median counts.
+Targets: /metrics with 200 streams in under 50 ms (median of 20 requests), and less than 2 % effect on the rate and on
+the CPU time per message of the publishing threads.
+One service publishes 40 simulated vehicles with 5 streams each. Intervals with and without scrapes alternate, so other
+load affects both; the result is the median of the ratios of adjacent intervals.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from typing import Final, NamedTuple
 
 import psutil
 
-from .processes import PATIENCE, Process, end, free_port, start
+from .processes import TIMEOUT, Process, end, free_port, start
 
 VEHICLES: Final = 40
 STREAMS: Final = 200
-SPEED: Final = 0.25  # 2,040 messages a second of all together: the service keeps its pace on a busy machine too
+SPEED: Final = 0.25  # 2,040 messages a second in total, which the service sustains on a busy machine too
 REQUESTS: Final = 20
 _PUBLISHED: Final = "nedbus_messages_published_total{"
 
 
 class Turn(NamedTuple):
-    """Measurement of some seconds: messages a second, and CPU time of the threads that publish [us/message]."""
+    """Figures of an interval: messages a second, and CPU time of the publishing threads [us/message]."""
 
     rate: float
     cpu: float
@@ -47,12 +47,12 @@ class Service:
 
     def get(self) -> str:
         """Return the metrics."""
-        with urllib.request.urlopen(f"{self.url}/metrics", timeout=PATIENCE) as answer:  # noqa: S310 - http, on loopback
+        with urllib.request.urlopen(f"{self.url}/metrics", timeout=TIMEOUT) as answer:  # noqa: S310 - http, on loopback
             return str(answer.read().decode())
 
     def wait(self) -> None:
-        """Wait until all streams have been measured for a while."""
-        deadline = time.monotonic() + PATIENCE
+        """Wait until the usual rate of all streams is known."""
+        deadline = time.monotonic() + TIMEOUT
         while time.monotonic() < deadline and self.process.poll() is None:
             with suppress(OSError):
                 if self.get().count("nedbus_stream_usual_rate_hertz{") == STREAMS:
@@ -61,7 +61,7 @@ class Service:
         raise RuntimeError(f"the service does not publish {STREAMS} streams")
 
     def measure(self, seconds: int, *, scraped: bool) -> Turn:
-        """Measure for some seconds, with or without a scrape in each."""
+        """Measure for `seconds`, with or without one scrape a second."""
         before, published, begin = self._cpu(), self._published(), time.monotonic()
         for second in range(1, seconds + 1):
             time.sleep(max(0.0, begin + second - time.monotonic()))
@@ -69,7 +69,7 @@ class Service:
                 self.get()
         after, passed = self._cpu(), time.monotonic() - begin
         messages = self._published() - published
-        # Threads that answer requests are not there before and after.
+        # Threads that answer requests do not exist at both times.
         used = sum(after[thread] - before[thread] for thread in before.keys() & after.keys())
         return Turn(messages / passed, used / messages * 1e6)
 
@@ -84,7 +84,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--turns", type=int, default=6, help="pairs of turns, without and with scrapes")
-    parser.add_argument("--seconds", type=int, default=6, help="of a turn")
+    parser.add_argument("--seconds", type=int, default=6, help="duration of a turn")
     arguments = parser.parse_args()
     service = Service()
     try:
@@ -93,12 +93,12 @@ def main() -> None:
         size = len(service.get())
         print(
             f"/metrics with {STREAMS} streams: {statistics.median(times) * 1e3:.1f} ms, at most"
-            f" {max(times) * 1e3:.1f} ms of {REQUESTS}, {size / 1e3:.0f} kB (bar: 50 ms)",
+            f" {max(times) * 1e3:.1f} ms of {REQUESTS}, {size / 1e3:.0f} kB (target: 50 ms)",
             flush=True,
         )
         rates, costs = [], []
         for pair in range(arguments.turns):
-            order = (False, True) if pair % 2 else (True, False)  # a drift is in both
+            order = (False, True) if pair % 2 else (True, False)  # drift affects both
             turns = {scraped: service.measure(arguments.seconds, scraped=scraped) for scraped in order}
             rates.append(1 - turns[True].rate / turns[False].rate)
             costs.append(turns[True].cpu / turns[False].cpu - 1)
@@ -109,11 +109,11 @@ def main() -> None:
             )
         print(
             f"effect, the median of {len(rates)}: {100 * statistics.median(rates):.2f} % fewer messages a second,"
-            f" {100 * statistics.median(costs):.2f} % more CPU for each (bar: 2 %)"
+            f" {100 * statistics.median(costs):.2f} % more CPU per message (target: 2 %)"
         )
     finally:
         service.process.terminate()
-        end(service.process, patience=10.0)
+        end(service.process, timeout=10.0)
 
 
 def _time_of(service: Service) -> float:

@@ -1,7 +1,7 @@
-"""Measure how exactly a replay at speed=1 keeps the pace of its log.
+"""Timing error of a replay at speed=1.
 
-A log of 20 s (--seconds) at 100 Hz is replayed by a service in another process; times are the publisher's timestamps.
-The bar: 99 % of the errors below 5 ms on an idle machine.
+A service in another process replays a log of 20 s (--seconds) at 100 Hz; times are the publisher's timestamps.
+Target: 99 % of the errors below 5 ms on an idle machine.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main() -> None:
     errors = sorted((moment - start) / 1e3 for moment in sent)
     print(
         f"pacing at speed=1: error of {count} messages: median {statistics.median(errors):.2f} ms,"
-        f" p99 {errors[int(0.99 * count)]:.2f} ms, max {errors[-1]:.2f} ms (bar: p99 below 5 ms)"
+        f" p99 {errors[int(0.99 * count)]:.2f} ms, max {errors[-1]:.2f} ms (target: p99 below 5 ms)"
     )
 
 

@@ -1,4 +1,4 @@
-"""The processes of a measurement, which are told and asked by lines."""
+"""Processes of a measurement, which are controlled and queried through lines on stdin and stdout."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from typing import IO, Final, NamedTuple
 import psutil
 
 ROOT: Final = Path(__file__).parents[1]
-PATIENCE: Final = 120.0  # s that a process may take to say something
+TIMEOUT: Final = 120.0  # s until the next line of a process
 
 Process = subprocess.Popen[str]
 
 
 class Checkout(NamedTuple):
-    """A checkout of nedbus; its own .venv runs it, if it has one."""
+    """A checkout of nedbus, run with its .venv if it has one."""
 
     folder: Path
 
@@ -44,7 +44,7 @@ def start(
     *arguments: str, python: str = sys.executable, environment: Mapping[str, str] | None = None,
     errors: int | IO[str] | None = subprocess.DEVNULL,
 ) -> Process:  # fmt: skip
-    """Start a Python process; `errors` gets its stderr, None shows it."""
+    """Start a Python process; `errors`: target of its stderr, None to inherit."""
     return subprocess.Popen(
         [python, *arguments],
         stdin=subprocess.PIPE,
@@ -56,28 +56,28 @@ def start(
     )
 
 
-def expect(process: Process, patience: float = PATIENCE) -> str:
-    """Return the next line that a process prints; raise TimeoutError if there is none yet, RuntimeError if it ended."""
+def expect(process: Process, timeout: float = TIMEOUT) -> str:
+    """Return the next line of a process; raise TimeoutError if there is none in time, RuntimeError if it has ended."""
     assert process.stdout is not None
-    if not select.select([process.stdout], [], [], patience)[0]:
-        raise TimeoutError(f"it says nothing within {patience:.0f} s")
+    if not select.select([process.stdout], [], [], timeout)[0]:
+        raise TimeoutError(f"no output within {timeout:.0f} s")
     line = process.stdout.readline().strip()
     if not line:
-        raise RuntimeError("it ended")
+        raise RuntimeError("the process has ended")
     return line
 
 
-def tell(process: Process) -> None:
-    """Let a process go on; one that has ended has said all."""
+def resume(process: Process) -> None:
+    """Send a line to a process, which lets it continue; ignore one that has ended."""
     assert process.stdin is not None
     with suppress(BrokenPipeError):
         process.stdin.write("\n")
         process.stdin.flush()
 
 
-def end(*processes: Process, patience: float = 0.0) -> None:
-    """Wait for processes to end by themselves, and kill those that do not."""
-    deadline = time.monotonic() + patience
+def end(*processes: Process, timeout: float = 0.0) -> None:
+    """Wait until processes end, and kill them after the timeout."""
+    deadline = time.monotonic() + timeout
     for process in processes:
         try:
             process.wait(max(0.0, deadline - time.monotonic()))
@@ -88,18 +88,18 @@ def end(*processes: Process, patience: float = 0.0) -> None:
 
 @contextmanager
 def nedbus_process(*arguments: str, checkout: Checkout = HERE, setup: str = "") -> Iterator[Process]:
-    """Run a nedbus command until the measurement is over; `setup` is Python code that runs before it."""
+    """Run a nedbus command inside a `with` block; `setup`: Python code that runs before it."""
     process = checkout.start("-c", f"{setup}\nfrom nedbus.cli import main\nmain()", *arguments)
     try:
         yield process
     finally:
         process.terminate()
-        end(process, patience=10.0)
+        end(process, timeout=10.0)
 
 
 @contextmanager
 def router(checkout: Checkout = HERE) -> Iterator[tuple[Process, str]]:
-    """Run a router on a free port, and give its endpoint."""
+    """Run a router on a free port; yield its process and endpoint."""
     port = free_port()
     with nedbus_process("router", "--listen", f"tcp/127.0.0.1:{port}", checkout=checkout) as process:
         wait_for_router(port, process)
@@ -107,10 +107,10 @@ def router(checkout: Checkout = HERE) -> Iterator[tuple[Process, str]]:
 
 
 def free_port() -> int:
-    """Return a port of the loopback on which nothing listens, and which no client gets while a router is down."""
+    """Return a free port of loopback that no outgoing connection takes while a router is down."""
     while True:
         with socket.socket() as free, suppress(OSError):
-            free.bind(("127.0.0.1", random.randint(20_000, 32_000)))  # below the ports of clients, from 32,768 on
+            free.bind(("127.0.0.1", random.randint(20_000, 32_000)))  # outgoing connections use ports from 32,768 up
             return int(free.getsockname()[1])
 
 
@@ -120,13 +120,13 @@ def cpu_seconds(*processes: Process) -> list[float]:
 
 
 def memory_mb(process: Process) -> float:
-    """Return what a process has in RAM (RSS) [MB]."""
+    """Return the resident memory (RSS) of a process [MB]."""
     return float(psutil.Process(process.pid).memory_info().rss / 2**20)
 
 
 def wait_for_router(port: int, process: Process) -> None:
     """Wait until a router listens; raise RuntimeError if it ends."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while process.poll() is None and time.monotonic() < deadline:
         with suppress(OSError):
             socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
@@ -135,8 +135,8 @@ def wait_for_router(port: int, process: Process) -> None:
     raise RuntimeError(f"the router does not start on port {port}")
 
 
-def wait_for_quiet(last: Callable[[], float], *, quiet: float, patience: float) -> None:
-    """Wait until nothing has come for `quiet` seconds, at most `patience`; `last` is when something came."""
+def wait_for_quiet(last: Callable[[], float], *, quiet: float, timeout: float) -> None:
+    """Wait until `last`, the time of the last message, is `quiet` seconds ago, at most `timeout` seconds."""
     start = time.monotonic()
-    while (now := time.monotonic()) < start + patience and now <= max(start, last()) + quiet:
+    while (now := time.monotonic()) < start + timeout and now <= max(start, last()) + quiet:
         time.sleep(0.05)

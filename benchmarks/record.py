@@ -1,8 +1,7 @@
-"""Record a fleet into one file for some seconds: loss, memory over time, CPU, bytes: python -m benchmarks.record.
+"""Record a fleet to one file: loss, resident memory over time, CPU time and bytes: python -m benchmarks.record.
 
-The bar: 200 vehicles at 100 Hz, 20,000 messages a second, nothing lost, and flat memory for 10 minutes:
+Target: 200 vehicles at 100 Hz, 20,000 messages a second, no loss and constant memory for 10 minutes:
 `python -m benchmarks.record --seconds 600`.
-The memory is what the recorder has in RAM (RSS).
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from typing import Final
 from mcap.reader import make_reader
 
 from .fleet import RATE
-from .processes import Process, cpu_seconds, end, expect, memory_mb, router, start, tell
+from .processes import Process, cpu_seconds, end, expect, memory_mb, resume, router, start
 
-SAMPLES: Final = 20  # of the memory
-ENDS: Final = 60.0  # s that the recorder has to write the rest
+SAMPLES: Final = 20  # memory samples
+ENDS: Final = 60.0  # s; timeout of the recorder for writing the rest
 
 
 def main() -> None:
@@ -38,15 +37,15 @@ def main() -> None:
             record(recorder, publisher, path, sent=count * seconds * RATE)
         finally:
             end(recorder, publisher)
-        print(f"its log: {log.read_text().strip()}")
+        print(f"log of the recorder: {log.read_text().strip()}")
 
 
 def record(recorder: Process, publisher: Process, path: Path, *, sent: int) -> None:
-    """Let the publisher send, watch the recorder, and print what it wrote of what was sent."""
+    """Start the publisher, watch the recorder, and print the recorded and lost messages."""
     expect(publisher)
     time.sleep(1.0)
     (before,) = cpu_seconds(recorder)
-    tell(publisher)
+    resume(publisher)
     memory, late = watch(recorder, publisher)
     time.sleep(3.0)
     used = cpu_seconds(recorder)[0] - before
@@ -57,14 +56,14 @@ def record(recorder: Process, publisher: Process, path: Path, *, sent: int) -> N
     written = summary.statistics.message_count if summary and summary.statistics else 0
     print(
         f"{written} of {sent} messages in the file, {sent - written} lost"
-        f" ({'holds' if written == sent else 'MISSED'}), {path.stat().st_size / max(1, written):.0f} bytes each;"
+        f" ({'met' if written == sent else 'MISSED'}), {path.stat().st_size / max(1, written):.0f} bytes each;"
         f" recorder {used / sent * 1e6:.1f} us a message, {memory[0]:.0f} to {memory[-1]:.0f} MB,"
         f" at most {max(memory):.0f} MB; publisher at most {late} s late"
     )
 
 
 def watch(recorder: Process, publisher: Process) -> tuple[list[float], str]:
-    """Return the recorder's memory over time in MB, and what the publisher prints at its end."""
+    """Return the recorder's memory over time [MB], and the last output of the publisher."""
     begin = time.monotonic()
     memory: list[float] = []
     interval = 1.0

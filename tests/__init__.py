@@ -1,1 +1,1 @@
-"""Tests; each one's docstring is the rule that it proves."""
+"""Tests: the docstring of each test states the rule that it proves."""

@@ -1,4 +1,4 @@
-"""Fixtures: a real router for each test, both clients behind one face, processes."""
+"""Fixtures: a real router for each test, the sync and the async client through one fixture, and processes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import nedbus
 from nedbus.timings import Timings
 from nedbus.transport import Session, open_router
 from tests.peers.ports import free_endpoint
-from tests.peers.processes import Process, Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import changing_timings
 
-from .blocking import blocking
+from .sync_adapter import sync_adapter
 
-# Examples of each property: 25, or 100 with `--hypothesis-profile=all`. A machine that is busy fails none.
+# 25 examples per property, or 100 with `--hypothesis-profile=all`; no time limits, which fail on a busy machine.
 hypothesis.settings.register_profile(
     "nedbus", max_examples=25, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
@@ -30,20 +30,20 @@ hypothesis.settings.load_profile("nedbus")
 
 
 def pytest_configure() -> None:
-    """Make signals work that a background job of a shell, or nohup, ignores: processes of tests would inherit that."""
+    """Restore SIGINT and SIGHUP: test processes would inherit that a shell's background job or nohup ignores them."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that start processes or open a router, so that `make quick` can leave them out."""
+    """Mark the tests that start processes or open a router, which `make quick` deselects."""
     for item in items:
         for fixture, mark in (("start", "process"), ("endpoint", "router")):
             if fixture in getattr(item, "fixturenames", ()):
                 item.add_marker(mark)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
-            item.add_marker(pytest.mark.timeout(600))  # thrice their time on four busy cores, under coverage
-        if "open_router" in vars(getattr(item, "module", item)):  # most of these tests open one themselves
+            item.add_marker(pytest.mark.timeout(600))  # three times their duration on four busy cores, with coverage
+        if "open_router" in vars(getattr(item, "module", item)):  # most tests of such a module open a router
             item.add_marker("router")
 
 
@@ -51,7 +51,7 @@ _may_start = True
 
 
 def _watch_processes(event: str, arguments: tuple[object, ...]) -> None:
-    if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:  # which Matplotlib asks, once
+    if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:  # Matplotlib runs it once
         raise AssertionError("this test starts a process: mark it with pytest.mark.process")
 
 
@@ -60,8 +60,8 @@ sys.addaudithook(_watch_processes)
 
 @pytest.fixture(autouse=True)
 def _no_unmarked_process(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Hold that the marks are true."""
-    global _may_start  # noqa: PLW0603 - an audit hook can neither be removed nor be given anything
+    """Fail a test that starts a process without being marked."""
+    global _may_start  # noqa: PLW0603 - an audit hook can neither be removed nor take arguments
     _may_start = any(request.node.get_closest_marker(name) for name in ("process", "compose"))
     yield
     _may_start = True
@@ -69,16 +69,16 @@ def _no_unmarked_process(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """Run a router of its own for this test."""
-    where = free_endpoint()
-    session = open_router(listen=(where,))
-    yield where
+    """Run a router for this test and return its endpoint."""
+    listen = free_endpoint()
+    session = open_router(listen=(listen,))
+    yield listen
     session.close()
 
 
 @pytest.fixture(autouse=True)
 def _no_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Keep the settings of whoever runs the tests out of them."""
+    """Isolate tests from the developer's environment variables and working directory."""
     for name in [name for name in os.environ if name.startswith("NEDBUS_")]:
         monkeypatch.delenv(name)
     monkeypatch.chdir(tmp_path)
@@ -86,61 +86,61 @@ def _no_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.fixture
 def timings() -> Iterator[Timings]:
-    """Change timings of this process for a test: `timings.stale = 0.5`."""
-    with changing_timings() as those:
-        yield those
+    """Change timings of this process for one test: `timings.stale = 0.5`."""
+    with changing_timings() as changed:
+        yield changed
 
 
 @pytest.fixture(params=["sync", "async"])
 def client(request: pytest.FixtureRequest, endpoint: str) -> Iterator[nedbus.Bus]:
-    """Connect with either client."""
+    """Connect with the sync and with the async client."""
     if request.param == "sync":
         with nedbus.connect(endpoint) as bus:
             yield bus
     else:
-        with asyncio.Runner() as runner, blocking(runner, nedbus.connect_async(endpoint)) as bus:
+        with asyncio.Runner() as runner, sync_adapter(runner, nedbus.connect_async(endpoint)) as bus:
             yield bus
 
 
 @pytest.fixture
 def bus(endpoint: str) -> Iterator[nedbus.Bus]:
-    """Connect another bus, as another script would."""
+    """Connect a second bus, as another script would."""
     with nedbus.connect(endpoint) as other:
         yield other
 
 
 @pytest.fixture
-def raw(endpoint: str) -> Iterator[Session]:
+def zenoh_session(endpoint: str) -> Iterator[Session]:
     """Connect a plain Zenoh session, as a client in another language would."""
     with nedbus.connect(endpoint) as other:
         yield other._session
 
 
 @pytest.fixture(scope="session")
-def zygote(request: pytest.FixtureRequest) -> Iterator[Zygote]:
-    """Keep a process ready that forks others."""
+def fork_server(request: pytest.FixtureRequest) -> Iterator[ForkServer]:
+    """Run the fork server of this pytest worker."""
     with request.config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
-        process = Zygote()  # what hangs shows its stacks on the terminal itself
+        process = ForkServer()  # a hanging process writes its stacks to the real terminal
     yield process
     process.close()
 
 
 @pytest.fixture
 def start(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Start]:
-    """Start Python processes; each is killed at the end of the test if it is still there.
+    """Start Python processes, which are killed at the end of the test.
 
-    They are forked from one that has imported nedbus, unless `fresh` says that the interpreter is to begin anew.
+    The fork server starts them; with `fresh=True` a new interpreter does.
     """
     processes: list[Process] = []
 
-    def start_process(*arguments: str, measured: bool = True, fresh: bool = False, **environment: str) -> Process:
+    def start_process(*arguments: str, coverage: bool = True, fresh: bool = False, **environment: str) -> Process:
         where = tmp_path / f"process-{len(processes)}"
         where.mkdir()
-        inherited = dict(os.environ) if measured else unmeasured()
+        inherited = dict(os.environ) if coverage else without_coverage()
         inherited = {name: value for name, value in inherited.items() if not name.startswith("NEDBUS_")}
         environment = inherited | {"PYTHONFAULTHANDLER": "1"} | environment
         command = [sys.executable, *arguments]
-        process = Process(command, where, environment, None if fresh else request.getfixturevalue("zygote"))
+        process = Process(command, where, environment, None if fresh else request.getfixturevalue("fork_server"))
         processes.append(process)
         return process
 

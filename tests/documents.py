@@ -1,12 +1,12 @@
-"""The snippets of README and docs: which there are, and what each needs to run on a host without a vehicle.
+"""Parse the snippets of README and docs.
 
-A comment above a block says what is special about it; the site and plain git hosts do not show it:
+A comment above a block marks how it is tested; the site and git hosts hide it:
 
-    <!-- not run: REASON -->            its syntax, commands, options and files are checked
-    <!-- run by: tests/... -->          the same here; that test runs it
-    <!-- continues -->                  Python that needs the blocks of its page before it
-    <!-- output -->                     what the block before it prints; numbers may differ
-    <!-- all sh not run: REASON -->     of a page: so are all of this language (bash, sh, ini) without a comment
+    <!-- not run: REASON -->            only syntax, commands, options and files are checked
+    <!-- run by: tests/... -->          likewise; the named test runs it
+    <!-- continues -->                  Python that continues the previous blocks of its page
+    <!-- output -->                     output of the previous block; numbers may differ
+    <!-- all sh not run: REASON -->     default marker of all blocks of this language on the page
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PAGES: Final = [
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs").glob("[!mr]*/**/*.md")),
 ]
-"""README and the pages that somebody writes: all but docs/messages and docs/reference."""
+"""README and the hand-written pages: all but docs/messages and docs/reference."""
 
 _MARKER = r"(?: *<!-- ([a-z ]+?)(?:: ([^\n]*?))? -->\n)?"
 _BLOCK = re.compile(rf"^{_MARKER}^( *)```([\w{{}}]*)\n(.*?)^\3```$", re.DOTALL | re.MULTILINE)
@@ -39,7 +39,7 @@ _SHELL = re.compile(r"[|<>&;$`\\*{}]|^(?!nedbus )")
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One block: where it is, its language and text, and what the comment above it says."""
+    """A code block: page and line, language, text, and the marker and reason of the comment above it."""
 
     page: Path
     line: int
@@ -53,28 +53,28 @@ class Block:
 
     @property
     def is_run(self) -> bool:
-        """True if it is run here."""
+        """True if test_documents runs the block."""
         return self.marker not in {"not run", "run by"}
 
     @property
     def commands(self) -> list[str]:
-        """The lines of a shell, without comments, each with those that continue it."""
+        """The shell commands, without comments; continuation lines are joined."""
         text = re.sub(r"(^|\s)#.*$", "", self.text, flags=re.MULTILINE).replace("\\\n", " ")
         return [line.strip() for line in text.splitlines() if line.strip()]
 
     @property
     def is_plain(self) -> bool:
-        """True if it is commands of nedbus alone, with nothing that needs a shell."""
+        """True if the block consists of nedbus commands that need no shell."""
         return not any(_SHELL.search(re.sub(r"\"[^\"]*\"|'[^']*'", "", each)) for each in self.commands)
 
 
 def blocks_of(page: Path) -> Iterator[Block]:
     """Yield the blocks of a page."""
     text = page.read_text()
-    of_all = {language: (marker, reason) for language, marker, reason in _ALL.findall(text)}
+    defaults = {language: (marker, reason) for language, marker, reason in _ALL.findall(text)}
     for found in _BLOCK.finditer(text):
         line = text.count("\n", 0, found.start(5))
-        marker, reason = (found[1] or "", found[2] or "") if found[1] else of_all.get(found[4], ("", ""))
+        marker, reason = (found[1] or "", found[2] or "") if found[1] else defaults.get(found[4], ("", ""))
         yield Block(page, line, found[4], textwrap.dedent(found[5]), marker, reason)
 
 
@@ -82,7 +82,7 @@ BLOCKS: Final = [block for page in PAGES for block in blocks_of(page)]
 
 
 def check_options(command: str) -> None:
-    """Assert that a command that a sentence names exists, and has the options that are named with it."""
+    """Assert that a command named in a sentence exists and has the options named with it."""
     group: Any = typer.main.get_command(app)
     options = {name for option in group.params for name in option.opts}
     for word in shlex.split(command)[1:]:
@@ -95,7 +95,7 @@ def check_options(command: str) -> None:
 
 
 def parse_command(command: str) -> None:
-    """Parse a command line of nedbus as Typer does; raise its error for an unknown command, option or value."""
+    """Parse a nedbus command line with Typer, which raises for an unknown command, option or value."""
     group: Any = typer.main.get_command(app)
     arguments = [each for each in shlex.split(command)[1:] if each != "..."]
     context = group.make_context("nedbus", arguments, resilient_parsing=False)
@@ -107,13 +107,13 @@ def parse_command(command: str) -> None:
 
 
 def nedbus_commands(block: Block) -> list[str]:
-    """Return the command lines of nedbus in a block, as far as a shell's pipes and redirections."""
+    """Return the nedbus command lines in a block, without shell pipes and redirections."""
     found = [re.search(r"(?:^|[|&] ?)(nedbus (?:\"[^\"]*\"|[^|&>])*)", each) for each in block.commands]
     return [match[1].strip() for match in found if match]
 
 
 def shape_of(line: str) -> re.Pattern[str]:
-    """Return what matches a line that differs in its numbers and spaces only."""
+    """Return a pattern that matches lines with other numbers and spaces."""
     parts = re.split(r"(-?\d[\d.,:]*|\s+)", line.strip())
     return re.compile("".join(
         r"\s+" if part.isspace() else r"-?\d[\d.,:]*" if re.fullmatch(r"-?\d[\d.,:]*", part) else re.escape(part)

@@ -1,11 +1,11 @@
-"""A process in which everything happens at once, which must never stand still: python -m tests.stress --seconds 600.
+"""Stress test for deadlocks and stalls: python -m tests.stress --seconds 600.
 
-It opens and closes publishers in one thread, while others put, call `vehicles()` and `latest()`, and subscribe, with
-`max_rate` too. Its router is killed and started again; other processes keep the processor busy. A thread ticks every
-50 ms, and so does a process that does nothing else: on a shared machine that one may be late by seconds itself.
-The bar: no tick comes a second later than the latest one of that, and the process ends.
+One thread opens and closes publishers, while others publish, call `vehicles()` and `latest()`, and subscribe, also with
+`max_rate`. The router is killed and restarted, and other processes load the processor. A thread ticks every 50 ms, and
+so does an idle control process, which on a shared machine may itself be late by seconds.
+Pass criteria: no tick is more than a second later than the latest one of the control, and the process ends.
 
-Whenever ticks stay away for a second, faulthandler prints the stacks of all threads, on stderr.
+When no tick arrives for a second, faulthandler writes the stacks of all threads to stderr.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from nedbus.transport import alive_keys, open_router
 from nedbus_msgs import Selection
 
 TICK: Final = 0.05  # s
-GRACE: Final = 60.0  # s that the process has to end
+GRACE: Final = 60.0  # s; timeout for the process to end
 VEHICLES: Final = 8
 
 
 def main() -> None:
-    """Run for `--seconds`, print what happened, and exit with 1 when it stood still."""
+    """Run for `--seconds`, print the counts, and exit with 1 after a stall."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--restart", type=float, default=20.0, help="seconds between two deaths of the router")
-    parser.add_argument("--busy", type=int, default=2, help="processes that compute")
-    parser.add_argument("--limit", type=float, default=1.0, help="seconds that a tick may be late")
+    parser.add_argument("--restart", type=float, default=20.0, help="interval between kills of the router [s]")
+    parser.add_argument("--busy", type=int, default=2, help="number of busy processes")
+    parser.add_argument("--limit", type=float, default=1.0, help="maximum delay of a tick [s]")
     parser.add_argument("--port", type=int, default=17_447)
     parser.add_argument("--part", choices=["router", "control", "stress"], help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -48,7 +48,7 @@ def main() -> None:
         with open_router(listen=(f"tcp/127.0.0.1:{arguments.port}",)):
             signal.pause()
     elif arguments.part == "control":
-        json.dump(_tick(arguments.seconds, shows=False), sys.stdout)
+        json.dump(_tick(arguments.seconds, dump_stacks=False), sys.stdout)
     elif arguments.part == "stress":
         json.dump(_stress(f"tcp/127.0.0.1:{arguments.port}", arguments.seconds), sys.stdout)
     else:
@@ -57,12 +57,12 @@ def main() -> None:
         sys.exit(found.get("latest tick", float("inf")) >= arguments.limit + found["latest tick of control"])
 
 
-def measure(seconds: float, restart: float, computing: int, port: int) -> dict[str, float]:
-    """Run the process beside a router that comes and goes; return its counts, and how late ticks came [s].
+def measure(seconds: float, restart: float, busy_count: int, port: int) -> dict[str, float]:
+    """Run the process with a router that is killed and restarted; return its counts and the latest ticks [s].
 
-    Of a process that does not end there is no more than those of the control; the stacks of its threads are printed.
+    If the process does not end, its thread stacks are printed, and only the result of the control is returned.
     """
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"], text=True) for _ in range(computing)]
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"], text=True) for _ in range(busy_count)]
     router = _start("router", port)
     control = _start("control", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
     stress = _start("stress", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
@@ -80,11 +80,11 @@ def measure(seconds: float, restart: float, computing: int, port: int) -> dict[s
             stress.send_signal(signal.SIGABRT)  # Python writes the stacks of all threads
         with suppress(subprocess.TimeoutExpired):
             stress.wait(5.0)
-        said = stress.communicate()[0] if stress.returncode == 0 else ""
+        counts = stress.communicate()[0] if stress.returncode == 0 else ""
         late = control.communicate(timeout=GRACE)[0]
     finally:
         _kill(stress, control, router, *busy)
-    return {**json.loads(said or "{}"), "latest tick of control": round(json.loads(late), 3)}
+    return {**json.loads(counts or "{}"), "latest tick of control": round(json.loads(late), 3)}
 
 
 def _listens(port: int) -> bool:
@@ -128,7 +128,7 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             with bus.publisher("vehicle_local_position", vehicle=f"c{counts['closed'] % VEHICLES}") as publisher:
                 publisher.publish(message)
 
-        def take_some(mode: nedbus.Mode = "latest", max_rate: float | None = None) -> None:
+        def receive_some(mode: nedbus.Mode = "latest", max_rate: float | None = None) -> None:
             with bus.subscribe(vehicle="*", mode=mode, max_rate=max_rate) as samples:
                 for _ in range(20):
                     samples.receive(timeout=0.5)
@@ -139,14 +139,14 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             "vehicles": lambda: alive_keys(bus._session, Selection().alive_key_expr(prefix=bus.prefix), timeout=1.0),
             "followed": lambda: (bus.vehicles(timeout=1.0), stop.wait(0.01)),
             "latest": lambda: bus.latest(timeout=1.0),
-            "subscribed": take_some,
-            "every": lambda: take_some("every"),
-            "downsampled": lambda: take_some(max_rate=5.0),
+            "subscribed": receive_some,
+            "every": lambda: receive_some("every"),
+            "downsampled": lambda: receive_some(max_rate=5.0),
         }
         threads = [threading.Thread(target=repeat, args=each, name=each[0], daemon=True) for each in actions.items()]
         for thread in threads:
             thread.start()
-        latest = _tick(seconds, shows=True)
+        latest = _tick(seconds, dump_stacks=True)
         stop.set()
         for thread in threads:
             thread.join(GRACE / 2)
@@ -154,11 +154,11 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
     return {**counts, "latest tick": round(latest, 3)}
 
 
-def _tick(seconds: float, *, shows: bool) -> float:
-    """Tick for this time, and return how late the latest tick was [s]; `shows`: show all stacks when one is."""
+def _tick(seconds: float, *, dump_stacks: bool) -> float:
+    """Tick for `seconds` and return the delay of the latest tick [s]; `dump_stacks`: on a late tick."""
     end, latest, last = time.monotonic() + seconds, 0.0, time.monotonic()
     while last < end:
-        if shows:
+        if dump_stacks:
             faulthandler.dump_traceback_later(1.0 + TICK, exit=False)
         time.sleep(TICK)
         now = time.monotonic()

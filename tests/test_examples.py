@@ -1,4 +1,4 @@
-"""The examples, unchanged, against a service with a simulated vehicle."""
+"""The examples, run unchanged with a simulated vehicle."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pytest
 import nedbus
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import convert_replay
-from tests.nedbus.cli.commands.test_query import flying
+from tests.nedbus.cli.commands.test_query import simulation
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
 from tests.waits import wait_for
 
-__all__ = ["flying"]  # a fixture
+__all__ = ["simulation"]  # a fixture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTS = {
@@ -32,33 +32,33 @@ PRINTS = {
 
 
 def run_example(start: Start, name: str, endpoint: str, folder: Path) -> Process:
-    """Run an example; the default endpoint in it is replaced by this test's."""
+    """Run an example with the test's endpoint instead of the default one."""
     script = folder / name
     script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", endpoint))
-    return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1", measured=False)
+    return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1", coverage=False)
 
 
 def test_all_examples_are_tested() -> None:
-    """Every example has a test."""
+    """Every script of examples/ has a test."""
     assert {path.name for path in EXAMPLES.glob("*.py")} == {*PRINTS, "publish.py", "resets.py"}
 
 
 @pytest.mark.parametrize("name", PRINTS)
-def test_example_runs(start: Start, flying: str, tmp_path: Path, name: str) -> None:
-    """Each example prints its result, and ends without a word at Ctrl-C."""
-    process = run_example(start, name, flying, tmp_path)
+def test_example_runs(start: Start, simulation: str, tmp_path: Path, name: str) -> None:
+    """Each example prints its result, and Ctrl-C ends it without an error message."""
+    process = run_example(start, name, simulation, tmp_path)
     wait_for(
         lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}"
     )
     assert PRINTS[name] in process.out, process.err
-    if name != "fleet.py":  # which ends by itself
+    if name != "fleet.py":  # it ends on its own
         process.signal(signal.SIGINT)
     assert process.wait() == 0, process.err
     assert process.err == ""
 
 
-def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
-    """The vehicle of examples/publish.py moves."""
+def test_publish_example_moves_its_vehicle(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+    """examples/publish.py publishes changing positions with increasing timestamps."""
     process = run_example(start, "publish.py", endpoint, tmp_path)
     position, topic = nedbus.VehicleLocalPosition, "external_ins_local_position"
     with bus.subscribe(position, topic=topic, vehicle="mine", mode="every") as subscription:
@@ -69,13 +69,13 @@ def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.B
 
 
 @pytest.mark.slow
-def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Path) -> None:
-    """examples/alarm.py waits for the service, which is the router too, at its start and when it was killed."""
+def test_alarm_example_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Path) -> None:
+    """examples/alarm.py waits for the router of the service at its start, and after the service was killed."""
     endpoint = free_endpoint()
     states = ["vehicle 1: good", "vehicle 1: ALARM: nothing arrived for 1 s", "vehicle 1: good"]
 
     def serve() -> Process:
-        service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", measured=False)
+        service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", coverage=False)
         wait_for(lambda: "router on" in service.err, what="the router")
         return service
 
@@ -91,12 +91,12 @@ def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Pat
     assert alarm.wait() == 0
 
 
-def test_alarm_is_raised_by_the_flag(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
-    """examples/alarm.py names each flag that casts doubt on a position, once."""
+def test_alarm_example_names_the_flags(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+    """examples/alarm.py reports each flag that makes a position doubtful, once."""
     alarm = run_example(start, "alarm.py", endpoint, tmp_path)
     publisher = bus.publisher(VLP, vehicle="1")
 
-    def is_said(text: str, flags: dict[str, bool]) -> bool:
+    def is_printed(text: str, flags: dict[str, bool]) -> bool:
         publisher.publish(message(1, **VALID | flags))
         return alarm.out.rstrip().endswith(text)
 
@@ -107,13 +107,13 @@ def test_alarm_is_raised_by_the_flag(start: Start, endpoint: str, bus: nedbus.Bu
         ("ALARM: z_valid is false, dead_reckoning is true", {"z_valid": False, "dead_reckoning": True}),
         ("ALARM: v_xy_valid is false, v_z_valid is false", {"v_xy_valid": False, "v_z_valid": False}),
     ):
-        wait_for(lambda text=text, flags=flags: is_said(text, flags), what=text)  # type: ignore[misc]
+        wait_for(lambda text=text, flags=flags: is_printed(text, flags), what=text)  # type: ignore[misc]
     assert alarm.out.count("xy_valid is false") == 2
 
 
 @pytest.mark.slow
-def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:
-    """examples/resets.py prints the reset at the end of the simulated outage, and plots both tracks and one cross."""
+def test_resets_example_plots_both_tracks(start: Start, tmp_path: Path) -> None:
+    """examples/resets.py prints the reset after the simulated outage, and plots both tracks and one marker."""
     flight, picture = tmp_path / "flight.mcap", tmp_path / "resets.png"
     convert_replay("sim:?duration=80", flight)
     process = start(str(EXAMPLES / "resets.py"), str(flight), str(picture), MPLBACKEND="agg")
@@ -126,7 +126,7 @@ def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:
         return np.nonzero(np.abs(pixels - color).max(axis=2) < 0.1)
 
     dotted, solid, cross = (drawn(color) for color in ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (1.0, 0.0, 0.0)))
-    # The figure of eight fills the plot; the dotted track is beside it only after the reset, from the cross on.
+    # The figure of eight fills the plot; the dotted track differs from it only after the reset, marked by the cross.
     assert len(solid[0]) > 2000
     assert np.ptp(solid[0]) > 300
     assert np.ptp(solid[1]) > 600

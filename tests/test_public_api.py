@@ -1,4 +1,4 @@
-"""The public interface: complete, documented, made of public names only, with every error in one drawing."""
+"""The public API: complete, documented, with public names only in its signatures, and one tree of all errors."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ OURS = {
     name
     for folder in ("service", "schemas")
     for path in ROOT.glob(f"{folder}/**/*.py")
-    for name in re.findall(r"^ *class (\w+)", path.read_text(), re.MULTILINE)  # a hundredth of the time of ast
+    for name in re.findall(r"^ *class (\w+)", path.read_text(), re.MULTILINE)  # a hundred times faster than ast
 }
-# Generic over all messages, or parts of the file of a message, which no script imports.
+# Generic over all messages, or used only in the definition of a message, which no script imports.
 ALLOWED = {"Definition", "FieldType", "Layout", "RenamedField", "Rule"}
 
 
@@ -32,8 +32,8 @@ PUBLIC = {name: module for module in MODULES.values() for name in module.__all__
 
 
 @pytest.mark.parametrize("name", [*MODULES, "nedbus_msgs"])
-def test_public_interface_is_complete(name: str) -> None:
-    """Each name of __all__ is there, once and documented, and nothing public is missing."""
+def test_all_lists_every_public_name(name: str) -> None:
+    """Each name of __all__ exists once and has a docstring, and no public name is missing."""
     module = importlib.import_module(name)
     assert len(module.__all__) == len(set(module.__all__))
     for word in module.__all__:
@@ -46,8 +46,8 @@ def test_public_interface_is_complete(name: str) -> None:
         assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
 
 
-def test_completion_shows_what_scripts_use() -> None:
-    """`dir(nedbus)` has fewer than 70 names: its own, the messages, and the modules that have the rest."""
+def test_dir_of_nedbus_is_short() -> None:
+    """`dir(nedbus)` has fewer than 70 names: __all__, the messages, and the public modules."""
     shown = {name for name in dir(nedbus) if not name.startswith("__")}
     assert shown == {*nedbus.__all__, *MESSAGES, "errors", "frames", "health"}
     assert len(shown) < 70
@@ -56,7 +56,7 @@ def test_completion_shows_what_scripts_use() -> None:
 
 
 def annotations_of(public: object) -> typing.Iterator[str]:
-    """Yield the annotations of a function, or of the public methods and fields of a class, as they are written."""
+    """Yield the annotations of a function, or of the public methods and fields of a class, as source text."""
     if inspect.isfunction(public):
         yield from map(str, inspect.get_annotations(public).values())
     elif inspect.isclass(public):
@@ -64,22 +64,22 @@ def annotations_of(public: object) -> typing.Iterator[str]:
         for name, member in list(vars(public).items()):
             function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
             returned = r"get one from|from `connect|returns one|yields them"
-            made_by_users = name == "__init__" and not re.search(returned, public.__doc__ or "")
-            if inspect.isfunction(function) and (not name.startswith("_") or made_by_users):
+            is_constructor = name == "__init__" and not re.search(returned, public.__doc__ or "")
+            if inspect.isfunction(function) and (not name.startswith("_") or is_constructor):
                 yield from map(str, inspect.get_annotations(function).values())
 
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_public_signatures_mention_public_names_only(name: str) -> None:
-    """A script can import from nedbus and its public modules whatever it gets from them, or gives to them."""
+    """A script can import every class in a public signature from nedbus or its public modules."""
     for annotation in annotations_of(getattr(PUBLIC[name], name)):
         expression = annotation.removeprefix("<class '").removesuffix("'>")
         mentioned = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
         assert mentioned & OURS <= {*PUBLIC, *ALLOWED}, annotation
 
 
-def test_error_tree_is_drawn() -> None:
-    """The docstring of nedbus.errors draws every error, with the built-in error that each one also is."""
+def test_error_tree_lists_every_error() -> None:
+    """The docstring of nedbus.errors lists every error, with its built-in base class."""
     errors = importlib.import_module("nedbus.errors")
     for name in errors.__all__:
         assert name in (errors.__doc__ or ""), name

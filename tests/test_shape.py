@@ -38,14 +38,14 @@ def test_packages_are_imported_through_their_interface() -> None:
 
 
 def test_modules_state_their_responsibility() -> None:
-    """The docstring of a module begins with one sentence that fits a line."""
+    """The docstring of a module begins with a one-line sentence."""
     for path in PRODUCT:
-        first = (ast.get_docstring(parse(path)) or "\n").splitlines()[0]
-        assert path.stem.startswith("__") or first.endswith((".", ":")), path
+        summary = (ast.get_docstring(parse(path)) or "\n").splitlines()[0]
+        assert path.stem.startswith("__") or summary.endswith((".", ":")), path
 
 
 @pytest.mark.parametrize("folder", sorted({path.parent for path in ALL}), ids=lambda path: str(path.relative_to(ROOT)))
-def test_folder_is_small(folder: Path) -> None:
+def test_folder_has_at_most_14_files(folder: Path) -> None:
     """A folder has at most 14 Python files."""
     assert len([*folder.glob("*.py")]) <= MAX_FILES
 

@@ -1,4 +1,4 @@
-"""Waiting for conditions, with a deadline and words for when it passes."""
+"""Wait for conditions, with a deadline and a message for when it passes."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ DEADLINE = 30.0
 
 
 def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEADLINE) -> None:
-    """Wait until a condition holds, and fail with words when it never does."""
+    """Wait until a condition holds; fail with `what` after the deadline."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, f"waited {seconds} s in vain for {what}"
         time.sleep(0.01)
 
 
-def wait_for_reader(raw: Session, key: str) -> None:
-    """Wait until a session knows of a subscriber of this key: what it publishes before goes nowhere."""
-    probe = raw.declare_publisher(key)
+def wait_for_matching(zenoh_session: Session, key: str) -> None:
+    """Wait until the session has a matching subscriber of this key; Zenoh drops what it publishes before."""
+    probe = zenoh_session.declare_publisher(key)
     wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
     probe.undeclare()
 
 
-def wait_for_router(raw: Session) -> None:
-    """Wait until the router knows what a session has declared: it answers in the order in which it is told."""
-    alive_keys(raw, "nowhere", timeout=DEADLINE)
+def wait_for_router(zenoh_session: Session) -> None:
+    """Wait until the router has processed the session's declarations: it replies to this query after them."""
+    alive_keys(zenoh_session, "nowhere", timeout=DEADLINE)
 
 
 @contextmanager
 def changing_timings() -> Iterator[Timings]:
-    """Yield the timings of this process, to change fields of them, and restore them at the end."""
+    """Yield the timings of this process for changes, and restore them at the end."""
     before = replace(TIMINGS)
     try:
         yield TIMINGS
@@ -51,7 +51,7 @@ def changing_timings() -> Iterator[Timings]:
 
 @contextmanager
 def repeating(action: Callable[[], object]) -> Iterator[None]:
-    """Do something fifty times a second, as a vehicle does."""
+    """Repeat an action at 50 Hz, as a vehicle publishes."""
     stop = threading.Event()
 
     def run() -> None:

@@ -1,1 +1,1 @@
-"""nedbus beside its peers, in one run: `python -m benchmarks.compare`."""
+"""Comparison of nedbus with similar libraries: `python -m benchmarks.compare`."""

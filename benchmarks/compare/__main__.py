@@ -1,12 +1,12 @@
-"""nedbus beside its peers, in one run: python -m benchmarks.compare [--rounds N].
+"""Compare nedbus with similar libraries: python -m benchmarks.compare [--rounds N].
 
-Each form of `forms` sends the same 53 fields from one process to another, through one router where it uses
-Zenoh: as fast as it can without losing any, then at 1 kHz and at 100 Hz; some with ten vehicles in one process, and
-with the messages of other flights.
-Rounds are interleaved, and medians taken, as machines are shared and noisy; only the ratios of one run mean something.
-Peers are installed in environments of their own under build/bench; one that cannot be is named as such.
-The results are written to docs/explanation/performance.json and, as tables, into the page beside it and the README;
-those of a part, as with `--forms raw models --loads 1kHz --flights "no origin"`, are only printed.
+Each module of `forms` sends the same 53 fields from one process to another, with Zenoh through one router: at full
+speed without loss, then at 1 kHz and at 100 Hz; some also with ten vehicles in one process, and with the messages of
+other flights.
+Machines are shared and noisy: rounds are interleaved, medians are reported, and only ratios within one run are
+meaningful. Other libraries are installed in virtual environments under build/bench; failures are reported.
+A complete run is written to docs/explanation/performance.json and, as tables, to its page and the README; the results
+of a part, as with `--forms raw models --loads 1kHz --flights "no origin"`, are only printed.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from typing import Final
 
 from benchmarks.processes import router
 
-from .bars import print_bars
 from .fields import DEFAULT_FLIGHT, FLIGHTS
 from .measure import run
 from .peers import CORE, find_forms, prepare
 from .report import as_markdown, write
 from .results import FULL, KHZ, LOADS, TEN, Load, Results
+from .targets import print_targets
 
 ROUNDS: Final = 3
-LASTS: Final = 2.5  # s that a run at full speed should last
-TRIAL: Final = 5000  # messages that say how many that are
-MANY: Final = {"raw": 2_000_000, "batches": 2_000_000}  # messages of these in any case, with the default flight
+DURATION: Final = 2.5  # s; desired duration of a run at full speed
+TRIAL: Final = 5000  # messages of the trial that estimates their number
+MIN_MESSAGES: Final = {"raw": 2_000_000, "batches": 2_000_000}  # with the default flight
 
 
 @dataclass(frozen=True)
 class Part:
-    """The part that is measured: all of it, unless the arguments name less."""
+    """The selected part of the measurement, by default all."""
 
     forms: Sequence[str]
     loads: Sequence[str]
     flights: Sequence[str]
 
     def cases(self) -> Iterable[tuple[str, Load, list[str]]]:
-        """Yield flight, load and forms: peers with one vehicle, and beside other flights with the default one only."""
+        """Yield flight, load and forms: other libraries only with one vehicle and the default flight."""
         core = [form for form in self.forms if form in CORE]
         for flight in self.flights:
             for load in (LOADS[name] for name in self.loads):
@@ -52,21 +52,21 @@ class Part:
 
 
 def main() -> None:
-    """Measure, print, and write what is complete."""
-    whole = Part(find_forms(), list(LOADS), [DEFAULT_FLIGHT, *(each for each in FLIGHTS if each != DEFAULT_FLIGHT)])
+    """Measure and print; write the results of a complete run."""
+    complete = Part(find_forms(), list(LOADS), [DEFAULT_FLIGHT, *(each for each in FLIGHTS if each != DEFAULT_FLIGHT)])
     parser = argparse.ArgumentParser(description="Compare nedbus with its peers.")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
-    for name, known in (("forms", whole.forms), ("loads", whole.loads), ("flights", whole.flights)):
+    for name, known in (("forms", complete.forms), ("loads", complete.loads), ("flights", complete.flights)):
         parser.add_argument(f"--{name}", nargs="+", choices=known, default=known)
     arguments = parser.parse_args()
     part = Part(arguments.forms, arguments.loads, arguments.flights)
     results = measure(part, arguments.rounds)
-    if part == whole:
+    if part == complete:
         write(results, arguments.rounds)
         print(as_markdown(results, arguments.rounds))
     else:
         print_medians(results)
-    print_bars(results)
+    print_targets(results)
 
 
 def measure(part: Part, rounds: int) -> Results:
@@ -85,10 +85,10 @@ def measure(part: Part, rounds: int) -> Results:
                 for form in forms:
                     if form in results.failed:
                         continue
-                    many = MANY.get(form, 0) if flight == DEFAULT_FLIGHT else 0
-                    chosen = load if load.rate else replace(load, messages=max(counts[form], many))
+                    least = MIN_MESSAGES.get(form, 0) if flight == DEFAULT_FLIGHT else 0
+                    sized = load if load.rate else replace(load, messages=max(counts[form], least))
                     try:
-                        measured = run(form, pythons[form], chosen, flight=flight, endpoint=endpoint)
+                        measured = run(form, pythons[form], sized, flight=flight, endpoint=endpoint)
                     except RuntimeError as exc:
                         results.drop(form, f"fails: {exc}")
                         continue
@@ -98,17 +98,17 @@ def measure(part: Part, rounds: int) -> Results:
 
 
 def count(form: str, python: str, endpoint: str, results: Results) -> int:
-    """Return how many messages last for a while; 0 if the form does not work."""
+    """Return the number of messages for a run of the desired duration; 0 if the form does not work."""
     try:
         trial = run(form, python, replace(FULL, messages=TRIAL), flight=DEFAULT_FLIGHT, endpoint=endpoint)
     except RuntimeError as exc:
         results.drop(form, f"does not work here: {exc}")
         return 0
-    return min(1_000_000, max(TRIAL, round(trial["rate"] * LASTS)))
+    return min(1_000_000, max(TRIAL, round(trial["rate"] * DURATION)))
 
 
 def describe(load: Load, measured: dict[str, float]) -> str:
-    """Return the most important numbers of a run, or of several."""
+    """Format the main figures of a run, or of the medians of several."""
     cpu = f"CPU {measured['publish_cpu']:.1f} / {measured['receive_cpu']:.1f} us"
     lost = f", {1 - measured['kept']:.2%} LOST" if measured["kept"] < 1.0 else ""
     if load.rate:
@@ -117,7 +117,7 @@ def describe(load: Load, measured: dict[str, float]) -> str:
 
 
 def print_medians(results: Results) -> None:
-    """Print the medians of a part, and their ratios to raw and to the straightforward script."""
+    """Print the medians, and their ratios to raw Zenoh and the straightforward script."""
     print()
     for flight, name, form in results.runs:
         load = LOADS[name]

@@ -10,8 +10,8 @@ class Case:
     """One publisher process and one reader process.
 
     `endpoint`: the router.
-    `vehicles`: the ids that are published; forms of other projects know one only.
-    `paced`: messages come at a rate, from a live vehicle; else as fast as they can be sent without losing any.
+    `vehicles`: published vehicle ids; forms of other projects support only one.
+    `paced`: send at a fixed rate like a live vehicle; otherwise at full speed without loss.
     """
 
     endpoint: str
@@ -20,10 +20,10 @@ class Case:
 
     @property
     def lossless(self) -> bool:
-        """True if publishers wait for their readers: live ones never do."""
+        """True if publishers wait for slow readers; live ones never do."""
         return not self.paced
 
     @property
     def vehicle(self) -> str:
-        """Vehicle that a reader subscribes to: the only one, or all of them."""
+        """Vehicle to subscribe to: the only one, or "*" for several."""
         return self.vehicles[0] if len(self.vehicles) == 1 else "*"

@@ -1,7 +1,7 @@
-"""The message that all forms send, as plain Python values: one of a real flight, of tests/data/flights.json.
+"""The message that all forms send, as plain Python values, from a real flight in tests/data/flights.json.
 
-The environment variable BENCH_FLIGHT names the flight.
-The timestamp is the sender's, so `timestamp_sample` is 0, which is never later.
+The environment variable BENCH_FLIGHT selects the flight. The sender sets `timestamp`, so `timestamp_sample` is 0 to be
+never later.
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 VARIABLE: Final = "BENCH_FLIGHT"
-DEFAULT_FLIGHT: Final = "no origin"  # and its dist_bottom_valid is false as well: no terrain
+DEFAULT_FLIGHT: Final = "no origin"  # it has no terrain estimate either: dist_bottom_valid is false
 FLIGHTS: Final[dict[str, Any]] = json.loads((Path(__file__).parents[2] / "tests/data/flights.json").read_text())
 FLIGHT: Final = os.environ.get(VARIABLE, DEFAULT_FLIGHT)
 
@@ -32,15 +32,15 @@ def _value(value: Any) -> Any:
 
 
 def _complete(provided: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all fields in PX4's order, with NaN, false or 0 for those that the source does not provide."""
+    """Return all fields in PX4's order, with NaN, False or 0 for fields that the source does not provide."""
     return {name: provided.get(name, _ABSENT[type(value)]) for name, value in _read("everything set").items()}
 
 
 COMPLETE: Final = [flight for flight in FLIGHTS if len(_read(flight)) == len(_read("everything set"))]
-"""The flights whose source provides all fields."""
+"""Flights whose source provides all fields."""
 
 PROVIDED: Final = _read(FLIGHT)
-"""What the source of this flight provides, which nedbus tells its readers."""
+"""Fields that the source of this flight provides; nedbus transmits which these are."""
 
 FIELDS: Final = _complete(PROVIDED)
 """All 53 fields."""

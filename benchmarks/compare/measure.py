@@ -1,4 +1,4 @@
-"""One run of one form: a publisher and a reader, in processes of their own, at one load."""
+"""One run of one form at one load, with a publisher process and a reader process."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import json
 import subprocess
 import time
 
-from benchmarks.processes import Process, end, expect, start, tell
+from benchmarks.processes import Process, end, expect, resume, start
 
 from .fields import VARIABLE
 from .results import Load, Measured
 
-TRIES = 2  # a shared machine may stand still for seconds
+TRIES = 2  # a shared machine may stall for seconds
 
 
 def run(name: str, python: str, load: Load, *, flight: str, endpoint: str) -> Measured:
-    """Measure, and once more if that fails; raise RuntimeError if it fails again."""
+    """Measure, with one retry; raise RuntimeError if both runs fail."""
     for tries in range(TRIES, 0, -1):
         try:
             return _run(name, python, load, flight=flight, endpoint=endpoint, quiet=tries > 1)
         except (RuntimeError, TimeoutError, subprocess.SubprocessError, ValueError) as exc:
             if tries == 1:
                 raise RuntimeError(f"{load.name}, {flight}: {exc}") from exc
-            print(f"{name}: {exc}; once more", flush=True)
+            print(f"{name}: {exc}; retrying", flush=True)
     raise AssertionError
 
 
@@ -42,13 +42,13 @@ def _run(name: str, python: str, load: Load, *, flight: str, endpoint: str, quie
                 raise RuntimeError(f"{role} does not start")
         receiver, publisher = ends
         time.sleep(0.5)
-        tell(publisher)
+        resume(publisher)
         sent = json.loads(expect(publisher))
-        tell(receiver)
+        resume(receiver)
         got = json.loads(expect(receiver))
-        tell(publisher)
+        resume(publisher)
     finally:
-        end(*ends, patience=2.0)
+        end(*ends, timeout=2.0)
     return {
         "rate": got["received"] / got["seconds"],
         "kept": got["received"] / load.messages,

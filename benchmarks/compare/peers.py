@@ -1,4 +1,4 @@
-"""The forms that are compared, and the environments of those that belong to other projects, under build/bench."""
+"""The compared forms, and virtual environments for those of other projects, under build/bench."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benchmarks.processes import ROOT
 
 FORMS: Final = ROOT / "benchmarks" / "compare" / "forms"
 CORE: Final = ("raw", "straightforward", "models", "fields_in", "rows", "batches")
-"""The forms that are measured in all cases: what others are compared with, and nedbus."""
+"""Forms measured in all cases: the references, and nedbus."""
 
 
 def find_forms() -> list[str]:
@@ -24,7 +24,7 @@ def find_forms() -> list[str]:
 
 
 def prepare(name: str) -> str:
-    """Return the Python that has what a form needs, installed if it is a peer's.
+    """Return the Python interpreter of a form; create a virtual environment with its packages if it needs any.
 
     Raises subprocess.CalledProcessError if it cannot be installed.
     """
@@ -41,13 +41,13 @@ def prepare(name: str) -> str:
 
 
 def title(name: str) -> str:
-    """Return the first sentence of a form's description."""
+    """Return the first sentence of a form's docstring."""
     doc = ast.get_docstring(_parse(name)) or name
     return re.split(r"[.;](?:\s|$)", doc.replace("\n", " "))[0]
 
 
 def _find_packages(name: str) -> list[str]:
-    """Return what a form's PACKAGES says, without importing it."""
+    """Return PACKAGES of a form without importing it."""
     for node in _parse(name).body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "PACKAGES":
             found: list[str] = ast.literal_eval(node.value)

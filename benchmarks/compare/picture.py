@@ -1,4 +1,4 @@
-"""The picture of docs/explanation/performance.json: python -m benchmarks.compare.picture."""
+"""Plot docs/explanation/performance.json: python -m benchmarks.compare.picture."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .results import FULL
 
 
 def main() -> None:
-    """Draw messages a second of each form, nedbus in colour."""
+    """Plot the throughput of each form, with nedbus highlighted."""
     about = json.loads(RESULTS.read_text())
     rows = sorted(about["results"][about["flight"]][FULL.name].items(), key=lambda item: item[1]["rate"])
     names = [("nedbus " if title(name).startswith("nedbus") else "") + name.replace("_", " ") for name, _ in rows]

@@ -1,4 +1,4 @@
-"""The results as text: performance.json, two tables for the page beside it, and four rows for the README."""
+"""Output of the results: performance.json, two tables for its page, and four rows for the README."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Final
 
 from benchmarks.processes import ROOT
 
-from .bars import judge
 from .fields import DEFAULT_FLIGHT, FLIGHTS
 from .peers import CORE, title
 from .results import FULL, KHZ, LOADS, SLOW, TEN, Measured, Results
+from .targets import evaluate
 
 RESULTS: Final = ROOT / "docs" / "explanation" / "performance.json"
 PAGE: Final = RESULTS.with_suffix(".md")
@@ -25,7 +25,7 @@ HEAD: Final = (
     " | one-way p50 / p99 at 1 kHz, µs | at 100 Hz, µs | CPU µs/message at 1 kHz |"
 )
 
-BYTES: Final = {  # of a payload of the default flight, with a timestamp in ns, without what the transport adds
+BYTES: Final = {  # payload size with the default flight and a timestamp in ns, without transport overhead
     "raw": 244, "batches": 244, "rows": 244, "models": 244, "fields_in": 244, "straightforward": 916,
     "msgspec_array": 356, "pyzmq": 916, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
     "mavsdk_telemetry": 40, "rclpy_odometry": 708,
@@ -33,7 +33,7 @@ BYTES: Final = {  # of a payload of the default flight, with a timestamp in ns, 
 
 
 def table(results: Results) -> str:
-    """Return the results with the default flight as Markdown, the fastest first."""
+    """Return the results with the default flight as a Markdown table, the fastest first."""
     flight = DEFAULT_FLIGHT
     medians = {form: results.median(flight, FULL, form) for form in results.forms(flight, FULL)}
     lines = [HEAD, "|---" * HEAD.count(" |") + "|"]
@@ -56,7 +56,7 @@ def _lost(measured: Measured) -> str:
 
 
 def flight_table(results: Results) -> str:
-    """Return the core forms with each flight, and with ten vehicles, as Markdown."""
+    """Return the core forms with each flight, and with ten vehicles, as a Markdown table."""
     flights = results.flights(FULL)
     head = ["form", *flights, "ten vehicles"]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
@@ -76,7 +76,7 @@ def flight_table(results: Results) -> str:
 
 
 def as_json(results: Results, rounds: int) -> dict[str, object]:
-    """Return all that is known: medians and ratios by flight, load and form."""
+    """Return the complete results: medians and ratios by flight, load and form."""
     measured: dict[str, dict[str, dict[str, object]]] = {}
     for flight, name, form in results.runs:
         load = LOADS[name]
@@ -94,7 +94,7 @@ def as_json(results: Results, rounds: int) -> dict[str, object]:
         "loads": {load.name: {"rate": load.rate, "vehicles": load.vehicles} for load in LOADS.values()},
         "bytes": BYTES,
         "results": measured,
-        "bars": list(judge(results)),
+        "bars": list(evaluate(results)),
         "failed": results.failed,
     }
 
@@ -104,10 +104,10 @@ def _rounded(numbers: Measured) -> dict[str, object]:
 
 
 def as_markdown(results: Results, rounds: int) -> str:
-    """Return what stands on the page: a few sentences and two tables."""
+    """Return the text of the page: a few sentences and two tables."""
     about = as_json(results, rounds)
     return (
-        f"Measured on {about['date']} on {about['machine']}, publisher, router and reader in processes of their own,"
+        f"Measured on {about['date']} on {about['machine']}, publisher, router and reader in separate processes,"
         f" TCP on loopback; medians of {rounds} interleaved rounds.\n"
         f"The message is one of a real flight, {FLIGHTS[DEFAULT_FLIGHT]['from']}: valid, with no origin and no terrain"
         " estimate.\n\n"
@@ -130,7 +130,7 @@ SHOWN: Final = {
 
 
 def short_table(results: Results) -> str:
-    """Return the rows of the README."""
+    """Return the table of the README."""
     lines = [
         "| form | messages/s | CPU µs/message, publisher / reader | one-way p50 / p99 at 1 kHz, µs |",
         "|---|---|---|---|",
@@ -145,7 +145,7 @@ def short_table(results: Results) -> str:
 
 
 def write(results: Results, rounds: int) -> None:
-    """Write the results as JSON, as tables into their page, and as rows into the README."""
+    """Write the results to performance.json, and the tables to its page and the README."""
     RESULTS.write_text(json.dumps(as_json(results, rounds), indent=2) + "\n")
     _replace(PAGE, "performance", as_markdown(results, rounds))
     if all(form in results.forms(DEFAULT_FLIGHT, FULL) for form in SHOWN):

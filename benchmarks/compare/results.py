@@ -1,4 +1,4 @@
-"""Results of all rounds, with medians and ratios; and the loads that are measured."""
+"""The measured loads, and the results of all rounds with medians and ratios."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 Measured = dict[str, float]
-"""What one run measured: rate in messages/s, CPU times and delays in microseconds a message, peaks in MB."""
+"""Figures of one run: rate [messages/s], CPU times and delays [us/message], memory peaks [MB]."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Load of a run: `rate` of each vehicle in Hz, 0 for as fast as possible; `messages` of all together."""
+    """Load of a run: `rate` per vehicle [Hz], 0 for full speed; `messages` in total."""
 
     name: str
     rate: int
@@ -30,7 +30,7 @@ LOADS: Final = {load.name: load for load in (FULL, KHZ, SLOW, TEN)}
 
 @dataclass
 class Results:
-    """The runs of all rounds, in their order, by flight, load and form; `failed` says why a form is not in it."""
+    """The runs of all rounds in order, by flight, load and form; `failed`: reason for each failed form."""
 
     runs: dict[tuple[str, str, str], list[Measured]] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
@@ -40,7 +40,7 @@ class Results:
         self.runs.setdefault((flight, load.name, form), []).append(measured)
 
     def drop(self, form: str, reason: str) -> None:
-        """Forget a form that has failed."""
+        """Remove a form that failed."""
         self.failed[form] = reason
         self.runs = {key: runs for key, runs in self.runs.items() if key[2] != form}
 
@@ -57,18 +57,18 @@ class Results:
         return list(dict.fromkeys(flight for flight, name, _ in self.runs if name == load.name))
 
     def median(self, flight: str, load: Load, form: str) -> Measured:
-        """Return the medians of the rounds, and of `kept`, the share of messages that arrived, the least."""
+        """Return the medians of the rounds; of `kept`, the fraction of messages that arrived, the minimum."""
         runs = self.runs[flight, load.name, form]
         medians = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
         return medians | {"kept": min(run["kept"] for run in runs)}
 
     def ratio(self, flight: str, load: Load, form: str, other: str, key: str) -> float:
-        """Return the median of the ratios of one form to another in the same round, which the machine's pace is in."""
+        """Return the median of the ratios of two forms in the same round, when the machine had the same speed."""
         pairs = zip(self.runs[flight, load.name, form], self.runs[flight, load.name, other], strict=True)
         return statistics.median(one[key] / two[key] for one, two in pairs)
 
     def ratios(self, flight: str, load: Load, form: str, other: str) -> Iterator[tuple[str, float]]:
-        """Yield the ratios of all that was measured and is not 0."""
+        """Yield the ratios of all figures that are not 0."""
         for key in self.runs[flight, load.name, form][0]:
             if all(run[key] for run in self.runs[flight, load.name, other]):
                 yield key, self.ratio(flight, load, form, other, key)

@@ -1,8 +1,8 @@
-"""One end of a measurement.
+"""Publisher or reader process of a measurement.
 
-Run it as `python -m benchmarks.compare.role FORM publish|receive ENDPOINT COUNT RATE [VEHICLE,VEHICLE...]`.
-COUNT messages of all vehicles together, RATE of each in Hz, 0 for as fast as possible; all vehicles send at once.
-It prints "ready", waits for a line, works, and prints what it measured as JSON.
+Usage: `python -m benchmarks.compare.role FORM publish|receive ENDPOINT COUNT RATE [VEHICLE,VEHICLE...]`.
+COUNT is the total number of messages; RATE is per vehicle in Hz, 0 for full speed; all vehicles send simultaneously.
+It prints "ready", waits for a line, runs, and prints its figures as JSON.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ class Form(Protocol):
 
 
 def main() -> None:
-    """Play the role that the arguments name."""
+    """Run the publisher or the reader."""
     form_name, role, endpoint, count, rate, *vehicles = sys.argv[1:7]
     form = cast("Form", importlib.import_module(f"benchmarks.compare.forms.{form_name}"))
-    chosen = tuple(vehicles[0].split(",")) if vehicles else ("1",)
-    play = publish if role == "publish" else receive
-    play(form, Case(endpoint, chosen, paced=float(rate) > 0), int(count), float(rate))
+    ids = tuple(vehicles[0].split(",")) if vehicles else ("1",)
+    run = publish if role == "publish" else receive
+    run(form, Case(endpoint, ids, paced=float(rate) > 0), int(count), float(rate))
 
 
 def publish(form: Form, case: Case, count: int, rate: float) -> None:
-    """Send this many messages."""
+    """Send `count` messages."""
     size = getattr(form, "BATCH", 1)
     with form.publish(case) as senders:
         print("ready", flush=True)
@@ -63,7 +63,7 @@ def publish(form: Form, case: Case, count: int, rate: float) -> None:
 
 
 def send_paced(senders: Sequence[Send], ticks: int, rate: float) -> None:
-    """Send one message of each vehicle at each tick."""
+    """Send one message per vehicle and tick."""
     start = time.monotonic()
     for tick in range(ticks):
         wait = start + tick / rate - time.monotonic()
@@ -74,7 +74,7 @@ def send_paced(senders: Sequence[Send], ticks: int, rate: float) -> None:
 
 
 def receive(form: Form, case: Case, count: int, rate: float) -> None:
-    """Take this many messages, or fewer if no more come."""
+    """Receive `count` messages, or fewer if no more arrive."""
     received, start, end = 0, (0.0, 0.0), (0.0, 0.0)
     delays: list[int] = []
 
@@ -93,7 +93,7 @@ def receive(form: Form, case: Case, count: int, rate: float) -> None:
                 delays.extend(taken - int(each) for each in stamp)
         if received < count:
             return True
-        end = now()  # before anything is closed
+        end = now()  # before closing
         return False
 
     def watch() -> None:
@@ -109,7 +109,7 @@ def receive(form: Form, case: Case, count: int, rate: float) -> None:
         delays.sort()
         found = {f"p{part}": delays[len(delays) * part // 100] / 1e3 for part in (50, 99)} if delays else {}
         report(start, end, received=received, **found)
-        os._exit(0)  # it may be waiting for ever for the rest
+        os._exit(0)  # the form may wait forever for missing messages
 
     threading.Thread(target=watch, daemon=True).start()
     form.receive(case, lambda: print("ready", flush=True), seen)

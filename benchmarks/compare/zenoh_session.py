@@ -1,4 +1,4 @@
-"""A plain Zenoh client, as the forms without nedbus use it."""
+"""A plain Zenoh client for the forms without nedbus."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -7,11 +7,11 @@ import zenoh
 
 from .case import TOPIC, Case
 
-KEY = f"bench/1/{TOPIC}"  # of forms that know one vehicle only
+KEY = f"bench/1/{TOPIC}"  # of forms that support only one vehicle
 
 
 def client_config(endpoint: str, more: Mapping[str, object] | None = None) -> zenoh.Config:
-    """Return the settings of a client of this router, with shared memory and scouting off, as nedbus has it."""
+    """Return the configuration of a client without shared memory and scouting, like nedbus."""
     config = zenoh.Config()
     settings = {
         "mode": "client",
@@ -25,12 +25,12 @@ def client_config(endpoint: str, more: Mapping[str, object] | None = None) -> ze
 
 
 def open_session(endpoint: str) -> zenoh.Session:
-    """Open a client of this router."""
+    """Open a client session."""
     return zenoh.open(client_config(endpoint))
 
 
 def key(vehicle: str) -> str:
-    """Return the key of a vehicle, or the key expression of all."""
+    """Return the key of a vehicle, or for "*" the key expression of all."""
     return f"bench/{vehicle}/{TOPIC}"
 
 
@@ -43,7 +43,7 @@ def declare_publishers(session: zenoh.Session, case: Case) -> list[zenoh.Publish
 def receive_each(
     case: Case, ready: Callable[[], None], seen: Callable[[int], bool], stamp: Callable[[bytes], int]
 ) -> None:
-    """Take payloads until `seen` says that it is enough; `stamp` decodes one and returns its timestamp."""
+    """Receive payloads until `seen` returns False; `stamp` decodes a payload and returns its timestamp."""
     with open_session(case.endpoint) as session:
         subscriber = session.declare_subscriber(key(case.vehicle), zenoh.handlers.FifoChannel(1024))
         ready()

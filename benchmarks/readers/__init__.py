@@ -1,1 +1,1 @@
-"""Readers that compute or are stuck, beside healthy ones."""
+"""Readers that are busy or stuck, next to healthy ones."""

@@ -1,9 +1,8 @@
-"""Readers in scripts that compute in pure Python: python -m benchmarks.readers.busy [--seconds N].
+"""Readers in scripts that are busy with pure Python: python -m benchmarks.readers.busy [--seconds N].
 
-One vehicle is published live at 2,000 messages a second.
-A script is idle; or it computes all the time, and reads in a thread of its own; or it computes for 10 ms between two
-reads.
-The bars: mode `every` loses and drops nothing, and what mode `latest` hands out is at most 50 ms old (p99).
+One vehicle is published live at 2,000 messages a second. A script is idle, or computes all the time and reads in a
+second thread, or computes for 10 ms between two reads.
+Targets: mode `every` loses and drops nothing, and messages of mode `latest` are at most 50 ms old (p99).
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ import argparse
 import json
 from typing import Final
 
-from benchmarks.processes import end, expect, router, start, tell
+from benchmarks.processes import end, expect, resume, router, start
 
 RATE: Final = 2000  # Hz
 MAX_AGE: Final = 50.0  # ms
-PATIENCE: Final = 60.0  # s beyond the measurement
+TIMEOUT: Final = 60.0  # s beyond the measurement
 CASES: Final = [
     *((form, script) for script in ("idle", "computes beside") for form in ("raw fifo", "raw ring", "every", "latest")),
     *((form, "computes between") for form in ("raw fifo", "raw ring", "latest")),
@@ -37,7 +36,7 @@ def main() -> None:
 
 
 def measure(form: str, script: str, seconds: int) -> str:
-    """Run one reader and return a line about it."""
+    """Run one reader and return its line."""
     sent = RATE * seconds
     with router() as (_, endpoint):
         reader = start("-m", "benchmarks.readers.busy_reader", form, script, endpoint)
@@ -46,23 +45,23 @@ def measure(form: str, script: str, seconds: int) -> str:
         try:
             expect(reader)
             expect(publisher)
-            tell(publisher)
-            expect(publisher, seconds + PATIENCE)
-            tell(reader)
-            found = json.loads(expect(reader, seconds + PATIENCE))
-            tell(publisher)
+            resume(publisher)
+            expect(publisher, seconds + TIMEOUT)
+            resume(reader)
+            found = json.loads(expect(reader, seconds + TIMEOUT))
+            resume(publisher)
         finally:
-            end(reader, publisher, patience=2.0)
+            end(reader, publisher, timeout=2.0)
     lost, dropped = (f"{found[key]:8}" if key in found else "       -" for key in ("lost", "dropped"))
     line = (
         f"{form:9} {script:17} {found['received']:8} / {sent:<8} {lost} {dropped}"
         f"   {found['p50']:12.2f} {found['p99']:7.2f} {found['max']:7.1f} {found['steps']:9.0f}"
     )
     if form == "every":
-        whole = found["received"] == sent and not found["lost"] and not found["dropped"]
-        return f"{line}   {'holds' if whole else 'MISSED'}: nothing lost or dropped"
+        complete = found["received"] == sent and not found["lost"] and not found["dropped"]
+        return f"{line}   {'met' if complete else 'MISSED'}: nothing lost or dropped"
     if form == "latest":
-        return f"{line}   {'holds' if found['p99'] <= MAX_AGE else 'MISSED'}: p99 at most {MAX_AGE:.0f} ms"
+        return f"{line}   {'met' if found['p99'] <= MAX_AGE else 'MISSED'}: p99 at most {MAX_AGE:.0f} ms"
     return line
 
 

@@ -1,7 +1,7 @@
-"""A reader that computes in pure Python: python -m benchmarks.readers.busy_reader FORM SCRIPT ENDPOINT.
+"""A reader that is busy with pure Python: python -m benchmarks.readers.busy_reader FORM SCRIPT ENDPOINT.
 
-It prints "ready", and once it was told and nothing more comes, what it measured as JSON: ages of messages in ms, from
-their own timestamp until they are handed out.
+It prints "ready", and after a line on stdin and the last message its figures as JSON: ages of messages in ms, from
+their timestamp until the script receives them.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from benchmarks.compare.case import TOPIC
 from benchmarks.compare.zenoh_session import KEY, open_session
 from benchmarks.processes import wait_for_quiet
 
-QUIET = 1.0  # s without a message after which nothing more comes
-PATIENCE = 5.0  # s after the last was sent, whatever is still to come
-PAUSE = 0.01  # s that a script computes between two reads
+QUIET = 1.0  # s without a message until the stream counts as ended
+TIMEOUT = 5.0  # s after the last message was sent
+PAUSE = 0.01  # s of computation between two reads
 
 Counts = Callable[[], dict[str, int]]
 
 
 @dataclass
 class Ages:
-    """Age of messages in ns, when the last one came, and the work that the script did meanwhile."""
+    """Ages of messages [ns], time of the last one [s], and the computation steps of the script."""
 
     ages: list[int] = field(default_factory=list)
     last: float = 0.0
     steps: int = 0
 
-    def take(self, stamp: int) -> None:
-        """Note one message."""
+    def add(self, stamp: int) -> None:
+        """Record one message."""
         now = time.monotonic_ns()
         self.ages.append(now - stamp)
         self.last = now / 1e9
 
     def compute(self, seconds: float) -> None:
-        """Compute in pure Python: the interpreter is busy all the time."""
+        """Keep the interpreter busy with pure Python."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             value = 1
@@ -52,7 +52,7 @@ class Ages:
             self.steps += 1
 
     def report(self, counts: dict[str, int], seconds: float) -> None:
-        """Print what was measured."""
+        """Print the figures as JSON."""
         ages = sorted(self.ages) or [0]
         found = {f"p{part}": ages[len(ages) * part // 100] / 1e6 for part in (50, 99)}
         steps = self.steps / seconds
@@ -60,7 +60,7 @@ class Ages:
 
 
 def main() -> None:
-    """Read as the arguments say."""
+    """Read according to the arguments."""
     form, script, endpoint = sys.argv[1:4]
     stamps, counts = open_nedbus(form, endpoint) if form in ("every", "latest") else open_raw(form, endpoint)
     ages = Ages()
@@ -73,25 +73,25 @@ def main() -> None:
 
 
 def read(stamps: Iterator[int], ages: Ages, pause: float = 0.0) -> None:
-    """Take messages, and compute between them."""
+    """Receive messages, and compute between them."""
     for stamp in stamps:
-        ages.take(stamp)
+        ages.add(stamp)
         if pause:
             ages.compute(pause)
 
 
 def watch(ages: Ages, counts: Counts) -> None:
-    """Report once nothing more comes, or soon after the last was sent."""
+    """Print the report after the last message, or after a timeout."""
     start = time.monotonic()
     sys.stdin.readline()
-    wait_for_quiet(lambda: ages.last, quiet=QUIET, patience=PATIENCE)
+    wait_for_quiet(lambda: ages.last, quiet=QUIET, timeout=TIMEOUT)
     ages.report(counts(), time.monotonic() - start)
     sys.stdout.flush()
     os._exit(0)
 
 
 def open_nedbus(form: str, endpoint: str) -> tuple[Iterator[int], Counts]:
-    """Subscribe with nedbus, in the mode that the form is named after."""
+    """Subscribe with nedbus; `form` is the mode."""
     bus = nedbus.connect(endpoint)
     subscription = bus.subscribe(TOPIC, mode="every" if form == "every" else "latest")
 

@@ -1,15 +1,15 @@
-"""A reader of every message that is stuck, beside a healthy one at the same router: python -m benchmarks.readers.stuck.
+"""Effect of a stuck reader in mode `every` on a healthy one at the same router: python -m benchmarks.readers.stuck.
 
-It never reads, reads one message a second, or is stopped with SIGSTOP, for --seconds; then it reads on.
-Vehicle 1 is live at --rate Hz, and in all cases the healthy reader follows it; vehicle 2 is replayed by a lossless
-publisher as fast as its readers take it, --messages in all.
+For --seconds it does not read, reads one message a second, or is stopped with SIGSTOP; then it continues.
+Vehicle 1 is live at --rate Hz, and the healthy reader always subscribes to it; vehicle 2 is a lossless replay of
+--messages messages at the speed of its readers.
 
-    live    the stuck reader has vehicle 1; there is no other
-    beside  the stuck reader has vehicle 1, the healthy one both: the replay goes on
-    replay  the stuck reader has vehicle 2, the healthy one both: the replay waits, what is live goes on
+    live    the stuck reader subscribes to vehicle 1; there is no vehicle 2
+    beside  the stuck reader subscribes to vehicle 1, the healthy one to both: the replay continues
+    replay  the stuck reader subscribes to vehicle 2, the healthy one to both: the replay waits, vehicle 1 continues
 
-The bars: the healthy reader is never without a message of vehicle 1, nor of a replay that has no stuck reader, for
-more than 0.2 s; the stuck one gets a replay whole and in order, and of what is live an exact count.
+Targets: the healthy reader is without a message of vehicle 1, or of a replay without a stuck reader, for at most 0.2 s;
+the stuck reader receives a replay completely and in order, and counts the loss of vehicle 1 exactly.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import signal
 import time
 from typing import Any, Final
 
-from benchmarks.processes import Process, end, expect, router, start, tell
+from benchmarks.processes import Process, end, expect, resume, router, start
 
-BEFORE: Final = 2.0  # s that all read
-AFTER: Final = 10  # s that live goes on when the stuck one reads on
-PATIENCE: Final = 120.0  # s that the replay may take then
+BEFORE: Final = 2.0  # s during which all readers read
+AFTER: Final = 10  # s of vehicle 1 after the stuck reader continues
+TIMEOUT: Final = 120.0  # s for the rest of the replay
 MAX_GAP: Final = 0.2  # s
 LIVE, REPLAYED = "1", "2"
 CASES: Final = {"live": (LIVE, [LIVE]), "beside": (LIVE, [LIVE, REPLAYED]), "replay": (REPLAYED, [LIVE, REPLAYED])}
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) -> str:
-    """Run one case, and return what became of both readers."""
+    """Run one case, and return the results of both readers."""
     stuck_reads, healthy_reads = CASES[case]
     sent = {LIVE: round((BEFORE + seconds + AFTER) * rate), REPLAYED: messages}
     with router() as (_, endpoint):
@@ -63,25 +63,25 @@ def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) ->
         try:
             for process in processes:
                 expect(process)
-            tell(live)
+            resume(live)
             time.sleep(BEFORE)
             if replay is not None:
-                tell(replay)
+                resume(replay)
             if habit == "stopped":
                 stuck.send_signal(signal.SIGSTOP)
             time.sleep(seconds)
             stuck.send_signal(signal.SIGCONT)
-            tell(stuck)
-            tell(healthy)
-            expect(live, seconds + PATIENCE)
+            resume(stuck)
+            resume(healthy)
+            expect(live, seconds + TIMEOUT)
             took = f", sent in {json.loads(expect(replay))['seconds']:.1f} s" if replay is not None else ""
             for reader in (stuck, healthy):
-                tell(reader)
+                resume(reader)
             found = json.loads(expect(stuck)), json.loads(expect(healthy))
         finally:
             for process in processes[2:]:
-                tell(process)
-            end(*processes, patience=5.0)
+                resume(process)
+            end(*processes, timeout=5.0)
     return f"{case}, {habit} for {seconds} s{took}\n" + "\n".join(_describe(*found, sent, stuck_reads))
 
 
@@ -93,27 +93,27 @@ def _describe(stuck: dict[str, Any], healthy: dict[str, Any], sent: dict[str, in
     lines = []
     for vehicle, got in healthy.items():
         waits = vehicle == REPLAYED and stuck_reads == REPLAYED
-        bar = "waits for the stuck one" if waits else _judge(got["gap"] <= MAX_GAP)
-        whole = _judge(got["received"] == sent[vehicle] and got["in order"])
+        gap = "waits for the stuck reader" if waits else _verdict(got["gap"] <= MAX_GAP)
+        complete = _verdict(got["received"] == sent[vehicle] and got["in order"])
         kind = "live" if vehicle == LIVE else "replayed"
         lines.append(
-            f"  healthy, {kind:8}: at most {got['gap']:.3f} s without a message ({bar});"
-            f" received {got['received']} of {sent[vehicle]} ({whole})"
+            f"  healthy, {kind:8}: at most {got['gap']:.3f} s without a message ({gap});"
+            f" received {got['received']} of {sent[vehicle]} ({complete})"
         )
     for vehicle, got in stuck.items():
         kind = "live" if vehicle == LIVE else "replayed"
         counted = got["received"] + got["lost"] + got["dropped"]
-        fine = (counted if vehicle == LIVE else got["received"]) == sent[vehicle] and got["in order"]
+        is_exact = (counted if vehicle == LIVE else got["received"]) == sent[vehicle] and got["in order"]
         lines.append(
             f"  stuck,   {kind:8}: received {got['received']}, lost {got['lost']}, dropped {got['dropped']},"
             f" together {counted} of {sent[vehicle]}, {'in order' if got['in order'] else 'NOT IN ORDER'}"
-            f" ({_judge(fine)})"
+            f" ({_verdict(is_exact)})"
         )
     return lines
 
 
-def _judge(holds: bool) -> str:
-    return "holds" if holds else "MISSED"
+def _verdict(is_met: bool) -> str:
+    return "met" if is_met else "MISSED"
 
 
 if __name__ == "__main__":

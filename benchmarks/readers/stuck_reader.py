@@ -1,9 +1,8 @@
-"""A reader of every message that may be stuck: python -m benchmarks.readers.stuck_reader HABIT ENDPOINT VEHICLE...
+"""A reader in mode `every` that may be stuck: python -m benchmarks.readers.stuck_reader HABIT ENDPOINT VEHICLE...
 
 HABIT is `reads`, `never` (does not read) or `slowly` (one message a second); each vehicle has a subscription and a
-thread of its own.
-It prints "ready", reads on from the first line on, and after the second, once nothing more comes, prints for each
-vehicle what it got, as JSON.
+thread. It prints "ready", reads normally after the first line on stdin, and after the second line and the last message
+prints its counts per vehicle as JSON.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ import nedbus
 from benchmarks.compare.case import TOPIC
 from benchmarks.processes import wait_for_quiet
 
-QUIET: Final = 3.0  # s without a message after which nothing more comes
-PATIENCE: Final = 60.0  # s for it
-PAUSE: Final = 1.0  # s between two messages of a reader that is slow
+QUIET: Final = 3.0  # s without a message until the stream counts as ended
+TIMEOUT: Final = 60.0  # s; maximum wait for that
+PAUSE: Final = 1.0  # s between two messages of a slow reader
 
 
 @dataclass
-class Got:
-    """Messages of one vehicle: `gap` is the longest time without a message, in s."""
+class Received:
+    """Received messages of one vehicle; `gap`: longest time without a message [s]."""
 
     received: int = 0
     last: float = 0.0
@@ -35,8 +34,8 @@ class Got:
     stamp: int = 0
     in_order: bool = True
 
-    def take(self, stamp: int) -> None:
-        """Note one message."""
+    def add(self, stamp: int) -> None:
+        """Record one message."""
         now = time.monotonic()
         if self.received:
             self.gap = max(self.gap, now - self.last)
@@ -45,21 +44,21 @@ class Got:
 
 
 def main() -> None:
-    """Read as the arguments say."""
+    """Read according to the arguments."""
     habit, endpoint, *vehicles = sys.argv[1:]
     reads_on = threading.Event()
     if habit == "reads":
         reads_on.set()
     with nedbus.connect(endpoint) as bus:
         subscriptions = {vehicle: bus.subscribe(TOPIC, vehicle=vehicle, mode="every") for vehicle in vehicles}
-        got = {vehicle: Got() for vehicle in vehicles}
+        got = {vehicle: Received() for vehicle in vehicles}
         for vehicle, subscription in subscriptions.items():
             threading.Thread(target=read, args=(subscription, got[vehicle], habit, reads_on), daemon=True).start()
         print("ready", flush=True)
         sys.stdin.readline()
         reads_on.set()
         sys.stdin.readline()
-        wait_for_quiet(lambda: max(each.last for each in got.values()), quiet=QUIET, patience=PATIENCE)
+        wait_for_quiet(lambda: max(each.last for each in got.values()), quiet=QUIET, timeout=TIMEOUT)
         report = {
             vehicle: {
                 "received": got[vehicle].received,
@@ -74,12 +73,12 @@ def main() -> None:
         os._exit(0)
 
 
-def read(subscription: nedbus.Subscription, got: Got, habit: str, reads_on: threading.Event) -> None:
+def read(subscription: nedbus.Subscription, got: Received, habit: str, reads_on: threading.Event) -> None:
     """Read one subscription."""
     if habit == "never":
         reads_on.wait()
     for sample in subscription.rows():
-        got.take(sample.message.timestamp)
+        got.add(sample.message.timestamp)
         if not reads_on.is_set():
             reads_on.wait(PAUSE)
 

@@ -1,8 +1,8 @@
-"""Measure how fast ULog files are read, beside pyulog, and how a replay begins and what memory it takes.
+"""Reading speed of ULog files compared with pyulog, and start time and memory of a replay.
 
-Each log is read in full by nedbus and by pyulog, alternately, and the medians are compared. The last log is then
-repeated up to 200 MB (--megabytes) and replayed without pauses.
-Bars: no slower than pyulog, the first message within 0.3 s, less than 100 MB of resident memory.
+nedbus and pyulog alternately read each log in full, and the medians are compared. The last log is then repeated up to
+200 MB (--megabytes) and replayed at full speed.
+Targets: no slower than pyulog, the first message within 0.3 s, less than 100 MB of resident memory.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ print(first, count, time.perf_counter() - start, peak)
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("logs", nargs="*", type=Path, help="default: those that the tests read")
+    parser.add_argument("logs", nargs="*", type=Path, help="default: the logs of the tests")
     parser.add_argument("--megabytes", type=int, default=200)
     parser.add_argument("--repeat", type=int, default=5)
     options = parser.parse_args()
@@ -54,13 +54,13 @@ def main() -> None:
         total = [so_far + median for so_far, median in zip(total, medians, strict=True)]
         first = measure_replay(path)[0]
         ratio = medians[0] / medians[1]
-        print(f"{path.name}: {ratio:.2f} of pyulog's time, first message after {first:.3f} s (bar: 0.3 s)")
-    print(f"all logs: {total[0] / total[1]:.2f} of pyulog's time (bar: 1)")
+        print(f"{path.name}: {ratio:.2f} of pyulog's time, first message after {first:.3f} s (target: 0.3 s)")
+    print(f"all logs: {total[0] / total[1]:.2f} of pyulog's time (target: 1)")
     with tempfile.TemporaryDirectory() as folder:
         big = repeat_log(logs[-1], Path(folder) / "big.ulg", options.megabytes * 1_000_000)
         first, count, duration, peak = measure_replay(big)
         print(f"{big.stat().st_size / 1e6:.0f} MB: first message after {first:.3f} s, {count:.0f} messages", end="")
-        print(f" in {duration:.0f} s, {peak:.0f} MB of resident memory (bar: below 100 MB)")
+        print(f" in {duration:.0f} s, {peak:.0f} MB of resident memory (target: below 100 MB)")
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -71,13 +71,13 @@ def seconds(call: Callable[[], object]) -> float:
 
 
 def measure_replay(path: Path) -> list[float]:
-    """Replay a log in another process; return the time to its first message, their number, all time and the peak."""
+    """Replay a log in a subprocess; return time to the first message [s], count, total time [s], peak memory [MB]."""
     command = [sys.executable, "-c", REPLAY, os.fspath(path)]
     return [float(word) for word in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
 
 
 def repeat_log(path: Path, target: Path, size: int) -> Path:
-    """Write a log whose data are repeated until it has a size."""
+    """Write a log with the data section of another one repeated up to `size` bytes."""
     data = path.read_bytes()
     at = 16
     while data[at + 2] != ord("A"):  # the first subscription ends the definitions

@@ -1,8 +1,8 @@
-"""Measure PX4's ULog stream over MAVLink: the delay from a datagram to the sample at a reader, and the CPU time.
+"""Delay from a datagram of PX4's ULog stream over MAVLink to the sample at a reader, and CPU time of the service.
 
-A recorded flight of a real PX4 (SITL) is played at 200 KB/s of ULog to a service, which a reader in another process
-subscribes; then the same flight to a service with the plain source.
-Bars: p99 of the delay at most 20 ms above that of the plain source, at most 60 % of a core.
+A recorded flight of a real PX4 (SITL) is played to a service at 200 KB/s of ULog, and a reader in another process
+subscribes; then the same with a source without `log=1`.
+Targets: p99 of the delay at most 20 ms above that of the source without `log=1`, at most 60 % of a core.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from tests.peers.px4_log_stream import (  # fmt: skip
     unpack,
 )
 
-from benchmarks.processes import cpu_seconds, end, expect, free_port, nedbus_process, start, tell
+from benchmarks.processes import cpu_seconds, end, expect, free_port, nedbus_process, resume, start
 from nedbus.ulog import Data, LoggedStream, UlogParser
 
 RATE = 200_000  # bytes of ULog per second
-NATURAL = 69_800  # that of the recording in real time
+NATURAL = 69_800  # bytes of ULog per second of the recording in real time
 READER = """
 import json, sys, threading, time
 import nedbus
@@ -44,7 +44,7 @@ Key = tuple[str, int]
 
 
 class Arrivals:
-    """Times at which the last datagram of each message was sent, by address and timestamp."""
+    """Send time of the last datagram of each message, by address and timestamp."""
 
     def __init__(self) -> None:
         self.times: dict[Key, float] = {}
@@ -52,7 +52,7 @@ class Arrivals:
         self._stream_of = cache(partial(LoggedStream, "1"))
 
     def add(self, frame: bytes) -> None:
-        """Take a frame before it is sent."""
+        """Record a frame before it is sent."""
         number, payload = unpack(frame)
         if message := stream_message(frame):
             for record in self._parser.feed(message.data):
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def measure(form: str, seconds: float) -> str:
-    """Run one form of the source and return a line about it."""
+    """Run one form of the source and return its line."""
     arrivals, port, endpoint = Arrivals(), free_port(), f"tcp/127.0.0.1:{free_port()}"
     recording = read_recording(STREAMS / "ulog_stream_flight1.bin.gz")
     speed = RATE / NATURAL
@@ -93,10 +93,10 @@ def measure(form: str, seconds: float) -> str:
                 (before,), began = cpu_seconds(service), time.monotonic()
                 peer.finished.wait(seconds - 3.0)
                 (after,), passed = cpu_seconds(service), time.monotonic() - began
-            tell(reader)
+            resume(reader)
             found = json.loads(expect(reader))
         finally:
-            end(reader, patience=2.0)
+            end(reader, timeout=2.0)
     delays = sorted(
         1e3 * (received - arrivals.times[address, timestamp])
         for address, timestamp, received in found

@@ -1,1 +1,1 @@
-"""Real containers on real networks: the compose files as shipped."""
+"""Tests of the shipped compose files with real containers and networks."""

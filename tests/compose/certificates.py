@@ -1,4 +1,4 @@
-"""Certificates for the secure stack, handed out as docs/security.md says, and sessions that show them."""
+"""Certificates of the secure stack, distributed with the commands of docs/security.md, and sessions that use them."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from tests.waits import DEADLINE
 from .stack import ROOT, Stack
 
 FILES = ("docker-compose.yml", "docker-compose.secure.yml")
-USER = f"{os.getuid() or 1000}:{os.getgid() or 1000}"  # of the containers: who may read the keys
+USER = f"{os.getuid() or 1000}:{os.getgid() or 1000}"  # user of the containers, who must own the keys
 
 
 def make_certificates(folder: Path, *names: str) -> None:
-    """Make an authority in a new folder, with the certificates of a router and of these, and hand them out."""
+    """Make an authority, a router certificate and the named certificates in a new folder, and distribute them."""
     make_authority(folder)
     make_certificate(folder, "router", hosts=["router", "localhost", "127.0.0.1"])
     for name in names:
         make_certificate(folder, name)
-    hand_out(folder)
+    distribute(folder)
 
 
-def hand_out(folder: Path) -> None:
-    """Copy to each container what it may see, with the documented loop; the first user of a host owns all of it."""
+def distribute(folder: Path) -> None:
+    """Copy the files of each container to its folder, with the documented shell loop; root makes uid 1000 the owner."""
     loop = re.search(r"^for name in .*?^done$", (ROOT / "docs" / "security.md").read_text(), re.DOTALL | re.MULTILINE)
     assert loop is not None
     subprocess.run(["bash", "-e", "-c", loop[0].replace("pki/", f"{folder}/")], check=True, timeout=DEADLINE)
@@ -37,7 +37,7 @@ def hand_out(folder: Path) -> None:
 
 
 def join(stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeout: float = DEADLINE) -> nedbus.Bus:
-    """Connect from the host, as somebody."""
+    """Connect from the host with the certificate `name`, or without any."""
     own, key = (None, None) if name is None else (pki / f"{name}.crt", pki / f"{name}.key")
     endpoint = f"tls/{stack.address}"
     return nedbus.connect(endpoint, tls=nedbus.Tls(pki / ca, own, key), timeout=timeout)

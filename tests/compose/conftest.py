@@ -1,4 +1,4 @@
-"""Fixtures: images that are built once, and stacks that leave nothing behind."""
+"""Fixtures: images that are built once, and compose stacks that are removed after the test."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import nedbus
 
 from .recorder import Recorder
-from .stack import ENVIRONMENT, ROOT, STAND_IN, Stack, docker, require_docker
+from .stack import ENVIRONMENT, ROOT, SUBSTITUTE_ROUTER, Stack, docker, require_docker
 
 StartStack = Callable[..., Stack]
 Record = Callable[[nedbus.Subscription[Any]], Recorder]
@@ -20,18 +20,18 @@ Record = Callable[[nedbus.Subscription[Any]], Recorder]
 
 @pytest.fixture(scope="session")
 def images(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Build the image, and the router that stands in for the official one if that was asked for."""
+    """Build the image of nedbus, and if requested the substitute for the official router image."""
     require_docker()
     with Path(tmp_path_factory.getbasetemp().parent, "images").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # of all workers the first builds, and the others find what it built
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the first worker builds, the others use its images
         Stack("build", tmp_path_factory.mktemp("build")).compose("build")
-        if ENVIRONMENT.get("NEDBUS_ROUTER_IMAGE") == STAND_IN:
-            docker("build", "--quiet", "--tag", STAND_IN, str(ROOT / "tests" / "compose" / "router"))
+        if ENVIRONMENT.get("NEDBUS_ROUTER_IMAGE") == SUBSTITUTE_ROUTER:
+            docker("build", "--quiet", "--tag", SUBSTITUTE_ROUTER, str(ROOT / "tests" / "compose" / "router"))
 
 
 @pytest.fixture
 def make_stack(images: None, tmp_path: Path) -> Iterator[StartStack]:
-    """Make stacks of the shipped files; nothing is started yet."""
+    """Make stacks from the shipped compose files, without starting them."""
     stacks: list[Stack] = []
 
     def make(name: str, *files: str, directory: Path = ROOT, **environment: str) -> Stack:
@@ -45,7 +45,7 @@ def make_stack(images: None, tmp_path: Path) -> Iterator[StartStack]:
 
 @pytest.fixture
 def record() -> Iterator[Record]:
-    """Make recorders that end with the test."""
+    """Start recorders, which are closed after the test."""
     recorders: list[Recorder] = []
 
     def start(subscription: nedbus.Subscription[Any]) -> Recorder:

@@ -1,4 +1,4 @@
-"""A container that boots a real systemd, in which nedbus is installed as docs/systemd.md says."""
+"""A container that boots a real systemd, with nedbus installed as in docs/systemd.md."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tests.waits import wait_for
 from .stack import DEADLINE, ENVIRONMENT, ROOT, docker
 
 IMAGE = "nedbus-systemd"
-# What a systemd needs to give services namespaces of their own; of devices and other hosts' processes it sees nothing.
-RIGHTS = (
+# Privileges that systemd needs to create namespaces for services; devices and processes of the host stay hidden.
+PRIVILEGES = (
     *("--cgroupns=private", "--cap-add=SYS_ADMIN", "--cap-add=SYS_PTRACE", "--security-opt=seccomp=unconfined"),
     *("--security-opt=apparmor=unconfined", "--security-opt=systempaths=unconfined"),
     *("--tmpfs=/run", "--tmpfs=/run/lock", "--tmpfs=/tmp"),
@@ -23,33 +23,33 @@ RIGHTS = (
 
 
 class Machine:
-    """A machine with systemd, on top of the image of nedbus, which must be there; `remove` leaves nothing behind."""
+    """A container with systemd, based on the image of nedbus, which must exist; `remove` deletes it."""
 
     def __init__(self) -> None:
         base = ENVIRONMENT.get("NEDBUS_BASE_IMAGE")
-        given = ("--build-arg", f"NEDBUS_BASE_IMAGE={base}") if base else ()
-        docker("build", "--quiet", "--tag", IMAGE, *given, str(ROOT / "tests" / "compose" / "systemd"))
+        build_arg = ("--build-arg", f"NEDBUS_BASE_IMAGE={base}") if base else ()
+        docker("build", "--quiet", "--tag", IMAGE, *build_arg, str(ROOT / "tests" / "compose" / "systemd"))
         self.name = f"nedbus-test-{os.getpid()}-systemd"
-        docker("run", "--detach", "--name", self.name, *RIGHTS, IMAGE)
+        docker("run", "--detach", "--name", self.name, *PRIVILEGES, IMAGE)
 
     def wait_until_booted(self) -> None:
-        """Wait for the end of the boot; skip where a systemd cannot run, or fail where Docker is required."""
+        """Wait for the end of the boot; skip the test if systemd cannot run here, or fail if Docker is required."""
         try:
             wait_for(lambda: self.call("systemctl is-system-running").stdout.strip() == "running", what="the boot")
         except AssertionError as exc:
-            said = self.call("systemctl list-units --failed --no-pager")
-            reason = f"no systemd runs in a container here: {exc}: {said.stdout}{said.stderr}{self._said()}"
+            failed = self.call("systemctl list-units --failed --no-pager")
+            reason = f"systemd does not run in a container here: {exc}: {failed.stdout}{failed.stderr}{self._logs()}"
             if ENVIRONMENT.get("NEDBUS_REQUIRE_DOCKER") == "1":
                 pytest.fail(reason)
             pytest.skip(reason)
 
     def call(self, command: str) -> subprocess.CompletedProcess[str]:
-        """Run a command line as root and return what became of it."""
-        whole = ["docker", "exec", self.name, "sh", "-c", command]
-        return subprocess.run(whole, capture_output=True, text=True, timeout=DEADLINE, env=ENVIRONMENT, check=False)
+        """Run a shell command as root and return the completed process."""
+        full = ["docker", "exec", self.name, "sh", "-c", command]
+        return subprocess.run(full, capture_output=True, text=True, timeout=DEADLINE, env=ENVIRONMENT, check=False)
 
     def run(self, command: str) -> str:
-        """Run a command line as root, and return what it printed; fail with what it and the service said."""
+        """Run a shell command as root and return its stdout; fail with its output and the journal."""
         done = self.call(command)
         assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}{self.call('journalctl -n 30').stdout}"
         return done.stdout
@@ -59,7 +59,7 @@ class Machine:
         docker("cp", str(file), f"{self.name}:{where}")
 
     def write(self, text: str, where: str) -> None:
-        """Write a file that belongs to root, and that everybody may read."""
+        """Write a file owned by root and readable by all."""
         with tempfile.NamedTemporaryFile("w") as file:
             file.write(text)
             file.flush()
@@ -71,18 +71,18 @@ class Machine:
         return self.run(f"systemctl show --value --property {name} {unit}").strip()
 
     def journal(self, unit: str = "nedbus") -> str:
-        """Return what the journal has of a unit."""
+        """Return the journal of a unit."""
         return self.run(f"journalctl --no-pager --unit {unit}")
 
     def reboot(self) -> None:
-        """Shut it down and start it again."""
+        """Restart the container, which shuts systemd down and boots it again."""
         docker("restart", self.name)
 
     def remove(self) -> None:
         """Remove the container."""
         docker("rm", "--force", "--volumes", self.name)
 
-    def _said(self) -> str:
+    def _logs(self) -> str:
         done = subprocess.run(
             ["docker", "logs", self.name], capture_output=True, text=True, env=ENVIRONMENT, check=False
         )

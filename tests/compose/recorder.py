@@ -1,4 +1,4 @@
-"""A reader on the host that keeps everything it gets, and what the simulated vehicle publishes, to compare it with."""
+"""A subscriber on the host that stores all samples, and the simulated flight to compare them with."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.waits import DEADLINE, wait_for
 
 
 class Recorder:
-    """Reads a subscription in a thread of its own, as a script does, and keeps everything."""
+    """Read a subscription in a thread and store all samples."""
 
     def __init__(self, subscription: nedbus.Subscription[Any]) -> None:
         self.subscription = subscription
         self.samples: list[nedbus.Sample[Any]] = []
-        self.unseen = 0  # messages that may have been superseded before the first one that was read
+        self.unseen = 0  # messages that may have been superseded before the first sample
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -31,13 +31,13 @@ class Recorder:
             self.samples.append(sample)
 
     def wait_for_more(self, count: int, *, seconds: float = DEADLINE) -> float:
-        """Wait for `count` samples from now on, and return how long that took."""
+        """Wait for `count` new samples, and return the duration [s]."""
         start, before = time.monotonic(), len(self.samples)
         wait_for(lambda: len(self.samples) >= before + count, what=f"{count} more samples", seconds=seconds)
         return time.monotonic() - start
 
     def of(self, address: Address) -> list[nedbus.Sample[Any]]:
-        """Return what arrived of one address so far."""
+        """Return the samples of one address so far."""
         return [sample for sample in list(self.samples) if sample.address == address]
 
     def close(self) -> None:
@@ -46,12 +46,12 @@ class Recorder:
 
 
 def indices(samples: list[nedbus.Sample[Any]], flight: Flight) -> list[int]:
-    """Return the indices of these samples of one address in its flight; every value must be right."""
+    """Return the indices of these samples of one address in its flight; assert that all values are correct."""
     return flight.indices((sample.address, sample.message) for sample in samples).popitem()[1]
 
 
 class Flight:
-    """The messages of a simulated source, each with its index in the sequence of its address; the same each time."""
+    """The messages of a simulated source, which are the same in each run, with their index per address."""
 
     def __init__(self, source: str = "sim:") -> None:
         self._messages: Iterator[SourceMessage] = open_replay(source).messages
@@ -59,16 +59,16 @@ class Flight:
         self._counts: dict[Address, int] = {}
 
     def indices(self, arrived: Iterable[tuple[Address, Message]]) -> dict[Address, list[int]]:
-        """Return, for each address, the indices of its messages in the order of their arrival; all must be right."""
+        """Return the indices of the messages of each address in order of arrival; assert that all are correct."""
         indices: dict[Address, list[int]] = {}
         for address, message in arrived:
-            index, right = self._find(address, message.timestamp)
-            assert message == right, f"{address} at {message.timestamp}"
+            index, expected = self._find(address, message.timestamp)
+            assert message == expected, f"{address} at {message.timestamp}"
             indices.setdefault(address, []).append(index)
         return indices
 
     def last(self, address: Address) -> Message:
-        """Return the last message of an address; the flight must have an end."""
+        """Return the last message of an address; the flight must be finite."""
         *_, last = (each for each in self._messages if each.address == address)
         message: Message = upgrade_with(BY_TOPIC[address.topic], last.fields)
         return message
@@ -83,11 +83,11 @@ class Flight:
         return self._known[address, timestamp]
 
 
-def is_whole(indices: list[int]) -> bool:
-    """Return whether nothing is missing, doubled or out of order."""
+def is_complete(indices: list[int]) -> bool:
+    """Return whether no message is missing, duplicated or out of order."""
     return indices == list(range(indices[0], indices[0] + len(indices)))
 
 
 def missing(indices: list[int]) -> int:
-    """Return how many are missing between the first and the last."""
+    """Return the number of messages missing between the first and the last."""
     return indices[-1] - indices[0] + 1 - len(set(indices))

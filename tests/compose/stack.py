@@ -1,4 +1,4 @@
-"""The compose files as shipped, driven through the command line as a user does."""
+"""The shipped compose files, run through the command line of Docker."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process
 
 ROOT = Path(__file__).parents[2]
-ENVIRONMENT = dict(os.environ)  # as it was before any test: NEDBUS_BASE_IMAGE, NEDBUS_ROUTER_IMAGE
-STAND_IN = "nedbus-router"  # the router image that is made here, where the official one cannot be pulled
-DEADLINE = 300.0  # s that one command of Docker may take
+ENVIRONMENT = dict(os.environ)  # before any test changes it: NEDBUS_BASE_IMAGE, NEDBUS_ROUTER_IMAGE
+SUBSTITUTE_ROUTER = "nedbus-router"  # router image built by the tests, if the official one cannot be pulled
+DEADLINE = 300.0  # timeout of one Docker command [s]
 
 
 def find_compose() -> list[str]:
-    """Return the command: that of this environment, or the plugin of docker."""
-    own = Path(sys.executable).with_name("docker-compose")
-    if own.exists():
-        return [str(own)]
+    """Return the command of compose: docker-compose of this environment, or the plugin of docker."""
+    local = Path(sys.executable).with_name("docker-compose")
+    if local.exists():
+        return [str(local)]
     found = shutil.which("docker-compose")
     return [found] if found else ["docker", "compose"]
 
 
 def require_docker() -> None:
-    """Skip where Docker is missing; fail there when NEDBUS_REQUIRE_DOCKER is 1."""
+    """Skip the test if Docker is missing; fail instead if NEDBUS_REQUIRE_DOCKER is 1."""
     try:
         for command in (["docker", "version"], [*find_compose(), "version"]):
             subprocess.run(command, check=True, capture_output=True, timeout=DEADLINE)
     except (OSError, subprocess.SubprocessError) as exc:
-        reason = f"no Docker with compose answers here: {exc}"
+        reason = f"Docker with compose is not available: {exc}"
         if ENVIRONMENT.get("NEDBUS_REQUIRE_DOCKER") == "1":
             pytest.fail(reason)
         pytest.skip(reason)
 
 
 def docker(*arguments: str) -> str:
-    """Run docker and return what it printed."""
+    """Run docker and return its stdout."""
     return _run(["docker", *arguments], ENVIRONMENT)
 
 
 class Stack:
-    """One project of compose, with its router on a free port of loopback; `down` leaves nothing behind.
+    """A compose project with its router on a free port of loopback; `down` removes it.
 
-    `files` are in the project's folder, if not absolute; what they name is relative to `directory`.
+    `files`: relative to the repository; paths in them are relative to `directory`.
     """
 
     def __init__(self, name: str, where: Path, *files: str, directory: Path = ROOT, **environment: str) -> None:
@@ -66,11 +66,11 @@ class Stack:
 
     @property
     def endpoint(self) -> str:
-        """Where the host reaches the router."""
+        """Endpoint of the router on the host."""
         return f"tcp/{self.address}"
 
     def compose(self, *arguments: str) -> str:
-        """Run a command of compose and return what it printed."""
+        """Run a compose command and return its stdout."""
         return _run([*self._command, *arguments], self._environment)
 
     def up(self, *services: str) -> None:
@@ -78,7 +78,7 @@ class Stack:
         self.compose("up", "--detach", "--no-build", *services)
 
     def run(self, service: str, *arguments: str, options: tuple[str, ...] = ()) -> Process:
-        """Start another container of a service in place of its command; its output is in the Process."""
+        """Start another container of a service with these arguments as its command."""
         where = self._where / f"{self.name}-{len(self._runs)}"
         where.mkdir()
         flags = ("--rm", "--no-deps", "--no-TTY", *options)
@@ -90,12 +90,12 @@ class Stack:
         return self.compose("ps", "--all", "--quiet", service).strip()
 
     def inspect(self, service: str) -> dict[str, Any]:
-        """Return what Docker knows of a service's container."""
+        """Return the output of `docker inspect` for a service's container."""
         content: list[dict[str, Any]] = json.loads(docker("inspect", self.container(service)))
         return content[0]
 
     def health(self, service: str) -> str:
-        """Return what Docker thinks of a service's health."""
+        """Return the health status of a service's container."""
         return str(self.inspect(service)["State"]["Health"]["Status"])
 
     def network(self, name: str) -> str:

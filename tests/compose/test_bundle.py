@@ -1,4 +1,4 @@
-"""Folders made by `nedbus pki enroll`, started with Docker beside the secure stack; `renew` and `rules` on them."""
+"""Bundles of `nedbus pki enroll`, run with Docker against the secure stack, and `pki renew` and `pki rules`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
-from .certificates import FILES, USER, hand_out, join, make_certificates
+from .certificates import FILES, USER, distribute, join, make_certificates
 from .conftest import Record, StartStack
 from .stack import ROOT, Stack
 
@@ -33,29 +33,29 @@ def pki(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def secure(make_stack: StartStack, tmp_path: Path, pki: Path) -> Stack:
-    """Prepare the shipped stack, with a copy of the router's file that a test may change."""
+    """Prepare the shipped stack with a copy of the router file that a test may change."""
     shutil.copytree(ROOT / "config", tmp_path / "config")
     files = [str(ROOT / file) for file in FILES]
     return make_stack("fleet", *files, directory=tmp_path, NEDBUS_PKI=str(pki), NEDBUS_USER=USER)
 
 
 def restart_router(stack: Stack) -> None:
-    """Restart it as documented."""
+    """Restart the router with the documented command."""
     assert RESTART in (ROOT / "docs" / "security.md").read_text()
     stack.compose(*RESTART.split()[-2:])
 
 
 def router_certificate(stack: Stack, pki: Path) -> str:
-    """Return the certificate that the router shows, as PEM."""
+    """Return the certificate that the router presents, as PEM."""
     host, port = stack.address.split(":")
-    shown = ssl.get_server_certificate((host, int(port)), ca_certs=str(pki / "ca.crt"), timeout=DEADLINE)
-    return shown.strip()
+    presented = ssl.get_server_certificate((host, int(port)), ca_certs=str(pki / "ca.crt"), timeout=DEADLINE)
+    return presented.strip()
 
 
-def test_bundles_run_beside_the_secure_stack(
+def test_bundles_work_with_the_secure_stack(
     make_stack: StartStack, run_nedbus: Start, secure: Stack, pki: Path, tmp_path: Path, *, record: Record
 ) -> None:
-    """As their README.txt says: who is in the router's rules is read, who is not is denied until the rules name it."""
+    """A bundle started as in its README.txt is denied until the router's access rules name its vehicle."""
     rules = tmp_path / "config" / "router-secure.json5"
 
     def pki_command(*arguments: str) -> None:
@@ -68,10 +68,10 @@ def test_bundles_run_beside_the_secure_stack(
         folder = tmp_path / vehicle
         router = f"tls/{secure.address}"
         pki_command("enroll", str(pki), vehicle, "--router", router, "-o", str(folder), "-s", "sim:")
-        said = re.findall(
+        command = re.findall(
             r"^ {7}(echo .* > \.env)\n {7}docker compose up -d$", (folder / "README.txt").read_text(), re.MULTILINE
         )
-        subprocess.run(["bash", "-c", *said], cwd=folder, check=True, timeout=DEADLINE)
+        subprocess.run(["bash", "-c", *command], cwd=folder, check=True, timeout=DEADLINE)
         status[vehicle] = free_endpoint().removeprefix("tcp/")
         bundles[vehicle] = make_stack(
             vehicle, str(folder / "compose.yml"), directory=folder, NEDBUS_HTTP=status[vehicle]
@@ -83,7 +83,7 @@ def test_bundles_run_beside_the_secure_stack(
     reader = join(secure, pki, "reader")
     recorder = record(reader.subscribe(VLP, mode="every"))
     recorder.wait_for_more(100)
-    wait_for(lambda: published(status["stranger"]) > 100, what="what the stranger publishes in vain")
+    wait_for(lambda: published(status["stranger"]) > 100, what="messages of the denied vehicle")
     recorder.wait_for_more(100)
     assert {sample.vehicle for sample in recorder.samples} == {"wing"}
     assert list(reader.vehicles()) == ["wing"]
@@ -102,7 +102,7 @@ def test_bundles_run_beside_the_secure_stack(
 
 
 def published(address: str) -> float:
-    """Return how many messages a service has published, by its metrics; 0 while it does not answer."""
+    """Return the number of published messages from a service's metrics; 0 if it does not respond."""
     try:
         with urllib.request.urlopen(f"http://{address}/metrics", timeout=DEADLINE) as page:
             text = page.read().decode()
@@ -112,8 +112,8 @@ def published(address: str) -> float:
     return sum(map(float, counts))
 
 
-def test_renewed_certificates_are_taken(run_nedbus: Start, secure: Stack, pki: Path, record: Record) -> None:
-    """Copied as documented, containers see them without being made anew; the router shows its own after a restart."""
+def test_renewed_certificates_are_used(run_nedbus: Start, secure: Stack, pki: Path, record: Record) -> None:
+    """Renewed certificates, copied as documented, reach the containers; the router presents its own after a restart."""
     secure.up()
     recorder = record(join(secure, pki, "reader").subscribe(VLP, mode="every"))
     recorder.wait_for_more(100)
@@ -124,23 +124,23 @@ def test_renewed_certificates_are_taken(run_nedbus: Start, secure: Stack, pki: P
     old = router_certificate(secure, pki)
     renewed = run_nedbus("pki", "renew", str(pki), "router", "vehicle-1", "reader", "--days", "900")
     assert renewed.wait() == 0, renewed.err
-    for name in ("router", "vehicle-1"):  # whoever copies may make a new file of the same name
+    for name in ("router", "vehicle-1"):  # copying may create a new file of the same name
         (pki / name / f"{name}.crt").unlink()
-    hand_out(pki)
+    distribute(pki)
     own = (pki / "vehicle-1.crt").read_text()
     assert secure.compose("exec", "-T", "service", "cat", "/etc/nedbus/pki/vehicle-1.crt") == own
     new = (pki / "router.crt").read_text().strip()
     assert router_certificate(secure, pki) == old != new
     restart_router(secure)
-    wait_for(lambda: is_shown(secure, pki, new), what="the router's new certificate")
+    wait_for(lambda: is_presented(secure, pki, new), what="the router's new certificate")
     recorder.wait_for_more(100)
     assert recorder.subscription.counts.lost == 0
     join(secure, pki, "reader").close()
     assert (secure.container("router"), secure.container("service")) == before
 
 
-def is_shown(stack: Stack, pki: Path, certificate: str) -> bool:
-    """Return whether the router shows this certificate; not while it starts."""
+def is_presented(stack: Stack, pki: Path, certificate: str) -> bool:
+    """Return whether the router presents this certificate; False while it starts."""
     try:
         return router_certificate(stack, pki) == certificate
     except OSError:

@@ -1,4 +1,4 @@
-"""Readers on the host, in containers, and behind a second router."""
+"""Subscribers on the host, in containers, and behind a second router."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.flights.messages import VLP
 from tests.waits import DEADLINE, wait_for
 
 from .conftest import StartStack
-from .recorder import Flight, is_whole
+from .recorder import Flight, is_complete
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
@@ -23,7 +23,7 @@ COUNT = 2000  # samples: about 7 s of all streams
 
 
 def parse(output: str) -> list[tuple[Address, Message]]:
-    """Return what `nedbus echo --json` printed."""
+    """Return the messages in the output of `nedbus echo --json`."""
     rows = [json.loads(line) for line in output.splitlines()]
     return [
         (
@@ -41,10 +41,12 @@ def parse(output: str) -> list[tuple[Address, Message]]:
         ("docker-compose.hosts.yml", {"service": ["vehicle"], "vehicle-router": ["link", "vehicle"]}),
     ],
 )
-def test_host_and_container_read_everything(make_stack: StartStack, file: str, networks: dict[str, list[str]]) -> None:
-    """Every sample of all topics, with the right values; `compose stop` ends the service with exit code 0.
+def test_host_and_container_receive_all_messages(
+    make_stack: StartStack, file: str, networks: dict[str, list[str]]
+) -> None:
+    """Subscribers receive all messages of all topics with correct values; `compose stop` exits with 0.
 
-    Beside the service, and behind a second router, on a network that the service is not on; the host through that one.
+    They are on the network of the service, or behind a second router on another network.
     """
     stack = make_stack("readers", file)
     stack.up()
@@ -59,15 +61,15 @@ def test_host_and_container_read_everything(make_stack: StartStack, file: str, n
     for arrived in ([(sample.address, sample.message) for sample in samples], in_container):
         indices = Flight().indices(arrived)
         assert set(indices) >= STREAMS
-        assert all(map(is_whole, indices.values()))
+        assert all(map(is_complete, indices.values()))
     for service, names in networks.items():
         assert sorted(stack.inspect(service)["NetworkSettings"]["Networks"]) == sorted(map(stack.network, names))
     stack.compose("stop", "service")
     assert stack.inspect("service")["State"]["ExitCode"] == 0
 
 
-def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
-    """It is kept, even though nothing is published any more."""
+def test_late_subscriber_receives_the_last_message(make_stack: StartStack) -> None:
+    """A late subscriber receives the last message, even after the replay has ended."""
     stack = make_stack("late", NEDBUS_SOURCE="sim:?duration=2")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
@@ -80,7 +82,7 @@ def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
 
 
 def read_page(address: str) -> bytes:
-    """Return the page of `nedbus web` as a browser gets it through the usual port; nothing while it does not answer."""
+    """Return the page of `nedbus web`, requested as from its default port; b"" if it does not respond."""
     web = http.client.HTTPConnection(address, timeout=DEADLINE)
     try:
         web.request("GET", "/", headers={"Host": "127.0.0.1:8420"})
@@ -92,7 +94,7 @@ def read_page(address: str) -> bytes:
 
 
 def test_compose_up_shows_data(make_stack: StartStack) -> None:
-    """The service logs its progress, the demo prints messages; both run as an ordinary user, and are healthy."""
+    """The service logs its progress and the demo prints messages; the service runs unprivileged and is healthy."""
     stack = make_stack("up", "docker-compose.yml", "tests/compose/quick-health.yml", NEDBUS_WEB="127.0.0.1:0")
     stack.compose("--profile", "demo", "up", "--detach", "--no-build")
     wait_for(lambda: " messages, " in stack.compose("logs", "service"), what="a count in the service's log", seconds=60)
@@ -102,11 +104,11 @@ def test_compose_up_shows_data(make_stack: StartStack) -> None:
     page = stack.compose("port", "web", "8420").strip()
     wait_for(lambda: b"static/js/bokeh" in read_page(page), what="the page", seconds=60)
     stack.compose("kill", "router")
-    wait_for(lambda: stack.health("service") == "unhealthy", what="its sickness", seconds=120)
+    wait_for(lambda: stack.health("service") == "unhealthy", what="the failed health check", seconds=120)
 
 
-def test_flags_are_those_of_zenohd(make_stack: StartStack) -> None:
-    """The flags that compose files give a router image are flags of zenohd."""
+def test_router_options_exist_in_zenohd(make_stack: StartStack) -> None:
+    """The compose files pass only options of zenohd to the router image."""
     for file in ("docker-compose.yml", "docker-compose.hosts.yml"):
         config = json.loads(make_stack("flags", file).compose("config", "--format", "json"))
         for name, service in config["services"].items():

@@ -1,4 +1,4 @@
-"""The stack with certificates: who may do what, proved by what arrives, as Zenoh denies in silence."""
+"""The stack with certificates: permissions, tested by the messages that arrive, as Zenoh denies silently."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from tests.flights.messages import VLP, message
 from tests.peers.processes import Process
 from tests.waits import wait_for
 
-from .certificates import FILES, USER, hand_out, join, make_certificates
+from .certificates import FILES, USER, distribute, join, make_certificates
 from .conftest import Record, StartStack
-from .recorder import Flight, Recorder, indices, is_whole
+from .recorder import Flight, Recorder, indices, is_complete
 from .stack import Stack
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 MINE = Address("1", VLP)
-PEOPLE = ("vehicle-1", "vehicle-2", "reader", "operator")
+CLIENTS = ("vehicle-1", "vehicle-2", "reader", "operator")
 
 
 @pytest.fixture(scope="module")
 def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make certificates as docs/security.md says, and some that must not work; the first user of a host owns them."""
+    """Make certificates as in docs/security.md, and some that must be rejected."""
     folder = tmp_path_factory.mktemp("pki")
-    make_certificates(folder, *PEOPLE)
+    make_certificates(folder, *CLIENTS)
     make_certificate(folder, "expired", days=-1)
     make_authority(folder / "foreign")
     make_certificate(folder / "foreign", "vehicle-1")
-    hand_out(folder)
+    distribute(folder)
     return folder
 
 
@@ -47,7 +47,7 @@ def secure(make_stack: StartStack, pki: Path) -> Stack:
 
 @pytest.fixture
 def reader(secure: Stack, pki: Path, record: Record) -> Recorder:
-    """Read everything, as the host's script of the README does."""
+    """Record all messages on the host."""
     bus = join(secure, pki, "reader")
     recorder = record(bus.subscribe("*", mode="every"))
     recorder.wait_for_more(100)
@@ -55,17 +55,17 @@ def reader(secure: Stack, pki: Path, record: Record) -> Recorder:
 
 
 def check_genuine(reader: Recorder) -> None:
-    """Whatever was tried meanwhile: this reader saw vehicle 1, whole and with the right values, and nothing else."""
+    """Assert that a recorder received all messages of vehicle 1 with correct values, and no others."""
     reader.wait_for_more(300)
     samples = list(reader.samples)
     assert {sample.vehicle for sample in samples} == {"1"}
-    assert is_whole(indices([sample for sample in samples if sample.address == MINE], Flight()))
+    assert is_complete(indices([sample for sample in samples if sample.address == MINE], Flight()))
     assert reader.subscription.counts.invalid == 0
 
 
 @pytest.mark.parametrize("name", ["vehicle-2", "reader", "operator"])
 def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, name: str) -> None:
-    """Another vehicle, a reader and an operator write in vain: as vehicle 1, as an unknown vehicle, as a status."""
+    """Puts of another vehicle, a reader and an operator are denied: as vehicle 1, as an unknown one, as a rejection."""
     with join(secure, pki, name) as intruder:
         for vehicle in ("1", "3"):
             publisher = intruder.publisher(VLP, vehicle=vehicle)
@@ -78,8 +78,8 @@ def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, n
             assert {sample.vehicle for sample in other.latest("*")} == {"1"}
 
 
-def test_service_with_a_wrong_name_publishes_nothing(secure: Stack, reader: Recorder) -> None:
-    """Vehicle 1's certificate does not publish vehicle 2."""
+def test_certificate_cannot_publish_another_vehicle(secure: Stack, reader: Recorder) -> None:
+    """Messages of vehicle 2 that are published with the certificate of vehicle 1 do not arrive."""
     impostor = secure.run("service", "serve", "-s", "sim:?vehicle=2&duration=3", "--until-done")
     assert impostor.wait(60.0) == 0, impostor.err
     assert "published" in impostor.err
@@ -91,11 +91,13 @@ def test_service_with_a_wrong_name_publishes_nothing(secure: Stack, reader: Reco
     [("ca.crt", None), ("ca.crt", "foreign/vehicle-1"), ("foreign/ca.crt", "vehicle-1"), ("ca.crt", "expired")],
     ids=["no certificate", "foreign certificate", "foreign authority", "expired certificate"],
 )
-def test_strangers_are_refused(secure: Stack, pki: Path, reader: Recorder, ca: str, certificate: str | None) -> None:
-    """On the host and in a container: no session, and an error that says what to check."""
+def test_invalid_certificates_are_refused(
+    secure: Stack, pki: Path, reader: Recorder, ca: str, certificate: str | None
+) -> None:
+    """Without a valid certificate no session opens, on the host and in a container, and the error names the reason."""
     with pytest.raises(nedbus.ConnectError, match=r"^no TLS connection to tls/.*(no certificate|signed|expired)"):
         join(secure, pki, certificate, ca=ca, timeout=1.0)
-    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]  # over a file of the container's folder
+    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]  # mounted over a file of the container's folder
     if certificate is None:
         volumes += ["--env=NEDBUS_TLS_CERTIFICATE=", "--env=NEDBUS_TLS_KEY="]
     else:
@@ -145,14 +147,14 @@ session.close()
 
 
 def last_count(peer: Process) -> dict[str, int]:
-    """Return what a peer has seen so far."""
+    """Return the number of messages that a peer has received so far."""
     lines = [line for line in peer.out.splitlines(keepends=True) if line.endswith("}\n")]
     counts: dict[str, int] = json.loads(lines[-1]) if lines else {"genuine": 0, "forged": 0}
     return counts
 
 
 def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Recorder) -> None:
-    """Peers with certificates are not introduced to each other, one without finds nobody: nothing forged arrives."""
+    """Peers with certificates do not discover each other, and one without finds no peer: no forged message arrives."""
     run = ("--entrypoint", "/opt/nedbus/bin/python")
     listener = secure.run("subscriber", "-c", PEER, "reader", "0", options=run)
     wait_for(lambda: "ready" in listener.out, what=f"the listening peer {listener.err}")
@@ -160,25 +162,25 @@ def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Record
         own = tuple(f"--volume={pki}/vehicle-2.{kind}:/etc/nedbus/pki/reader.{kind}:ro" for kind in ("crt", "key"))
         peer = secure.run("subscriber", "-c", PEER, name, "300", options=(*run, *own))
         assert peer.wait(60.0) == 0, peer.err
-        assert '{"genuine": 0, "forged": 300}' in peer.out, "it sees its own puts, and nothing else"
+        assert '{"genuine": 0, "forged": 300}' in peer.out, "it receives only its own puts"
     before = last_count(listener)["genuine"]
-    wait_for(lambda: last_count(listener)["genuine"] > before + 100, what="what it may read")
+    wait_for(lambda: last_count(listener)["genuine"] > before + 100, what="genuine messages")
     assert last_count(listener)["forged"] == 0
     check_genuine(reader)
 
 
-def test_only_operators_see_who_is_connected(secure: Stack, pki: Path) -> None:
-    """The router's admin space answers operators, and is read-only."""
+def test_only_operators_can_query_the_admin_space(secure: Stack, pki: Path) -> None:
+    """The router's admin space answers operators, but no readers."""
     with join(secure, pki, "operator") as operator, join(secure, pki, "reader") as other:
         wait_for(lambda: [reply.ok for reply in operator._session.get("@/*/router")], what="an answer")
         assert [reply.ok for reply in other._session.get("@/*/router")] == []
 
 
-def test_secrets_are_not_shown(secure: Stack, pki: Path) -> None:
-    """Neither logs nor what Docker knows of the containers hold a key."""
-    shown = secure.compose("logs") + str(secure.inspect("service")) + str(secure.inspect("router"))
-    assert "PRIVATE KEY" not in shown
+def test_private_keys_do_not_leak(secure: Stack, pki: Path) -> None:
+    """Neither logs nor `docker inspect` contain a private key."""
+    output = secure.compose("logs") + str(secure.inspect("service")) + str(secure.inspect("router"))
+    assert "PRIVATE KEY" not in output
     for name in ("router", "vehicle-1"):
         secret = (pki / f"{name}.key").read_text().splitlines()[1]
-        assert secret not in shown
-    assert "ca.key" not in shown
+        assert secret not in output
+    assert "ca.key" not in output

@@ -1,4 +1,4 @@
-"""The units under a real systemd: installed as documented, started, killed, hung, reloaded, rebooted."""
+"""The shipped units under a real systemd: installation, start, kill, hang, reload and reboot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ READER = f"-c {ROUTER} " + " ".join(
 )
 DROP_IN = "/etc/systemd/system/nedbus.service.d/test.conf"
 
-# A vehicle with system id 7 that sends its position to a UDP port, or to the other end of a terminal, which it prints.
+# A vehicle with system id 7 that sends its position to a UDP port, or to a pseudo-terminal linked as /dev/ttyACM0.
 VEHICLE = """
 import os, socket, sys, time
 from pymavlink.dialects.v20 import common as mavlink
@@ -55,7 +55,7 @@ while True:
 
 @pytest.fixture(scope="module")
 def installed(images: None) -> Iterator[Machine]:
-    """Boot a machine, and install the service with the documented commands; pip has been there already."""
+    """Boot a machine, and install the service with the documented commands, except for pip."""
     machine = Machine()
     machine.wait_until_booted()
     machine.copy(ROOT / "packaging", "/root/packaging")
@@ -66,7 +66,7 @@ def installed(images: None) -> Iterator[Machine]:
     assert len(commands) == 5
     for command in commands[1:]:
         machine.run(f"cd /root && {command}")
-    assert_reads(machine)  # the last command has started it
+    assert_receives(machine)  # the last command has started it
     machine.run("systemctl stop nedbus")
     machine.write(VEHICLE, "/root/vehicle.py")
     yield machine
@@ -75,7 +75,7 @@ def installed(images: None) -> Iterator[Machine]:
 
 @pytest.fixture
 def machine(installed: Machine) -> Iterator[Machine]:
-    """Give each test the service as it was installed, stopped."""
+    """Return the machine with the service stopped, and restore its installation after the test."""
     yield installed
     installed.run("systemctl stop 'nedbus*' 'vehicle*'; rm -rf /etc/systemd/system/nedbus.service.d; true")
     installed.run("systemctl daemon-reload; systemctl reset-failed")
@@ -89,55 +89,55 @@ def configure(machine: Machine, text: str, name: str = "nedbus") -> None:
 
 
 def extend(machine: Machine, text: str) -> None:
-    """Add to the unit, as `systemctl edit` does."""
+    """Extend the unit with a drop-in, like `systemctl edit`."""
     machine.run(f"mkdir -p {Path(DROP_IN).parent}")
     machine.write(f"[Service]\n{text}", DROP_IN)
     machine.run("systemctl daemon-reload")
 
 
-def assert_reads(machine: Machine, vehicle: str = "1", options: str = "") -> None:
-    """Hold that a reader gets messages of a vehicle."""
+def assert_receives(machine: Machine, vehicle: str = "1", options: str = "") -> None:
+    """Assert that messages of a vehicle can be received."""
     assert f'"{vehicle}"' in machine.run(f"{NEDBUS} echo -v {vehicle} -n 1 --json --wait {options}")
 
 
 def wait_for_restart(machine: Machine, process: str) -> None:
-    """Wait until the service works again, in another process."""
+    """Wait until the service is active again in a new process."""
     wait_for(
         lambda: machine.property("MainPID") not in {"0", process} and machine.property("ActiveState") == "active",
-        what="another process",
+        what="a new process",
     )
 
 
 def test_start_returns_when_ready(machine: Machine) -> None:
-    """When `systemctl start` returns, the router answers; the status says what is published."""
+    """When `systemctl start` returns, the router accepts connections; the status text has counts."""
     for _ in range(3):
         machine.run(f"systemctl stop nedbus && systemctl start nedbus && {DIAL}")
-    assert_reads(machine)
+    assert_receives(machine)
     assert "1 source, " in machine.property("StatusText")
     assert machine.run("ps -o user= -p $(systemctl show --value -p MainPID nedbus)").strip() == "nedbus"
 
 
-def test_boot(machine: Machine) -> None:
-    """An enabled service is there after a boot."""
+def test_enabled_service_starts_at_boot(machine: Machine) -> None:
+    """An enabled service is active after a reboot."""
     machine.run("touch /run/before")
     machine.reboot()
     machine.wait_until_booted()
     assert machine.call("ls /run/before").returncode != 0
     assert machine.property("ActiveState") == "active"
-    assert_reads(machine)
+    assert_receives(machine)
 
 
-def test_kill(machine: Machine) -> None:
-    """A service that is killed comes back by itself."""
+def test_killed_service_is_restarted(machine: Machine) -> None:
+    """A killed service is restarted."""
     machine.run("systemctl start nedbus")
     process = machine.property("MainPID")
     machine.run("systemctl kill --kill-who=main --signal=KILL nedbus")
     wait_for_restart(machine, process)
-    assert_reads(machine)
+    assert_receives(machine)
 
 
-def test_hang(machine: Machine) -> None:
-    """A service that works outlives the watchdog; one that hangs is ended by it, shows its threads, and comes back."""
+def test_watchdog_restarts_hanging_service(machine: Machine) -> None:
+    """The watchdog kills only a hanging service, which writes the stacks of its threads and is restarted."""
     extend(machine, "WatchdogSec=3s\n")
     machine.run("systemctl start nedbus")
     process = machine.property("MainPID")
@@ -148,19 +148,19 @@ def test_hang(machine: Machine) -> None:
     journal = machine.journal()
     assert "Watchdog timeout" in journal
     assert "most recent call first" in journal
-    assert_reads(machine)
+    assert_receives(machine)
 
 
-def test_reload(machine: Machine) -> None:
-    """`systemctl reload` starts a new source, and ends one; it fails for a broken file; the process stays the same."""
+def test_reload_starts_and_stops_sources(machine: Machine) -> None:
+    """`systemctl reload` starts and stops sources in the same process, and fails for an invalid file."""
     machine.run("systemctl start nedbus")
     process = machine.property("MainPID")
     configure(machine, 'source = ["sim:", "sim:?vehicle=wing"]\n')
     machine.run("systemctl reload nedbus")
     assert machine.property("ActiveState") == "active"
     wait_for(lambda: machine.property("StatusText").startswith("2 sources, "), what="two sources")
-    assert_reads(machine, "wing")
-    assert_reads(machine, "1")
+    assert_receives(machine, "wing")
+    assert_receives(machine, "1")
     configure(machine, "source = [")
     assert machine.call("systemctl reload nedbus").returncode != 0
     assert f"{CONFIG}, line 1, column " in machine.journal()
@@ -168,15 +168,15 @@ def test_reload(machine: Machine) -> None:
     wait_for(lambda: "configuration rejected" in machine.property("StatusText"), what="the reason in the status")
     assert CONFIG in machine.property("StatusText")
     assert machine.property("ActiveState") == "active"
-    assert_reads(machine, "wing")
+    assert_receives(machine, "wing")
     configure(machine, SIMULATION)
     machine.run("systemctl reload nedbus")
     wait_for(lambda: machine.property("StatusText").startswith("1 source, "), what="one source")
     assert machine.property("MainPID") == process
 
 
-def test_mistake_in_configuration(machine: Machine) -> None:
-    """`systemctl start` fails at once, with the reason in the journal, and it is not tried again."""
+def test_invalid_configuration_is_not_retried(machine: Machine) -> None:
+    """With a mistake in the settings `systemctl start` fails with the reason in the journal, and is not retried."""
     configure(machine, "sorce = []\n")
     assert machine.call("systemctl start nedbus").returncode != 0
     assert machine.property("ActiveState") == "failed"
@@ -184,49 +184,49 @@ def test_mistake_in_configuration(machine: Machine) -> None:
     assert f"{CONFIG}, line 1, column 1" in machine.journal()
 
 
-def test_port_that_is_taken(machine: Machine) -> None:
-    """`systemctl start` fails when the router cannot listen; it is tried again, until it can."""
-    taker = 'import socket,time; s=socket.create_server(("127.0.0.1", 7447)); time.sleep(1000)'
-    machine.run(f"systemd-run --unit=vehicle-taker python3 -c '{taker}'")
-    wait_for(lambda: machine.call(DIAL).returncode == 0, what="the taker")
+def test_port_in_use_is_retried(machine: Machine) -> None:
+    """`systemctl start` fails if the router's port is in use, and is retried until the port is free."""
+    listener = 'import socket,time; s=socket.create_server(("127.0.0.1", 7447)); time.sleep(1000)'
+    machine.run(f"systemd-run --unit=vehicle-listener python3 -c '{listener}'")
+    wait_for(lambda: machine.call(DIAL).returncode == 0, what="the other listener")
     assert machine.call("systemctl start nedbus").returncode != 0
-    machine.run("systemctl stop vehicle-taker")
-    wait_for(lambda: machine.property("ActiveState") == "active", what="another try")
+    machine.run("systemctl stop vehicle-listener")
+    wait_for(lambda: machine.property("ActiveState") == "active", what="a restart")
 
 
-def test_several_services(machine: Machine) -> None:
-    """The template runs services of their own, each with its file."""
+def test_template_runs_several_services(machine: Machine) -> None:
+    """Instances of the template unit run several services, each with its settings file."""
     configure(machine, SIMULATION + 'vehicle = "wing"\nlisten = ["tcp/127.0.0.1:7448"]\n', "wing")
     configure(machine, SIMULATION + 'vehicle = "tail"\nconnect = ["tcp/127.0.0.1:7448"]\n', "tail")
     machine.run("systemctl start nedbus@wing nedbus@tail")
     for vehicle in ("wing", "tail"):
-        assert_reads(machine, vehicle, "--connect tcp/127.0.0.1:7448")
+        assert_receives(machine, vehicle, "--connect tcp/127.0.0.1:7448")
 
 
-def test_mavlink_over_udp(machine: Machine) -> None:
-    """The unit's permissions suffice for MAVLink over UDP; the service is started before anything arrives."""
+def test_mavlink_over_udp_works_in_hardened_unit(machine: Machine) -> None:
+    """The unit's permissions suffice for MAVLink over UDP; the service is ready before a message arrives."""
     configure(machine, 'source = ["mavlink:udpin:127.0.0.1:14540"]\n')
     machine.run("systemctl start nedbus")
     wait_for(lambda: "nothing arrives" in machine.property("StatusText"), what="the status")
     machine.run("systemd-run --unit=vehicle-udp /opt/nedbus/bin/python3 /root/vehicle.py 14540")
-    assert_reads(machine, "7")
+    assert_receives(machine, "7")
 
 
-def test_mavlink_over_serial_port(machine: Machine) -> None:
-    """With the documented addition it reads a serial port; the other end of a terminal stands in for one."""
+def test_mavlink_over_serial_port_works_with_drop_in(machine: Machine) -> None:
+    """With the documented drop-in the service reads a serial port, here a pseudo-terminal."""
     addition = (ROOT / "docs" / "systemd.md").read_text().split("```ini\n[Service]\n")[1].split("```")[0]
     configure(machine, 'source = ["mavlink:serial:/dev/ttyACM0"]\n')
     extend(machine, addition)
     machine.run("systemctl start nedbus")
     machine.run("systemd-run --unit=vehicle-serial /opt/nedbus/bin/python3 /root/vehicle.py serial")
-    assert_reads(machine, "7")
+    assert_receives(machine, "7")
     machine.run("systemctl stop vehicle-serial; rm /dev/ttyACM0")
 
 
-def test_bundle(machine: Machine, tmp_path: Path) -> None:
-    """The folder of `nedbus pki enroll`, installed as its README.txt says, beside a router that asks for certificates.
+def test_bundle_is_installed_with_readme_commands(machine: Machine, tmp_path: Path) -> None:
+    """A bundle of `nedbus pki enroll`, installed as in its README.txt, works with a router that requires certificates.
 
-    The service can read its keys, and nobody else can.
+    Only the service can read its keys.
     """
     make_authority(tmp_path)
     make_certificate(tmp_path, "router", hosts=["localhost", "127.0.0.1"])
@@ -243,13 +243,13 @@ def test_bundle(machine: Machine, tmp_path: Path) -> None:
     assert len(commands) == 5
     for command in commands:
         machine.run(f"cd /root/pki/bundle && {command}")
-    assert_reads(machine, "wing", READER)
+    assert_receives(machine, "wing", READER)
     for key in ("router.key", "pki/vehicle-wing.key"):
         assert machine.call(f"setpriv --reuid=65534 --clear-groups cat /etc/nedbus/{key}").returncode != 0
 
 
-def test_nothing_is_writable(machine: Machine) -> None:
-    """The process sees no writable file system but its own /tmp, no home and no device."""
+def test_service_cannot_write_files_or_see_devices(machine: Machine) -> None:
+    """The service can write only to its own /tmp, and sees neither home directories nor devices."""
     machine.run("systemctl start nedbus")
     inside = "nsenter --mount --target $(systemctl show --value -p MainPID nedbus)"
     assert machine.call(f"{inside} touch /etc/nedbus/new /opt/nedbus/new /var/lib/new").returncode != 0

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from nedbus.sources import FileAccount, read_account
-from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
+from nedbus.sources import FileEvents, read_file_events
+from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from nedbus_msgs import VehicleLocalPosition
 from tests.flights.local_position import FIELD_TYPES, LAYOUTS, downgrade
 
@@ -23,19 +23,18 @@ def _type(name: str, field_types: Mapping[str, str]) -> str:
 
 
 @cache
-def account_of(log: Path) -> FileAccount:
-    """Return the events of a real log, cached per worker, as reading a large one takes more than a second."""
-    return read_account(log)
+def cached_events(log: Path) -> FileEvents:
+    """Return the events of a real log, cached per worker: reading a large one takes more than a second."""
+    return read_file_events(log)
 
 
-def log_messages_in(log: Path | bytes, texts: Texts | None = None) -> list[tuple[int, int, str]]:
+def log_messages_in(log: Path | bytes, texts: LogMessageBuilder | None = None) -> list[tuple[int, int, str]]:
     """Return timestamp, severity and text of each log message in a log."""
     parser = UlogParser(verify=True)
     records = [*parser.feed(log if isinstance(log, bytes) else log.read_bytes()), *parser.close()]
-    messages = (texts or Texts()).merge(records)
-    logged = (each for each in messages if isinstance(each, Data) and each.subscription is SPOKEN)
-    found = [SPOKEN.layout.decode(each.payload) for each in logged]
-    return [tuple(fields.values()) for fields in found]
+    messages = (texts or LogMessageBuilder()).merge(records)
+    found = (each for each in messages if isinstance(each, Data) and each.subscription is LOG_MESSAGE)
+    return [tuple(LOG_MESSAGE.layout.decode(each.payload).values()) for each in found]
 
 
 class UlogWriter:

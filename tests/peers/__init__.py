@@ -1,1 +1,1 @@
-"""Peers of the tests: processes, servers, a browser, certificates, and sources as a service reads them."""
+"""The other side of a test: processes, routers, HTTP clients, a browser, certificates and simulated vehicles."""

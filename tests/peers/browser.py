@@ -1,4 +1,4 @@
-"""A real browser for tests of the page: the Chromium of this machine, driven by playwright."""
+"""A real browser for tests of the web page: the installed Chromium, controlled by Playwright."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from playwright.sync_api import Browser, Error, Page, sync_playwright
 
 from tests.waits import wait_for
 
-PATIENCE: Final = 60.0  # s: a page takes its time where other programs use the processor
+PAGE_TIMEOUT: Final = 60.0  # s; a page is slow on a busy machine
 _NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
 VEHICLE: Final = ".row[data-do=vehicle]"
-"""The rows of the list."""
+"""Selector of the rows of the vehicle list."""
 PARTS: Final = ("head", "find", "list", "tool", "map", "time", "why", "nums", "plots", "more")
-"""All parts of the page, by their classes."""
+"""CSS classes of the parts of the page."""
 _SOURCE: Final = """name => {
   for (const model of Bokeh.documents[0]?.all_models ?? [])
     if (model.type == "ColumnDataSource" && name in model.data)
@@ -121,10 +121,10 @@ _PLACE: Final = """([x, y]) => {
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Start a Chromium for the tests of a module; skip them where there is none."""
+    """Start Chromium for the tests of a module; skip them if it is not installed."""
     path = next(filter(None, map(shutil.which, _NAMES)), None)
     if path is None:
-        pytest.skip(f"there is no {' or '.join(_NAMES)} here")
+        pytest.skip(f"not installed: {' or '.join(_NAMES)}")
     with sync_playwright() as playwright:
         started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
         yield started
@@ -132,7 +132,7 @@ def browser() -> Iterator[Browser]:
 
 
 class Cell(NamedTuple):
-    """An element: its text, whether some of it needs scrolling, and which layers of its background move with it."""
+    """An element: its text, whether the text is clipped, and its CSS background-attachment."""
 
     text: str
     is_cut: bool
@@ -140,36 +140,36 @@ class Cell(NamedTuple):
 
 
 class Tab:
-    """One page: what it shows, what it asked for, and what it complained about."""
+    """A browser tab with the page, its requests, and the errors in its console."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
         self.requested: list[str] = []
-        self.complaints: list[str] = []
-        page.set_default_timeout(PATIENCE * 1e3)
+        self.console_errors: list[str] = []
+        page.set_default_timeout(PAGE_TIMEOUT * 1e3)
         page.on("request", lambda request: self.requested.append(request.url))
         page.on("websocket", lambda socket: self.requested.append(socket.url))
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: self.console_errors.append(str(error)))
+        page.on("console", lambda line: self.console_errors.append(line.text) if line.type == "error" else None)
 
     def open(self, url: str) -> None:
-        """Load the page, and wait for its first picture."""
+        """Load the page and wait until it is drawn."""
         self.page.goto(url)
         self.page.locator(".bk-Figure canvas").first.wait_for()
 
     def source(self, name: str) -> dict[str, list[Any]]:
-        """Return the data of the first source in the page that has a column of this name; {} before it is there."""
+        """Return the data of the first Bokeh data source with a column of this name; {} if there is none yet."""
         found: dict[str, list[Any]] = self.page.evaluate(_SOURCE, name)
         return found
 
     def rows(self, name: str) -> list[dict[str, Any]]:
-        """Return the same as rows."""
+        """Return the data of that data source as rows."""
         columns = self.source(name)
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     @property
     def listed(self) -> list[dict[str, Any]]:
-        """The rows of the list, in its order: vehicle, grade, state, and whether it is chosen; none while it loads."""
+        """Rows of the vehicle list in order: vehicle, grade, state and selection; empty while the page loads."""
         try:
             found: list[dict[str, Any]] = self.page.locator(VEHICLE).evaluate_all(_ROWS)
         except Error as exc:
@@ -180,7 +180,7 @@ class Tab:
 
     @property
     def states(self) -> dict[str, str]:
-        """The states in the list by vehicle."""
+        """States in the vehicle list, by vehicle."""
         return {row["vehicle"]: row["state"] for row in self.listed}
 
     @property
@@ -189,34 +189,34 @@ class Tab:
 
     @property
     def marks(self) -> dict[str, dict[str, Any]]:
-        """The markers on the map, by vehicle."""
+        """Markers on the map, by vehicle."""
         return {row["name"]: row for row in self.rows("shape")}
 
     @property
-    def asked(self) -> dict[str, str]:
-        """Return the query string of the page's address."""
+    def query(self) -> dict[str, str]:
+        """Parameters of the query string of the page's URL."""
         return dict(parse_qsl(urlsplit(self.url).query))
 
     @property
     def url(self) -> str:
-        """The address that a person sees; playwright's own is that of a while ago."""
+        """URL in the address bar; Playwright's own property may be outdated."""
         return str(self.page.evaluate("location.href"))
 
     def panel(self, name: str) -> str:
-        """Return the text of a part of the page, as a person sees it."""
+        """Return the visible text of a panel."""
         return self.page.locator(f"div.{name} .bk-clearfix").first.inner_text()
 
     def cells(self, selector: str) -> list[Cell]:
-        """Return the elements that a selector matches, of parts of the page, table cells and spans."""
+        """Return the page parts, table cells and spans that match a selector."""
         return [Cell(*each) for each in self.page.evaluate(_CELLS, selector)]
 
-    def misplaced(self) -> list[str]:
-        """Return what is wrong with the places of all parts: empty, beyond the page, or on each other."""
+    def layout_problems(self) -> list[str]:
+        """Return the layout problems of all parts: empty, outside the page, or overlapping."""
         found: list[str] = self.page.evaluate(_LAYOUT, list(PARTS))
         return found
 
     def contrasts(self, *names: str) -> list[tuple[str, str, float]]:
-        """Return each text of these parts with its contrast to what is under it."""
+        """Return each text of these parts with its contrast ratio to the background."""
         return [(name, text, value) for name, text, value in self.page.evaluate(_CONTRAST, list(names))]
 
     def labels(self) -> list[tuple[str, float, float, float, float]]:
@@ -224,24 +224,24 @@ class Tab:
         return [(text, left, top, right, low) for text, left, top, right, low in self.page.evaluate(_LABELS)]
 
     def tap(self, east: float, north: float) -> None:
-        """Tap the map there [m]."""
-        place = self.page.evaluate(_PLACE, [east, north])
-        if place is not None:
-            self.page.mouse.click(*place)
+        """Click on the map at this position [m]."""
+        pixel = self.page.evaluate(_PLACE, [east, north])
+        if pixel is not None:
+            self.page.mouse.click(*pixel)
 
     def shows(self, text: str) -> bool:
-        """Tell whether a person sees this text."""
+        """Return whether this text is visible."""
         return any(each.is_visible() for each in self.page.get_by_text(text).all())
 
     def wait_for_text(self, text: str) -> None:
-        wait_for(lambda: self.shows(text), what=f"the page to say {text!r}", seconds=PATIENCE)
+        wait_for(lambda: self.shows(text), what=f"the page to show {text!r}", seconds=PAGE_TIMEOUT)
 
 
 @contextmanager
-def open_tabs(browser: Browser, *, may_complain: bool = False) -> Iterator[Any]:
-    """Give a function that opens tabs; at the end no request has left this host, and no console has an error.
+def open_tabs(browser: Browser, *, allow_console_errors: bool = False) -> Iterator[Any]:
+    """Yield a function that opens tabs; at the end assert that no request left this host and no console has an error.
 
-    `may_complain`: a server that is away is an error in the console of every browser.
+    `allow_console_errors`: needed if a server is stopped, which every browser logs as an error.
     """
     tabs: list[Tab] = []
     contexts = []
@@ -257,7 +257,7 @@ def open_tabs(browser: Browser, *, may_complain: bool = False) -> Iterator[Any]:
         for tab in tabs:
             hosts = {urlsplit(url).hostname for url in tab.requested if not url.startswith(("data:", "blob:"))}
             assert hosts <= {"127.0.0.1"}
-            assert may_complain or not tab.complaints, tab.complaints
+            assert allow_console_errors or not tab.console_errors, tab.console_errors
     finally:
         for context in contexts:
             context.close()

@@ -1,4 +1,4 @@
-"""The certificates of a small fleet, made once in each process of pytest, and secure routers that show them."""
+"""Certificates of a small fleet, made once per pytest process, and configurations of secure routers."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from nedbus.pki import make_authority, make_certificate
 from tests.peers.ports import free_endpoint
 
 CONFIG: Final = Path(__file__).parents[2] / "config"
-"""The shipped configurations of routers."""
+"""Folder of the shipped router configurations."""
 
 
 @pytest.fixture(scope="session")
 def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of keys and certificates, good and bad ones, for tests that change nothing in it."""
+    """Make a read-only folder of keys and certificates, valid and invalid."""
     folder = tmp_path_factory.getbasetemp() / "pki"
-    if folder.is_dir():  # made for another file of tests
+    if folder.is_dir():  # made for another test module
         return folder
     make_authority(folder)
     for name in ("router", "router-2"):
@@ -40,7 +40,7 @@ def secure_endpoint() -> str:
 
 
 def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
-    """Copy the shipped configuration of this name, open or secure, with an endpoint of the test's and other text."""
+    """Copy the shipped configuration named like `file`, with another endpoint and other replacements."""
     text = (CONFIG / file.name).read_text()
     changes = {"/etc/nedbus/pki": str(pki), "tcp/0.0.0.0:7447": endpoint, "tls/0.0.0.0:7447": endpoint} | replaced
     for old, new in changes.items():
@@ -49,17 +49,17 @@ def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
     return file
 
 
-def files_of(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
-    """Return the settings of whoever shows a certificate, or none."""
+def tls_settings(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
+    """Return the TLS settings of a client with the certificate `name`, or without any."""
     own = {} if name is None else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
     return {"tls_ca": pki / ca, **own}
 
 
-def tls_of(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
-    """Return the same for a script."""
-    return nedbus.Tls(*files_of(pki, name, ca).values())
+def client_tls(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
+    """Return the same settings for a script."""
+    return nedbus.Tls(*tls_settings(pki, name, ca).values())
 
 
-def flags_of(pki: Path, name: str | None) -> list[str]:
-    """Return the same for a command."""
-    return [f"--{setting.replace('_', '-')}={path}" for setting, path in files_of(pki, name).items()]
+def tls_options(pki: Path, name: str | None) -> list[str]:
+    """Return the same settings as command-line options."""
+    return [f"--{setting.replace('_', '-')}={path}" for setting, path in tls_settings(pki, name).items()]

@@ -1,6 +1,6 @@
-"""Commands that end by themselves, in this process: what they print and their exit codes, without a start of Python.
+"""Run commands that exit on their own inside the test process, and return their output and exit code.
 
-What ends by a signal, or needs a stream of its own or something beside it, is a process: `run_nedbus`, `fork_command`.
+Commands that need a signal, a stream or a concurrent peer run as processes: `run_nedbus`, `fork_command`.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ import typer
 from nedbus.cli.app import app
 from nedbus.cli.output.logs import RateLimit
 
-from .processes import Forked, Zygote, unmeasured
+from .processes import ForkedProcess, ForkServer, without_coverage
 
-_SIZE: Final = {"COLUMNS": "80", "LINES": "24"}  # where a test does not say another, also if pytest has a terminal
+_SIZE: Final = {"COLUMNS": "80", "LINES": "24"}  # default terminal size, whatever pytest runs in
 
 
 @dataclass(frozen=True)
-class Ended:
-    """A command that has ended: its exit code and its output."""
+class CommandResult:
+    """Exit code and output of a command."""
 
     exit_code: int
     out: str
     err: str
 
 
-def run_command(*arguments: str, **environment: str) -> Ended:
-    """Run `nedbus` with these arguments, in the main thread, and return when it has ended."""
+def run_command(*arguments: str, **environment: str) -> CommandResult:
+    """Run `nedbus` with these arguments in the main thread."""
     exit_code, out, err = 0, io.BytesIO(), io.BytesIO()
     stdout = io.TextIOWrapper(out, "utf-8", write_through=True)
     stderr = io.TextIOWrapper(err, "utf-8", errors="backslashreplace", write_through=True)
@@ -50,33 +50,35 @@ def run_command(*arguments: str, **environment: str) -> Ended:
             _commands().main(arguments, prog_name="nedbus")
         except SystemExit as exc:
             exit_code = int(exc.code or 0)
-        except Exception:  # noqa: BLE001 - what a process would show
+        except Exception:  # noqa: BLE001 - printed, as by a process
             exit_code = 1
             traceback.print_exc()
-    return Ended(exit_code, out.getvalue().decode(), err.getvalue().decode())
+    return CommandResult(exit_code, out.getvalue().decode(), err.getvalue().decode())
 
 
-def fork_command(zygote: Zygote, *arguments: str, out: int, err: int | None = None, **environment: str) -> Forked:
-    """Start `nedbus` with these arguments and streams, and without coverage; it is the test that ends it."""
+def fork_command(
+    fork_server: ForkServer, *arguments: str, out: int, err: int | None = None, **environment: str
+) -> ForkedProcess:
+    """Start `nedbus` with these arguments and streams, without coverage; the caller must end it."""
     with Path(os.devnull).open("r+b") as null:
         streams = null.fileno(), out, null.fileno() if err is None else err
-        started = unmeasured() | environment
-        return zygote.start(("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams)
+        started = without_coverage() | environment
+        return fork_server.start(("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams)
 
 
 @cache
 def _commands() -> Any:
-    """Return the commands as `app()` makes them, each time in a tenth of a second."""
+    """Return the click command of the app; cached, as it takes 0.1 s to build."""
     return typer.main.get_command(app)
 
 
 @contextmanager
 def _as_process() -> Iterator[None]:
-    """Lend what a process has once, and give it back: the log, handlers of signals, and hooks for uncaught errors."""
+    """Save and restore process-wide state: logging, signal handlers and hooks for uncaught errors."""
     signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     root = logging.getLogger()
     levels = {logger: logger.level for logger in (root, logging.getLogger("nedbus"))}
-    handlers, root.handlers = root.handlers, []  # else logging would be set up already, by pytest
+    handlers, root.handlers = root.handlers, []  # otherwise pytest's handlers would count as a configured log
     hooks = sys.excepthook, threading.excepthook
     try:
         yield

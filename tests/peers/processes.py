@@ -1,4 +1,4 @@
-"""Processes that tests start: their output in files, a deadline for each wait, gone at the end of the test."""
+"""Processes of tests: output in files, a deadline for each wait, killed at the end of the test."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ import pytest
 
 from tests.waits import DEADLINE
 
-_SAID = 10_000  # characters of a process's output that a failure shows
+_MAX_SHOWN = 10_000  # characters of stdout and of stderr in a failure message
 
 
-class Forked:
-    """A process forked by a zygote, with the methods of subprocess.Popen."""
+class ForkedProcess:
+    """A process forked by the fork server, with the interface of subprocess.Popen."""
 
     def __init__(self, command: Sequence[str], status: int) -> None:
         self.args = command
@@ -55,29 +55,29 @@ class Forked:
         return self.returncode
 
 
-class Zygote:
-    """A process of `zygote.py`; one for each worker of pytest, from its first test that starts a process."""
+class ForkServer:
+    """Client of a `fork_server.py` process; one per pytest worker, started on first use."""
 
     def __init__(self) -> None:
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.peers.zygote", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.peers.fork_server", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 cwd=Path(__file__).parents[2],
-                # Coverage begins in the forked process, if at all; what has threads cannot be forked.
-                env=unmeasured() | {"OPENBLAS_NUM_THREADS": "1"},
+                # Coverage starts in the child, if at all: a process with threads cannot be forked.
+                env=without_coverage() | {"OPENBLAS_NUM_THREADS": "1"},
             )
 
     def start(
         self, arguments: Sequence[str], *, cwd: Path, environment: dict[str, str], streams: tuple[int, int, int]
-    ) -> Forked:
-        """Fork what Python would start with these arguments, with these three standard streams."""
+    ) -> ForkedProcess:
+        """Fork a process with these arguments of `python`, and these standard streams."""
         request = {"arguments": arguments, "cwd": str(cwd), "environment": environment}
         ours, theirs = os.pipe()
         socket.send_fds(self._requests, [json.dumps(request).encode()], [*streams, theirs])
         os.close(theirs)
-        return Forked([sys.executable, *arguments], ours)
+        return ForkedProcess([sys.executable, *arguments], ours)
 
     def close(self) -> None:
         self._requests.close()
@@ -85,19 +85,19 @@ class Zygote:
 
 
 class Process:
-    """A process that a test starts: its output in files, gone at the end of the test at the latest."""
+    """A process that a test starts, with its output in files."""
 
     def __init__(
-        self, command: Sequence[str], where: Path, environment: dict[str, str], zygote: Zygote | None = None
+        self, command: Sequence[str], where: Path, environment: dict[str, str], fork_server: ForkServer | None = None
     ) -> None:
         self._measured = any(name.startswith("COVERAGE_") for name in environment)
         self._out = where / "stdout"
         self._err = where / "stderr"
-        self.popen: Forked | subprocess.Popen[bytes]
+        self.popen: ForkedProcess | subprocess.Popen[bytes]
         with self._out.open("wb") as out, self._err.open("wb") as err, Path(os.devnull).open("rb") as null:
-            if zygote is not None:
+            if fork_server is not None:
                 streams = null.fileno(), out.fileno(), err.fileno()
-                self.popen = zygote.start(command[1:], cwd=where, environment=environment, streams=streams)
+                self.popen = fork_server.start(command[1:], cwd=where, environment=environment, streams=streams)
             else:
                 self.popen = subprocess.Popen(command, stdin=null, stdout=out, stderr=err, cwd=where, env=environment)
 
@@ -110,19 +110,19 @@ class Process:
         return self._err.read_text()
 
     def wait(self, seconds: float = DEADLINE) -> int:
-        """Wait for its end and return its exit code; fail with what it said, and where it was, when it does not end."""
+        """Return the exit code; fail with the output and the stacks of all threads if the process does not end."""
         try:
             return self.popen.wait(seconds)
         except subprocess.TimeoutExpired:
             self.popen.send_signal(signal.SIGABRT)  # Python writes the stacks of all threads
             with suppress(subprocess.TimeoutExpired):
                 self.popen.wait(DEADLINE)
-            said = f"{self.out[-_SAID:]}{self.err[-_SAID:]}"
-            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; it said:\n{said}")
+            output = f"{self.out[-_MAX_SHOWN:]}{self.err[-_MAX_SHOWN:]}"
+            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; its output:\n{output}")
 
     def signal(self, number: signal.Signals) -> None:
         if self._measured and number == signal.SIGINT:
-            pytest.fail("start what SIGINT is to end with measured=False")
+            pytest.fail("start a process that SIGINT will end with coverage=False")
         self.popen.send_signal(number)
 
     def kill(self) -> None:
@@ -130,8 +130,8 @@ class Process:
         self.popen.wait(DEADLINE)
 
 
-def unmeasured() -> dict[str, str]:
-    """Return an environment without coverage, for what SIGINT ends: KeyboardInterrupt can be raised in its lock."""
+def without_coverage() -> dict[str, str]:
+    """Return the environment without coverage, for processes that SIGINT ends: it may interrupt coverage's lock."""
     return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
 
 

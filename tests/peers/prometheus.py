@@ -1,4 +1,4 @@
-"""Debian's Prometheus, for tests: the programs where they are installed, and a running one that can be asked."""
+"""Debian's Prometheus for tests: `promtool`, and a running server to query."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from tests.waits import wait_for
 
 PACKAGING: Final = Path(__file__).parents[2] / "packaging"
 ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
-# Whatever `start` starts is Python: this one reads a file as its input and becomes another program.
-_BECOME: Final = "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
+# `start` starts Python; this script opens a file as stdin and replaces itself with another program.
+_EXEC_SCRIPT: Final = (
+    "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
+)
 
 
 def find_program(name: str) -> str:
-    """Return the path of `prometheus` or `promtool`; skip the test where it is not installed."""
+    """Return the path of `prometheus` or `promtool`; skip the test if it is not installed."""
     path = shutil.which(name)
     if path is None:
         pytest.skip(f"no {name}: apt-get install --no-install-recommends prometheus")
@@ -31,12 +33,12 @@ def find_program(name: str) -> str:
 
 
 def start_promtool(start: Start, *arguments: str, stdin: Path | str = os.devnull) -> Process:
-    """Start promtool, with a file as its input; it is killed at the end of the test."""
-    return start("-c", _BECOME, os.fspath(stdin), find_program("promtool"), *arguments)
+    """Start promtool with a file as its stdin; `start` kills it at the end of the test."""
+    return start("-c", _EXEC_SCRIPT, os.fspath(stdin), find_program("promtool"), *arguments)
 
 
 class Prometheus:
-    """A Prometheus that scrapes and evaluates every second, its data in a folder of the test; `start` ends it too."""
+    """A Prometheus server that scrapes and evaluates rules every second; `start` kills it at the end of the test."""
 
     def __init__(self, start: Start, folder: Path, rules: str, jobs: dict[str, list[str]]) -> None:
         program = find_program("prometheus")
@@ -47,28 +49,28 @@ class Prometheus:
         config.write_text(json.dumps({"global": every, "rule_files": ["alerts.yml"], "scrape_configs": scraped}))
         self._url = f"http://127.0.0.1:{free_port()}"
         self.process = start(
-            "-c", _BECOME, os.devnull, program,
+            "-c", _EXEC_SCRIPT, os.devnull, program,
             f"--config.file={config}", f"--storage.tsdb.path={folder / 'data'}",
             f"--web.listen-address={self._url.removeprefix('http://')}", "--log.level=warn",
         )  # fmt: skip
         wait_for(self._is_ready, what=f"Prometheus: {self.process.err}")
 
     def alerts(self, name: str, **labels: str) -> list[dict[str, str]]:
-        """Return the labels of what an alert fires for now, of those with these labels."""
+        """Return the labels of the firing instances of an alert, of those with these labels."""
         firing = [each["labels"] for each in self._get("/api/v1/alerts")["alerts"] if each["state"] == "firing"]
         return [each for each in firing if {"alertname": name, **labels}.items() <= each.items()]
 
     def annotations(self) -> list[str]:
-        """Return the texts of all alerts, pending ones included."""
+        """Return the annotations of all alerts, pending ones included."""
         return [text for each in self._get("/api/v1/alerts")["alerts"] for text in each["annotations"].values()]
 
     def query(self, expression: str) -> list[tuple[dict[str, str], float]]:
-        """Return the labels and the value of each series that an expression has now."""
+        """Return the labels and the current value of each series of an expression."""
         result = self._get(f"/api/v1/query?query={quote(expression)}")["result"]
         return [(each["metric"], float(each["value"][1])) for each in result]
 
     def scrape_errors(self) -> dict[str, str]:
-        """Return the last error of each target, by its address; "" for none."""
+        """Return the last scrape error of each target by address; "" if there was none."""
         targets = self._get("/api/v1/targets")["activeTargets"]
         return {each["labels"]["instance"]: each["lastError"] for each in targets}
 

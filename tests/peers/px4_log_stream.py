@@ -1,9 +1,9 @@
-"""A PX4 that streams its ULog over MAVLink, played from a recording: telemetry, commands, stop-and-wait, timeouts.
+"""A fake PX4 that streams its ULog over MAVLink from a recording: telemetry, commands, stop-and-wait, timeouts.
 
-The recordings are of a real PX4 (SITL, main of 2026-05-14): gzip of records `<QBH`, the time [ns], 0 for datagrams of
-the vehicle and 1 for those to it, the length, and one datagram with one MAVLink 2 frame.
-What the vehicle does here is what it did there; the bytes of the ULog are the recorded ones but for the time in the
-header of a second stream.
+The recordings are of a real PX4 (SITL, main of 2026-05-14): gzip of records `<QBH`: time [ns], direction (0: from the
+vehicle, 1: to it) and length, followed by a datagram with one MAVLink 2 frame.
+The fake behaves like the recorded vehicle; the bytes of the ULog are the recorded ones, except the time in the header
+of a second stream.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from pymavlink.generator.mavcrc import x25crc
 from tests.flights.ulogs import LOGS
 
 STREAMS: Final = LOGS.parent / "px4" / "ulog_stream"
-"""Recordings of streams, and the vehicle's own logs of the same flights."""
+"""Recordings of streams, and the ULog files of the same flights."""
 SHORT: Final = Path(__file__).parents[1] / "data" / "log_stream.bin.gz"
-"""The header of `ulog_stream_flight1`, but for parameters and counters, and the 2 s after it.
+"""The header of `ulog_stream_flight1` without parameters and counters, and the 2 s after it.
 
-A short header: on a machine that is very busy a long one is refused, as on a slow link.
+A short header, because on a very busy machine a long one is refused, as on a slow link.
 """
 
 START, STOP = dialect.MAV_CMD_LOGGING_START, dialect.MAV_CMD_LOGGING_STOP
 HEARTBEAT: Final = 0
 _DATA, _ACKED = dialect.MAVLINK_MSG_ID_LOGGING_DATA, dialect.MAVLINK_MSG_ID_LOGGING_DATA_ACKED
 _FIELDS: Final = struct.Struct("<HBBBB")  # sequence, target ids, length, first_message_offset; then the data
-_REPEAT: Final = 0.05  # s after which a message without acknowledgement is repeated
+_REPEAT: Final = 0.05  # s; retransmission interval without an acknowledgement
 _DATA_SIZE, _NO_RECORD = 249, 255  # bytes; first_message_offset of a message in which no record begins
-_NOBODY: Final = (0, 0)  # ids of a client on another link
+_OTHER_LINK: Final = (0, 0)  # ids of a client on another link
 _MAX_LATE: Final = 5  # frames
-_SENDS: Final = 50  # of one message, after which the stream ends
-_BLOCKED: Final = 2.5  # s of the logger, for a START during STOP
-_ROUND_TRIP: Final = 0.004  # s, of the recordings
+_SENDS: Final = 50  # transmissions of one message after which the stream ends
+_BLOCKED: Final = 2.5  # s that the logger blocks after a START during STOP
+_ROUND_TRIP: Final = 0.004  # s, in the recordings
 _MAX_QUEUED: Final = 2**16  # bytes in the receive buffer of the client, at full speed
 _HEARTBEAT_INTERVAL: Final = 1.0  # s while the recording is held
-_BATCH: Final = 64  # frames between looks at the socket
-_TAIL: Final = 0.18  # s, of a STOP whose client acknowledges on another link
+_BATCH: Final = 64  # frames sent between two reads of the socket
+_TAIL: Final = 0.18  # s; duration of a STOP whose client acknowledges on another link
 _MAX_IDLE: Final = 0.01  # s
 
 Event = Literal["reboot", "vanish", "return", "foreign_stop"]
@@ -67,7 +67,7 @@ class Message(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """A frame of telemetry, or a message of the stream behind its header, at a time of the recording [s]."""
+    """A telemetry frame, or a stream message after the header, with its time in the recording [s]."""
 
     time: float
     content: bytes | Message
@@ -75,11 +75,11 @@ class Entry(NamedTuple):
 
 @dataclass
 class Recording:
-    """Everything that the vehicle sent, apart from answers to this client.
+    """All messages of the vehicle except replies to the recorded client.
 
     `start`, `header_end`: times of the recording. `tail`: the messages after STOP.
     `clock`: time of the recording [s] and of the vehicle [ns], from answers to TIMESYNC.
-    `definitions`: records of topics that appeared in flight, and the number of the entry that completes each.
+    `definitions`: records of topics that appeared in flight, with the index of the entry that completes each.
     """
 
     system: int
@@ -116,7 +116,7 @@ def stream_message(frame: bytes) -> Message | None:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read the first stream of a recording, and the telemetry around it."""
+    """Read the first stream of a recording, and its telemetry."""
     recording: Recording | None = None
     first, is_stopping, data, last = 0.0, False, bytearray(), None
     for when, from_vehicle, frame in datagrams(path):
@@ -154,7 +154,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def split_records(data: bytearray) -> Iterator[tuple[str, bytes]]:
-    """Take the complete records of a ULog without its file header off `data`; yield their types and bodies."""
+    """Remove complete ULog records from the start of `data`; yield their types and bodies."""
     while len(data) >= 3 and len(data) >= (end := 3 + int.from_bytes(data[:2], "little")):
         yield chr(data[2]), bytes(data[3:end])
         del data[:end]
@@ -162,14 +162,14 @@ def split_records(data: bytearray) -> Iterator[tuple[str, bytes]]:
 
 @dataclass
 class _Stream:
-    """A stream that is active: `pending` are the messages to send by stop-and-wait, before anything else.
+    """An active stream. `pending`: messages to send by stop-and-wait before all others.
 
-    `expected`: the next sequence of the recording; None before the first record that begins in this stream.
-    `acknowledged`: time at which the acknowledgement of the first pending message arrives.
+    `is_on_link`: the client is on this link. `expected`: next sequence number of the recording, None before the first
+    record. `acknowledged`: arrival time of the acknowledgement of the first pending message.
     """
 
     ids: tuple[int, int]
-    is_heard: bool = True
+    is_on_link: bool = True
     sequence: int = 0
     expected: int | None = None
     pending: deque[Message] = field(default_factory=deque)
@@ -178,13 +178,13 @@ class _Stream:
     acknowledged: float | None = None
 
     def append(self, message: Message) -> None:
-        """Send this message by stop-and-wait."""
+        """Queue a message for stop-and-wait."""
         self.pending.append(message._replace(sequence=self.sequence % 2**16))
         self.sequence += 1
 
 
 class _Request(NamedTuple):
-    """A command that waits for the logger; `during_stop`: it came before STOP was accepted."""
+    """A command queued for the logger; `during_stop`: received before STOP was accepted."""
 
     command: int
     ids: tuple[int, int]
@@ -192,21 +192,21 @@ class _Request(NamedTuple):
 
 
 class Px4LogStream:
-    """A vehicle that sends to a UDP port of this host, from a thread; it ends with the block.
+    """A vehicle that sends to a UDP port of this host from a thread, inside a `with` block.
 
-    `speed`: factor of real time; None for as fast as the client reads, and while `is_ready` returns True.
-    `loss`, `burst`: part of the datagrams to the client that are dropped, and the number dropped in a row.
-    `reorder`: part of them that arrive up to five datagrams late.
-    `round_trip`: from a message to its acknowledgement, at least [s]; in real time that of the recordings.
-    `refusal`: MAV_RESULT of every START. `answers`: False without a logger: no COMMAND_ACK at all.
-    `unsent`: number of STARTs that are accepted without data.
-    `owner`: ids of a client that has the stream at first; `is_owner_heard`: it has it on this link.
-    `events`: at times of the recording [s]. `on_send`: called with each frame.
-    `waits`: the recording is held before its own START until one comes.
+    `speed`: factor of real time; None: as fast as the client reads, while `is_ready` returns True.
+    `loss`, `burst`: fraction of datagrams to the client that are dropped, and the number dropped in a row.
+    `reorder`: fraction of datagrams that arrive up to five datagrams late.
+    `round_trip`: minimum time from a message to its acknowledgement [s]; in real time that of the recordings.
+    `refusal`: MAV_RESULT of every START. `answers`: False: no logger, so no COMMAND_ACK at all.
+    `unsent`: number of STARTs that are accepted without sending data.
+    `owner`: ids of the client that initially owns the stream; `is_owner_on_link`: it is on this link.
+    `events`: by time in the recording [s]. `on_send`: called with each frame.
+    `waits`: hold the recording before its START until the client sends one.
 
-    `commands`: MAV_CMD of those received. `dropped`: LOGGING_DATA that never arrive, before a message that does.
-    `late`: those that come late.
-    `streams`: number of streams that began. `finished`: set when the recording has been sent.
+    `commands`: received MAV_CMDs. `dropped`: lost LOGGING_DATA, counted when a later one arrives.
+    `late`: number of reordered LOGGING_DATA.
+    `streams`: number of started streams. `finished`: set when the recording has been sent.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class Px4LogStream:
         answers: bool = True,
         unsent: int = 0,
         owner: tuple[int, int] | None = None,
-        is_owner_heard: bool = False,
+        is_owner_on_link: bool = False,
         events: Mapping[float, Event] | None = None,
         waits: bool = True,
         deadline: float = 100.0,
@@ -239,7 +239,7 @@ class Px4LogStream:
         self._round_trip = round_trip if round_trip is not None else _ROUND_TRIP if speed else 0.0
         self._refusal, self._answers, self._unsent, self._waits = refusal, answers, unsent, waits
         self._events, self._on_send = deque(sorted((events or {}).items())), on_send
-        self._caused: deque[Event] = deque()
+        self._triggered: deque[Event] = deque()
         self._mav = dialect.MAVLink(None, recording.system, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
         self._crc_extra: dict[int, int] = {}
@@ -251,7 +251,7 @@ class Px4LogStream:
         self._is_full, self._next_look = False, 0
         self._heartbeat = next(each for _, each in recording.entries if isinstance(each, bytes) and is_heartbeat(each))
         self._rewind()
-        self._stream: _Stream | None = _Stream(owner, is_owner_heard, sequence=5000) if owner else None
+        self._stream: _Stream | None = _Stream(owner, is_owner_on_link, sequence=5000) if owner else None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
@@ -271,12 +271,12 @@ class Px4LogStream:
         if self._failure:
             raise self._failure
 
-    def cause(self, event: Event) -> None:
-        """Let this happen now."""
-        self._caused.append(event)
+    def trigger(self, event: Event) -> None:
+        """Cause an event now."""
+        self._triggered.append(event)
 
     def _rewind(self) -> None:
-        """Begin the recording, and the vehicle's time with it."""
+        """Restart the recording and the vehicle's clock."""
         self._index, self._clock, self._checked = 0, 0.0, time.monotonic()
         self._stream = None
         self._stop_from: tuple[int, int] | None = None  # ids of the client whose STOP is under way
@@ -287,32 +287,32 @@ class Px4LogStream:
         try:
             while not self._closing.is_set() and time.monotonic() < self._end:
                 self._receive()
-                while self._caused:
-                    self._happen(self._caused.popleft())
+                while self._triggered:
+                    self._apply(self._triggered.popleft())
                 while self._events and self._events[0][0] <= self._clock:
-                    self._happen(self._events.popleft()[1])
+                    self._apply(self._events.popleft()[1])
                 self._run_logger(time.monotonic())
                 self._play(time.monotonic())
         except BaseException as exc:  # noqa: BLE001 - raised again in the thread of the test
             self._failure = exc
 
-    def _happen(self, event: Event) -> None:
+    def _apply(self, event: Event) -> None:
         match event:
             case "reboot":
                 self._rewind()
             case "foreign_stop":
-                self._queue.append(_Request(STOP, _NOBODY))
+                self._queue.append(_Request(STOP, _OTHER_LINK))
             case _:
                 self._is_gone = event == "vanish"
 
     def _receive(self) -> None:
-        """Take what the client sent; wait a little if nothing else is to do."""
+        """Handle the client's messages; wait briefly if nothing is due."""
         select.select([self._socket], [], [], self._idle_time())
         with suppress(BlockingIOError):
             while True:
                 for message in self._mav.parse_buffer(self._socket.recv(2048)) or []:
                     if not self._is_gone:
-                        self._take(message, time.monotonic())
+                        self._handle(message, time.monotonic())
 
     def _idle_time(self) -> float:
         entries = self.recording.entries
@@ -322,7 +322,7 @@ class Px4LogStream:
             return _MAX_IDLE
         return min(_MAX_IDLE, max(0.0, entries[self._index].time - self._clock)) if self._speed else 0.0
 
-    def _take(self, message: Any, now: float) -> None:
+    def _handle(self, message: Any, now: float) -> None:
         ids, stream = (message.get_srcSystem(), message.get_srcComponent()), self._stream
         match message.get_type():
             case "COMMAND_LONG":
@@ -337,14 +337,14 @@ class Px4LogStream:
                 self._send(dialect.MAVLink_timesync_message(self._boot_ns(), message.ts1))
 
     def _boot_ns(self) -> int:
-        """Return the time of the vehicle, from its recorded answers to TIMESYNC."""
+        """Return the time of the vehicle, interpolated from its recorded replies to TIMESYNC."""
         clock = self.recording.clock
         index = min(max(bisect(clock, (self._clock, 0)), 1), len(clock) - 1)
         (before, first), (after, second) = clock[index - 1 : index + 1]
         return first + round((self._clock - before) / (after - before) * (second - first))
 
     def _run_logger(self, now: float) -> None:
-        """Send what waits for an acknowledgement; obey commands only while nothing does, as PX4's logger."""
+        """Send pending messages; execute commands only if none is pending, like PX4's logger."""
         if (stream := self._stream) and stream.pending:
             self._send_pending(stream, now)
         elif now >= self._busy_until:
@@ -352,7 +352,7 @@ class Px4LogStream:
                 self._answer(STOP, dialect.MAV_RESULT_ACCEPTED, self._stop_from)
                 self._stream = self._stop_from = None
             elif self._queue:
-                self._obey(self._queue.popleft(), now)
+                self._execute(self._queue.popleft(), now)
 
     def _send_pending(self, stream: _Stream, now: float) -> None:
         if stream.acknowledged is not None and now >= stream.acknowledged:
@@ -370,14 +370,14 @@ class Px4LogStream:
         self._send_message(stream, stream.pending[0])
         stream.sends, stream.sent = stream.sends + 1, now
 
-    def _obey(self, request: _Request, now: float) -> None:
+    def _execute(self, request: _Request, now: float) -> None:
         if request.command == STOP:
             if self._stream is None:
                 self._answer(STOP, dialect.MAV_RESULT_ACCEPTED, request.ids)
                 return
             self._answer(STOP, dialect.MAV_RESULT_IN_PROGRESS, request.ids)
             self._stop_from = request.ids
-            if self._stream.is_heard:
+            if self._stream.is_on_link:
                 self._append_tail(self._stream)
             else:
                 self._busy_until = now + _TAIL
@@ -387,13 +387,13 @@ class Px4LogStream:
             self._answer(START, dialect.MAV_RESULT_TEMPORARILY_REJECTED, request.ids)
         else:
             self._answer(START, dialect.MAV_RESULT_ACCEPTED, request.ids)
-            if request.during_stop or self._unsent:  # its first message is not delivered, and is given up
+            if request.during_stop or self._unsent:  # its first message is never delivered
                 self._unsent, self._busy_until = max(0, self._unsent - 1), now + _BLOCKED
             else:
                 self._stream = self._begin(request.ids)
 
     def _begin(self, ids: tuple[int, int]) -> _Stream:
-        """Return a stream with the whole header, and with the definitions of topics that appeared since."""
+        """Return a stream with the header and the definitions of topics that appeared since."""
         recording, stream = self.recording, _Stream(ids)
         self._unnoticed = []
         for each in recording.header:
@@ -411,7 +411,7 @@ class Px4LogStream:
         return stream
 
     def _append_tail(self, stream: _Stream) -> None:
-        """Complete the record that was begun, then send what PX4 sends after STOP."""
+        """Queue the rest of the current record, then PX4's messages after STOP."""
         tail = self.recording.tail
         messages = [each for _, each in self.recording.entries[self._index :] if isinstance(each, Message)]
         if messages and tail:
@@ -425,7 +425,7 @@ class Px4LogStream:
             stream.append(each)
 
     def _play(self, now: float) -> None:
-        """Send what is due of the recording; hold it while the logger waits, or the client is slow."""
+        """Send the due part of the recording; pause while messages are pending or the client is slow."""
         elapsed, self._checked = now - self._checked, now
         limit = self.recording.start if self._is_held else math.inf
         if self._stream and self._stream.pending:
@@ -452,7 +452,7 @@ class Px4LogStream:
             self._transmit(self._heartbeat)
 
     def _send_entry(self, message: Message) -> None:
-        """Send a message of the recording, if a stream is active, from the first record that begins in it on."""
+        """Send a message of the recording if a stream is active, beginning with its first complete record."""
         stream = self._stream
         if stream is None or self._stop_from or (stream.expected is None and message.offset == _NO_RECORD):
             return
@@ -461,7 +461,7 @@ class Px4LogStream:
         else:
             stream.sequence += (message.sequence - stream.expected) % 2**16  # lost before it was recorded
         stream.expected = message.sequence + 1
-        if not stream.is_heard:
+        if not stream.is_on_link:
             stream.sequence += 1
         elif message.acked:
             stream.append(message)
@@ -477,14 +477,14 @@ class Px4LogStream:
         self._send(kind(*stream.ids, message.sequence, len(message.data), message.offset, [*data]), number)
 
     def _answer(self, command: int, result: int, ids: tuple[int, int]) -> None:
-        if ids != _NOBODY:
+        if ids != _OTHER_LINK:
             self._send(dialect.MAVLink_command_ack_message(command, result, 0, 0, *ids))
 
     def _send(self, message: Any, number: int = 0) -> None:
         self._transmit(message.pack(self._mav), number)
 
     def _transmit(self, frame: bytes, number: int = 0) -> None:
-        """Send a frame, drop it, or hold it back; `number`: of LOGGING_DATA, from 1."""
+        """Send, drop or delay a frame; `number`: count of LOGGING_DATA, from 1, or 0."""
         self._release()
         self._frames += 1
         if is_heartbeat(frame):
@@ -503,7 +503,7 @@ class Px4LogStream:
             self._socket.sendto(frame, ("127.0.0.1", self._port))
 
     def _release(self, *, everything: bool = False) -> None:
-        """Send the frames that are late enough."""
+        """Send the delayed frames that are due."""
         for each in self._held[:]:
             due, frame, number = each
             if everything or due <= self._frames:
@@ -513,13 +513,13 @@ class Px4LogStream:
                 self._socket.sendto(frame, ("127.0.0.1", self._port))
 
     def _arrive(self, number: int) -> None:
-        """Count what was dropped before a LOGGING_DATA that arrives."""
+        """Count the dropped LOGGING_DATA before one that arrives."""
         dropped = sum(each < number for each in self._unnoticed)
         self.dropped, self._unnoticed = self.dropped + dropped, self._unnoticed[dropped:]
         self._newest = max(self._newest, number)
 
     def _renumber(self, frame: bytes) -> bytes:
-        """Return a frame with the next sequence of this link, as PX4 counts what it sends."""
+        """Return a frame with the next MAVLink sequence number of this link."""
         number, _ = unpack(frame)
         if number not in self._crc_extra:  # some messages are not in this dialect
             self._crc_extra[number] = next(each for each in range(256) if _crc(frame[:-2], each) == frame[-2:])
@@ -527,7 +527,7 @@ class Px4LogStream:
         return frame + _crc(frame, self._crc_extra[number])
 
     def _has_room(self) -> bool:
-        """Return whether the client's receive buffer has room, looked up every 16 frames."""
+        """Return whether the client's receive buffer has room, checked every 16 frames."""
         if self._is_full or self._frames >= self._next_look:
             self._next_look = self._frames + 16
             self._is_full = not self._is_ready() or queued_bytes(self._port) > _MAX_QUEUED
@@ -541,7 +541,7 @@ def is_heartbeat(frame: bytes) -> bool:
 
 
 def queued_bytes(port: int) -> int:
-    """Return the bytes that wait in the receive buffers of a UDP port."""
+    """Return the number of unread bytes in the receive buffers of a UDP port."""
     rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
     return sum(int(row[4].split(":")[1], 16) for row in rows if int(row[1].split(":")[1], 16) == port)
 

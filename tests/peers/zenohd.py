@@ -1,4 +1,4 @@
-"""The real zenohd, for tests: unpacked once from ../shared/bin, where that is there."""
+"""Eclipse's zenohd for tests, unpacked once from ../shared/bin if that folder exists."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from tests.peers.processes import Process, Start
 
 ROOT = Path(__file__).parents[2]
 ARCHIVE = ROOT.parent / "shared" / "bin" / "zenohd-1.10.2.tar.xz"
-# Whatever `start` starts is Python: this one becomes another program.
-BECOME = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
-EITHER = ("nedbus", pytest.param("zenohd", marks=(pytest.mark.slow, pytest.mark.process)))
-"""Parameters of a fixture that runs a router: ours, and the real one where the tests may take their time."""
+# `start` starts Python; this script replaces it with another program.
+EXEC_SCRIPT = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
+ROUTER_KINDS = ("nedbus", pytest.param("zenohd", marks=(pytest.mark.slow, pytest.mark.process)))
+"""Parameters of a fixture that runs a router: nedbus, and zenohd in the slow tests."""
 
 
 @cache
 def zenohd_path() -> Path:
-    """Return the program, whose plugins are in ../lib beside it; skip the test where there is none."""
+    """Return the path of zenohd, with its plugins in ../lib; skip the test if the archive is missing."""
     if not ARCHIVE.is_file():
-        pytest.skip(f"no real zenohd: {ARCHIVE} is not there")
+        pytest.skip(f"no zenohd: {ARCHIVE} does not exist")
     unpacked = ROOT / "build" / f"zenohd-{hashlib.sha256(ARCHIVE.read_bytes()).hexdigest()[:12]}"
     if not unpacked.is_dir():
         unpacked.parent.mkdir(exist_ok=True)
@@ -41,7 +41,7 @@ def zenohd_path() -> Path:
 
 
 def start_zenohd(start: Start, *arguments: str, **environment: str) -> Process:
-    """Start a zenohd with these arguments, by the fixture `start`: it is killed at the end of the test."""
+    """Start zenohd with these arguments; the fixture `start` kills it at the end of the test."""
     path = zenohd_path()
     plugins = f"--plugin-search-dir={path.parents[1] / 'lib'}"
-    return start("-c", BECOME, os.fspath(path), plugins, *arguments, NO_COLOR="1", RUST_LOG="info", **environment)
+    return start("-c", EXEC_SCRIPT, os.fspath(path), plugins, *arguments, NO_COLOR="1", RUST_LOG="info", **environment)

@@ -13,14 +13,14 @@ from nedbus_msgs.arrays import to_array
 from . import rows
 from .models import open_publishers, open_subscription
 
-BATCH = 1000  # messages that are sent at once, where they are not paced
+BATCH = 1000  # messages sent at once, unless paced
 
 Send = Callable[[Sequence[int]], None]
 
 
 @contextmanager
 def publish(case: Case) -> Iterator[list[Send]] | Iterator[list[rows.Send]]:
-    """Send arrays, with which no field is missing; paced, a vehicle has one message at a time: send as rows do."""
+    """Send arrays, which have all fields; if paced, send single messages like `rows`."""
     if case.paced:
         with rows.publish(case) as senders:
             yield senders
@@ -40,7 +40,7 @@ def publish(case: Case) -> Iterator[list[Send]] | Iterator[list[rows.Send]]:
 
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[Sequence[int]], bool]) -> None:
-    """Take arrays."""
+    """Receive arrays."""
     with open_subscription(case) as subscription:
         ready()
         for batch in subscription.batches():

@@ -20,18 +20,18 @@ URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=4194304"
 CHANNEL = "vehicle_local_position"
 
 
-# Signed where LCM has no other.
+# LCM has only signed integers of these sizes.
 LCM_TYPES = {"bool": "boolean", "uint64": "int64_t", "uint8": "byte", "float32": "float", "float64": "double"}
 
 
 def field(name: str, type_name: str) -> str:
-    """Declare a field."""
+    """Return the declaration of a field."""
     kind, bracket, rest = type_name.partition("[")
     return f"{LCM_TYPES[kind]} {name}{bracket}{rest};"
 
 
 def generate() -> Any:
-    """Run lcm-gen, as a build does, and import what it wrote."""
+    """Run lcm-gen, like a build, and import the generated class."""
     with tempfile.TemporaryDirectory() as directory:
         source = Path(directory, "position.lcm")
         source.write_text(f"struct bench_position {{ {' '.join(field(*item) for item in TYPES.items())} }}")

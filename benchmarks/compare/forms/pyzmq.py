@@ -13,7 +13,7 @@ PACKAGES = ["pyzmq==27.3.0", "msgpack==1.2.4"]
 
 
 def address(endpoint: str) -> str:
-    """Take the port beside the router's."""
+    """Return an address with the port after the router's."""
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
     return f"tcp://{host}:{int(port) + 1}"
 

@@ -15,7 +15,7 @@ Send = Callable[[int], None]
 
 @contextmanager
 def publish(case: Case) -> Iterator[list[Send]]:
-    """Send tuples; where the source does not provide all fields, which a tuple cannot say, send fields by name."""
+    """Send tuples; send fields by name if some are missing, which a tuple cannot express."""
     if len(PROVIDED) < len(FIELDS):
         with fields_in.publish(case) as senders:
             yield senders
@@ -30,7 +30,7 @@ def publish(case: Case) -> Iterator[list[Send]]:
 
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    """Take named tuples."""
+    """Receive named tuples."""
     with open_subscription(case) as subscription:
         ready()
         for sample in subscription.rows():

@@ -17,10 +17,10 @@ PACKAGES = ["zenoh-ros2-sdk==0.1.8"]
 
 OVERRIDE = ";".join(
     [
-        'mode="client"',  # its default, a peer, would go round the router
+        'mode="client"',  # the default, peer, would bypass the router
         "listen/endpoints=[]",
         "transport/shared_memory/enabled=false",
-        # its own QoS says reliable, but does not find CongestionControl in zenoh 1.10, and so drops
+        # its QoS "reliable" does not find CongestionControl in zenoh 1.10 and drops
         'qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]',
     ]
 )
@@ -29,7 +29,7 @@ VALUES = {name: np.array(value, np.float32) if type(value) is tuple else value f
 
 
 def options(endpoint: str) -> dict[str, Any]:
-    """Say what both ends must agree on."""
+    """Return the settings that both ends must share."""
     os.environ["ZENOH_CONFIG_OVERRIDE"] = OVERRIDE
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
     return {
@@ -43,7 +43,7 @@ def options(endpoint: str) -> dict[str, Any]:
 
 
 def compile_codec(end: ROS2Publisher | ROS2Subscriber) -> None:
-    """Have rosbags write its code for the type now, which takes 40 ms, and not at the first message."""
+    """Make rosbags generate its code for the type now, not at the first message: it takes 40 ms."""
     store = end.session_mgr.store
     message = store.types[end.msg_type](**VALUES)
     store.deserialize_cdr(store.serialize_cdr(message, end.msg_type), end.msg_type)

@@ -21,7 +21,7 @@ from .output.streams import write
 
 app = typer.Typer(
     name="nedbus",
-    help="PX4's local position estimate, validated, on every host.",
+    help="PX4's messages, validated, on every host of a Zenoh network.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -35,8 +35,8 @@ app.add_typer(pki, name="pki")
 
 
 @command
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(requested: bool) -> None:
+    if requested:
         write(f"nedbus {__version__}")
         raise typer.Exit
 

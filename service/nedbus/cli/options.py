@@ -40,7 +40,7 @@ TopicArgument = Annotated[
 ]
 FilesArgument = Annotated[
     list[Path] | None,
-    typer.Argument(metavar="[FILE]...", help="Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"),
+    typer.Argument(metavar="FILE", help="Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"),
 ]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]
@@ -53,7 +53,6 @@ WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait until the r
 CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this number of samples")]
 DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")]
 
-
 ALL: Final = Selection()  # default selection of commands that show all topics
 POSITIONS: Final = Selection(DEFAULT_TOPIC)  # default selection of commands that show positions
 
@@ -61,37 +60,37 @@ POSITIONS: Final = Selection(DEFAULT_TOPIC)  # default selection of commands tha
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Turn a function into a command; its errors become one line on stderr and an exit code.
 
-    Some parameters are replaced by the options they are made from: `bus` (an open bus), `open_bus` and `read_settings`
-    (functions), and `selection`, whose default supplies the default topic.
+    Some parameters are expanded to the options that create their values: `bus` (an open bus), `open_bus` and
+    `read_settings` (functions), and `selection`, whose default supplies the default topic.
     """
     parameters = inspect.signature(function, eval_str=True).parameters
-    makers = {name: maker for name, maker in _MAKERS.items() if name in parameters}
-    taken = {name: _options_of(maker) for name, maker in makers.items()}
-    own = [each for name, each in parameters.items() if name not in makers]
+    factories = {name: factory for name, factory in _FACTORIES.items() if name in parameters}
+    expanded = {name: _options_of(factory) for name, factory in factories.items()}
+    direct = [each for name, each in parameters.items() if name not in factories]
 
     @functools.wraps(function)
     def run(**values: Any) -> None:
         with _exit_on_errors(), ExitStack() as stack:
-            for name, maker in makers.items():
-                make = functools.partial(maker, **{each.name: values.pop(each.name) for each in taken[name]})
+            for name, factory in factories.items():
+                make = functools.partial(factory, **{each.name: values.pop(each.name) for each in expanded[name]})
                 if name == "selection":
                     values[name] = make(default=parameters[name].default.topic)
                 else:
                     values[name] = stack.enter_context(make()) if name == "bus" else make
             function(**values)
 
-    options = sorted([*own, *itertools.chain(*taken.values())], key=lambda each: each.kind)
+    options = sorted([*direct, *itertools.chain(*expanded.values())], key=lambda each: each.kind)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined] # Typer reads both
     run.__annotations__ = {each.name: each.annotation for each in options}
     run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")  # rich would keep the line breaks
     return run
 
 
-def _options_of(maker: Callable[..., object]) -> list[inspect.Parameter]:
+def _options_of(factory: Callable[..., object]) -> list[inspect.Parameter]:
     """Return the parameters with defaults; `**settings_options` expands to those of `_read_settings`."""
-    parameters = [*inspect.signature(maker, eval_str=True).parameters.values()]
-    own = [each for each in parameters if each.default is not each.empty]
-    return [*_options_of(_read_settings), *own] if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD else own
+    parameters = [*inspect.signature(factory, eval_str=True).parameters.values()]
+    options = [each for each in parameters if each.default is not each.empty]
+    return [*_options_of(_read_settings), *options] if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD else options
 
 
 @contextmanager
@@ -169,7 +168,7 @@ def _select(
     return Selection("/".join(chunks), vehicle, instance)
 
 
-_MAKERS: Final[Mapping[str, Callable[..., Any]]] = {
+_FACTORIES: Final[Mapping[str, Callable[..., Any]]] = {
     "selection": _select, "bus": _open_bus, "open_bus": _open_bus, "read_settings": _read_settings,
 }  # fmt: skip
 

@@ -19,9 +19,9 @@ from nedbus.log_event import about
 _log = logging.getLogger("nedbus")
 
 _END_TIMEOUT: Final = 8.0  # s between a signal and a forced exit; systemd and Docker kill after 10 s
-_CLOSE_TIMEOUT: Final = 1.6  # s for Zenoh to close a session: it waits 10 s for a reader that takes nothing
+_CLOSE_TIMEOUT: Final = 1.6  # s for Zenoh to close a session: it waits 10 s for a peer that does not read
 _TICK: Final = 0.5  # s between two calls of `on_tick`
-_HANGUP_PAUSE: Final = 0.2  # s; some shells pass the signal on before their terminal is gone
+_HANGUP_PAUSE: Final = 0.2  # s; some shells forward SIGHUP before the terminal is closed
 
 
 def run_until_stopped(
@@ -34,10 +34,10 @@ def run_until_stopped(
 ) -> None:
     """Run `body` in a thread until it returns; Ctrl-C, SIGTERM or SIGHUP set its stop event.
 
-    `on_stop` is called from the signal handler, `on_tick` twice a second from the main thread, and `on_hangup`
-    after a SIGHUP that does not come from a closed terminal, in place of the end. `nohup` keeps SIGHUP ignored.
-    `body` sets `closing` when it has only its session left to close, which must not take long.
-    The main thread does nothing else, and so handles signals at once, even while Zenoh blocks.
+    `on_stop` is called from the signal handler, `on_tick` twice a second from the main thread. `on_hangup` is called
+    instead of stopping after a SIGHUP that does not come from a closed terminal. `nohup` keeps SIGHUP ignored.
+    `body` sets `closing` when only its session is left to close; this has a shorter timeout.
+    The main thread does nothing else, to handle signals at once even while Zenoh blocks.
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
@@ -94,14 +94,14 @@ def run_until_stopped(
 
 
 def _await_end(thread: threading.Thread, closing: threading.Event, signals: list[int]) -> None:
-    """Wait for the end of the body's work, then of its session; exit with the reason if either takes too long."""
+    """Wait until the body has finished, then until its session is closed; log an error and exit on a timeout."""
     if closing.wait(_END_TIMEOUT):
         thread.join(_CLOSE_TIMEOUT)
         if not thread.is_alive():
             return
         reason = f"links not closed within {_CLOSE_TIMEOUT:g} s: messages not yet sent on them are lost"
     else:
-        reason = f"still at work {_END_TIMEOUT:g} s after the signal: what is unfinished is lost"
+        reason = f"still running {_END_TIMEOUT:g} s after the signal: unfinished work is lost"
     _log.error(reason, extra=about("shutdown"))
     sys.stderr.flush()
     os._exit(130 if signals[0] == signal.SIGINT else 1)

@@ -46,7 +46,7 @@ class Notifier:
 
     WATCHDOG is sent only while everything works: Zenoh returns the number of sessions, the main thread has called
     `tick` since the last ping, and no source has spent half of systemd's limit on one message.
-    It is sent from a separate thread: the main thread has to handle signals even while Zenoh blocks.
+    A separate thread sends it: the main thread must handle signals even while Zenoh blocks.
     """
 
     def __init__(self, daemon: Daemon, *, environment: Mapping[str, str] = os.environ) -> None:
@@ -57,7 +57,7 @@ class Notifier:
         self._watchdog = watchdog_interval(environment)
         self._router_deadline = time.monotonic() + TIMINGS.systemd_patience
         self._counted = time.monotonic(), 0  # time, and messages published until then
-        self._is_ready = self._ticked = False  # READY was accepted; the main thread is alive
+        self._is_ready = self._ticked = False  # READY was accepted; `tick` was called since the last ping
         self._rejected = ""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-systemd", daemon=True)
@@ -100,8 +100,8 @@ class Notifier:
         next_status = next_ping = 0.0
         while True:
             now = time.monotonic()
-            has_waited = self._daemon.role == "client" and now >= self._router_deadline
-            if not self._is_ready and (self._daemon.ready.is_set() or has_waited):
+            is_overdue = self._daemon.role == "client" and now >= self._router_deadline
+            if not self._is_ready and (self._daemon.ready.is_set() or is_overdue):
                 self._is_ready = True  # set before sending: a reload may unset it at any moment
                 if not self._send(READY=1, STATUS=self._status()):
                     self._is_ready = False

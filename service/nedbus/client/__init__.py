@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from nedbus.events import to_age
+from nedbus.events import format_duration
 from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async

@@ -15,7 +15,7 @@ from operator import itemgetter
 from typing import Final, Literal, cast, get_args
 
 from nedbus import clock
-from nedbus.events import to_age
+from nedbus.events import format_duration
 from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, describe_flags, get_topic
@@ -312,9 +312,9 @@ def stream_state(health: Health, *, publishers: int | None = None, connected: bo
         return StreamState("disconnected", "no link")
     age = health.age
     if age is not None and age > _ABSENT and publishers == 0:
-        return StreamState("gone", f"last message {to_age(age)} ago")
+        return StreamState("gone", f"last message {format_duration(age)} ago")
     if age is not None and age > health.stale_after:
-        return StreamState("stale", f"nothing for {to_age(age)}")
+        return StreamState("stale", f"nothing for {format_duration(age)}")
     if publishers is not None and publishers > 1:
         return StreamState("duplicate", f"{publishers} publishers: stop one, or give it another vehicle")
     reasons = []
@@ -322,7 +322,7 @@ def stream_state(health: Health, *, publishers: int | None = None, connected: bo
     if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
         reasons.append(f"{health.rate:.1f} Hz, usually {usual:.0f}")
     if health.latency is not None and health.latency > _LATE:
-        reasons.append(f"{to_age(health.latency)} late, or clocks differ")
+        reasons.append(f"{format_duration(health.latency)} late, or clocks differ")
     return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")
 
 

@@ -12,7 +12,7 @@ from typing import Final, Literal
 from nedbus import clock
 from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus, reply_parts
 from nedbus.errors import ConfigError, ConnectError
-from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
+from nedbus.events import ACCOUNT_PARAMETER, AccountReport, EventLog, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting, locate_source
 from nedbus.sources import ReplaySource, Source, parse_source
@@ -85,7 +85,7 @@ class Daemon:
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
-        self.account = Account()
+        self.event_log = EventLog()
         # Random, as services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.max_sessions: int | None = None  # of the embedded router, once it is open
@@ -139,20 +139,20 @@ class Daemon:
         """Number of sessions connected to the embedded router, or of links of a client to its router."""
         return 0 if self._session is None else len(self._session.info.transports())
 
-    def update_events(self, measures: Sequence[SourceMeasures] | None = None) -> Account:
+    def update_events(self, measures: Sequence[SourceMeasures] | None = None) -> EventLog:
         """Update and return the event log; `measures`: current measurements, if already available."""
         measured: dict[str, str] = {}
         for source in self.measures if measures is None else measures:
             measured |= source.states
-        mains = [vehicle.main for vehicle in list(self.account.vehicles.values()) if vehicle.main is not None]
+        mains = [vehicle.main for vehicle in list(self.event_log.vehicles.values()) if vehicle.main is not None]
         shared = set() if self._registry is None else self._registry.shared_vehicles()
         present = set() if self._registry is None else {each.vehicle for each in tuple(self._registry.publishers)}
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         states |= {main: "duplicate" for main in states if main.vehicle in shared}
         is_link_lost = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_link_lost else ""
-        self.account.update(clock.steady(), states, link=link, present=present)
-        return self.account
+        self.event_log.update(clock.steady(), states, link=link, present=present)
+        return self.event_log
 
     def report(self, *, within: float = 0.0) -> AccountReport:
         """Return the events of the last `within` seconds and the current state of each vehicle."""
@@ -225,7 +225,7 @@ class Daemon:
                 removed.remove(worker)
             else:
                 retry, on_end = not self.until_done, self._changed.set
-                worker = Worker(planned, registry, router=router, account=self.account, retry=retry, on_end=on_end)
+                worker = Worker(planned, registry, router=router, event_log=self.event_log, retry=retry, on_end=on_end)
                 new.append(worker)
             ordered.append(worker)
         stop_workers(removed, _RETIRE_TIMEOUT, release=True)

@@ -11,9 +11,9 @@ from typing import Any, Final, cast
 from nedbus import clock
 from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.log_event import about
-from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
+from nedbus.sources import Rejection, ReplayRun, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
@@ -45,19 +45,19 @@ class SourceOutput:
     """Publish the messages of a source, called `name` in the log and configured as `text`; `now`: monotonic [s]."""
 
     def __init__(
-        self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
+        self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], event_log: EventLog
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
-        self.absence = Absence()  # topics that vehicles advertise but a live source does not deliver
-        self.log_streams: dict[str, LogStreamStatus] = {}  # of a live source, by vehicle
+        self.unavailable = UnavailableTopics()  # topics that vehicles publish and a live source does not deliver now
+        self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
         self._text = text
         self._kind = text.partition(":")[0]
         self._registry = registry
         self._now = now
-        self._account = account
+        self._event_log = event_log
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # addresses logged as silent
@@ -137,8 +137,8 @@ class SourceOutput:
         self.published += 1
         stream.health.add(fields, received=self._now_ns(), lost=message.lost)
         if message.dropout:
-            self._account.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
-        self._account.add(message.address, fields, clock.steady(), lost=message.lost)
+            self._event_log.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
+        self._event_log.add(message.address, fields, clock.steady(), lost=message.lost)
 
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
@@ -196,7 +196,7 @@ class SourceOutput:
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         for address, stream in list(self._streams.items()):
-            is_known = address.vehicle in self._account.vehicles and stream.last_received is not None
+            is_known = address.vehicle in self._event_log.vehicles and stream.last_received is not None
             if stream.publisher is None and not (is_known and now - (stream.last_received or 0.0) < TIMINGS.forgotten):
                 del self._streams[address]
         self._is_full = False
@@ -220,13 +220,13 @@ class SourceOutput:
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
-            self._account.reject(rejection.address, reason, clock.steady())
+            self._event_log.reject(rejection.address, reason, clock.steady())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
-    def note(self, absence: Absence) -> None:
-        """Store the absent topics of a live source, and log each silent address once."""
-        self.absence = absence
-        if new := [address for address in absence.silent if address not in self._silent]:
+    def note(self, unavailable: UnavailableTopics) -> None:
+        """Store the absent topics of a live source; log each silent address once."""
+        self.unavailable = unavailable
+        if new := [address for address in unavailable.silent if address not in self._silent]:
             self._silent.update(new)
             text = f"advertised, but no message arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
@@ -268,7 +268,7 @@ class SourceOutput:
             extra = about("rejected", message.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
-        self._account.reject(message.address, reason, clock.steady())
+        self._event_log.reject(message.address, reason, clock.steady())
         self._registry.reject(message.address, report)
 
 

@@ -10,9 +10,9 @@ from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.log_event import about
-from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage
+from nedbus.sources import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
 
@@ -26,7 +26,7 @@ _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
 _MAX_STREAMS: Final = 100  # in a status, which must fit into one reply
 
-_Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
+_Item = SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
 
@@ -77,7 +77,7 @@ class Worker:
         *,
         router: Session | None = None,
         clock: Clock | None = None,
-        account: Account,
+        event_log: EventLog,
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
@@ -90,7 +90,7 @@ class Worker:
         self._clock = clock or Clock()
         self._retry = retry or isinstance(self.source, LiveSource)
         self._on_end = on_end
-        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, account)
+        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, event_log)
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None
@@ -130,8 +130,8 @@ class Worker:
             warnings=run.warnings if run else output.warnings,
             error=self._error,
             streams=output.streams(max_streams),
-            not_carried=output.absence.not_carried,
-            silent=output.absence.silent,
+            not_carried=output.unavailable.unsupported,
+            silent=output.unavailable.silent,
             log_streams=tuple(output.log_streams.values()),
         )
 
@@ -244,7 +244,7 @@ class Worker:
                     return
                 if isinstance(item, Rejection):
                     self._output.reject(item)
-                elif isinstance(item, Absence):
+                elif isinstance(item, UnavailableTopics):
                     self._output.note(item)
                 elif isinstance(item, LogStreamStatus):
                     self._output.log_streams[item.vehicle] = item

@@ -1,4 +1,4 @@
-"""The doctor: checks of settings, routers, certificates, permissions, vehicles and clocks."""
+"""`nedbus doctor`: checks of settings, routers, certificates, permissions, vehicles and clocks."""
 
 from .configuration import check_router_file, check_service
 from .examination import examine

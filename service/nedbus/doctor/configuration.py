@@ -1,4 +1,4 @@
-"""Checks of settings and router files for `nedbus check` and `nedbus serve --check`: mistakes with their location."""
+"""Checks of settings and router files for `nedbus check` and `nedbus serve --check`; each mistake has its location."""
 
 import logging
 import socket
@@ -25,7 +25,7 @@ def check_service(
 ) -> list[ConfigError]:
     """Return all mistakes in the settings of a service; `file` and `given` as in `load_settings`.
 
-    `offline`: check only the text, not the files, certificates and endpoints of this host.
+    `offline`: check only the text, without access to files, certificates and endpoints.
     """
     settings, mistakes = find_mistakes(file, **(given or {}))
     endpoints = settings.connect if settings.is_client else settings.listen
@@ -51,9 +51,9 @@ def check_service(
 def check_router_file(
     path: Path, *, offline: bool = False, replaced: Collection[str] = frozenset()
 ) -> list[ConfigError]:
-    """Return all mistakes in a router's configuration file; `offline` as in `check_service`.
+    """Return all mistakes in a router's configuration file; `offline`: as in `check_service`.
 
-    `replaced`: `listen` or `connect` if other settings override the file's.
+    `replaced`: `listen`, `connect` or both, if overridden by settings.
     """
     try:
         config = read_router_config(path)
@@ -61,7 +61,7 @@ def check_router_file(
         return [exc]
     if offline:
         return []
-    found: list[tuple[str, str]] = []  # a value in the file, and its mistake or ""
+    found: list[tuple[str, str]] = []  # (value in the file, mistake or "")
     for name, endpoints, probe in (("listen", config.listen, _try_listen), ("connect", config.connect, reach_endpoint)):
         for endpoint in endpoints if name not in replaced else ():
             try:
@@ -79,7 +79,7 @@ def check_router_file(
 
 
 def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
-    """Yield a mistake for each source that cannot be opened, or publishes an address of another source."""
+    """Yield a mistake for each source that cannot be opened, or that publishes an address of another source."""
     plan, mistakes = plan_sources(settings, tuple(endpoints))
     yield from mistakes
     publishers: dict[Address, PlannedSource] = {}
@@ -91,7 +91,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
         same = next((address for address in addresses if address in publishers), None)
         if same is not None and "vehicle" not in settings.left_out:
             other = publishers[same].text
-            reason = f"publishes {same}, like source {other!r}: give one of them another vehicle"
+            reason = f"publishes {same}, as does source {other!r}: set another vehicle for one of them"
         if reason:
             yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
         for address in addresses:
@@ -99,7 +99,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
 
 
 def _addresses(planned: PlannedSource, *, offline: bool) -> Collection[Address]:
-    """Return the addresses of a replay, or the positions of vehicles named by a live source."""
+    """Return all addresses of a replay, or the position addresses of vehicles named in a live source's options."""
     spec = parse_source(planned.text)
     if isinstance(planned.source, LiveSource):
         named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
@@ -112,9 +112,9 @@ def _addresses(planned: PlannedSource, *, offline: bool) -> Collection[Address]:
 
 
 def _try_listen(endpoint: str) -> Finding | None:
-    """Return a finding if the address is not of this host; ignore the port, which a running service may occupy."""
+    """Return a finding if the address is not one of this host; ignore the port, which a running service may use."""
     parts = split_endpoint(endpoint)
-    if parts is None:  # a socket in the file system
+    if parts is None:  # a Unix domain socket
         return None
     _, host, _ = parts
     try:
@@ -126,7 +126,7 @@ def _try_listen(endpoint: str) -> Finding | None:
 
 
 def _reason(finding: Finding | None) -> str:
-    """Return a finding as the text of a mistake, "" for none; a missing package is only logged."""
+    """Return the text of a mistake, "" for none; an unknown state, as with a missing package, is only logged."""
     if finding is None or finding.state == "ok":
         return ""
     subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""

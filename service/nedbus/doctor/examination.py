@@ -1,4 +1,4 @@
-"""The examination: runs all checks, each with a time limit."""
+"""Run all checks, each with a timeout."""
 
 import logging
 import threading
@@ -25,7 +25,7 @@ from .prober import check_endpoint, check_tls_files
 _log = logging.getLogger(__name__)
 
 Check = Callable[[], Iterable[Finding]]
-_ENDPOINTS_TIMEOUT: Final = 9.0  # s for the checks before joining a router, which run in parallel
+_ENDPOINTS_TIMEOUT: Final = 9.0  # s for the parallel checks before connecting to a router
 _NETWORK_TIMEOUT: Final = 12.0  # s
 _MAX_ROUTERS: Final = 8
 
@@ -35,8 +35,8 @@ def examine(
 ) -> list[Finding]:
     """Run all checks and return their findings, the worst last; takes up to 10 s if no router answers.
 
-    `version`: of this nedbus. `vehicle`: examine only this one, and test the permission to write it. `mavlink`: link
-    to listen to, such as `udpin:0.0.0.0:14550`.
+    `version`: version of this nedbus. `vehicle`: check only this vehicle, and test the permission to publish it.
+    `mavlink`: link to check, such as `udpin:0.0.0.0:14550`.
 
     Raises ConfigError for an invalid link.
     """
@@ -51,7 +51,7 @@ def examine(
     findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
     answering = [each.subject for each in findings if (each.check, each.state) == ("endpoint", "ok")]
     if answering:
-        for index, each in enumerate(findings):  # one router is enough: the others do not explain silence
+        for index, each in enumerate(findings):  # one router is enough: the others do not explain missing data
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
         seen = Observation(settings.prefix, version, vehicle)
@@ -61,7 +61,7 @@ def examine(
 
 
 def _describe_settings(settings: Settings) -> Iterator[Finding]:
-    """Yield the routers and the other settings, each with the flag, variable or file that sets it."""
+    """Yield the routers and the other settings, each with the flag, variable or file that set it."""
     setters = {name: setter for name in Settings.model_fields if (setter := settings.set_by(name))}
     setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in setters.items()}
     setter = next((setters[name] for name in ("connect", "listen", "router_config") if name in setters), "")
@@ -79,7 +79,7 @@ def _check_sources(settings: Settings) -> Iterator[Finding]:
 
 
 def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[Finding]:
-    """Join a router, observe the network behind it, and yield the findings of `NETWORK_CHECKS`."""
+    """Connect to a router, observe its network, and yield the findings of `NETWORK_CHECKS`."""
     with open_client([router], timeout=TIMINGS.doctor_open, tls=tls) as session:
         if seen.vehicle is not None:
             with open_client([router], timeout=TIMINGS.doctor_open, tls=tls) as writer:
@@ -90,9 +90,9 @@ def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[F
 
 
 def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> list[Finding]:
-    """Run checks, by name and subject, in parallel threads; return the findings in the order of the checks.
+    """Run checks, given by name and subject, in parallel threads; return findings in the order of the checks.
 
-    A check that fails, or takes longer than `seconds`, becomes a finding itself; its thread ends by its own timeouts.
+    A check that fails or exceeds `seconds` becomes a finding; its thread then ends by the check's own timeouts.
     """
     found: dict[tuple[str, str], list[Finding]] = {}
 

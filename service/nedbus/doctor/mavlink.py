@@ -1,4 +1,4 @@
-"""Check of a MAVLink link for packets, messages, positions and the ULog stream; needs the extra `mavlink`."""
+"""Check of a MAVLink link: packets, messages, positions and the ULog stream; needs the extra `mavlink`."""
 
 import errno
 import struct
@@ -11,7 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.sources import Link, Senders, open_link, why_ignored
+from nedbus.sources import DuplicateIds, Link, ignore_reason, open_link
 from nedbus.timings import TIMINGS
 
 from .finding import Finding, limit_findings, list_names
@@ -20,9 +20,9 @@ _READ_TIMEOUT: Final = 0.25  # s
 _MAX_SENDERS: Final = 5
 _POSITION: Final = "LOCAL_POSITION_NED"
 _BAUD: Final = 57600
-_SYSTEM: Final = 245  # ours, as in the source
+_SYSTEM: Final = 245  # our system id, as in the MAVLink source
 _BACKEND: Final = "SDLOG_BACKEND"
-_TO_MAVLINK: Final = 2  # bit of SDLOG_BACKEND
+_TO_MAVLINK: Final = 2  # bit 1 of SDLOG_BACKEND
 
 
 def check_mavlink(link: str) -> Iterator[Finding]:
@@ -34,11 +34,11 @@ def check_mavlink(link: str) -> Iterator[Finding]:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check address, port or device, and permissions"
         if is_taken:
-            advice = "fine if 'nedbus serve' uses the port; else stop the process shown by 'ss -ulpn', or use another"
+            advice = "fine if 'nedbus serve' uses it; else stop the process shown by 'ss -ulpn', or use another port"
         yield Finding("mavlink", link, "warning" if is_taken else "wrong", exc.reason, advice)
         return
     if not senders:
-        advice = "check that the vehicle sends to this host and port ('mavlink status' in PX4's shell), and firewalls"
+        advice = "check firewalls, and that the vehicle sends to this host and port ('mavlink status' in PX4's shell)"
         yield Finding("mavlink", link, "wrong", f"no packet within {TIMINGS.listen:g} s", advice)
     elif not systems and not faults:
         seen = f"{senders.total()} packets from {list_names(sorted(senders))}, none of them MAVLink"
@@ -47,23 +47,23 @@ def check_mavlink(link: str) -> Iterator[Finding]:
     yield from limit_findings(
         Finding("mavlink", f"{link} system {system} component {component}", "wrong", fault)
         for (system, component), fault in sorted(faults.items())
-        if system not in systems or not why_ignored(system, component)
+        if system not in systems or not ignore_reason(system, component)
     )
     yield from limit_findings(
-        _judge_system(f"{link} system {number}", link, messages, TIMINGS.listen)
+        _check_system(f"{link} system {number}", link, messages, TIMINGS.listen)
         for number, messages in sorted(systems.items())
     )
     yield from limit_findings(
-        _judge_log(f"{link} system {number}", link, messages, TIMINGS.listen)
+        _check_log(f"{link} system {number}", link, messages, TIMINGS.listen)
         for number, messages in sorted(systems.items())
         if any(map(_is_px4, messages))
     )
 
 
 def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[int, int], str]]:
-    """Return packets by sender, messages by system, and faults by system and component; ask PX4s for SDLOG_BACKEND."""
+    """Count packets by sender, collect messages by system and faults by component; request SDLOG_BACKEND from PX4."""
     faults: dict[tuple[int, int], str] = {}
-    both = Senders()
+    both = DuplicateIds()
     senders: Counter[str] = Counter()
     systems: dict[int, list[Any]] = {}
     end, next_heartbeat, parser = time.monotonic() + seconds, 0.0, None
@@ -72,7 +72,7 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[An
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
     )
     while (now := time.monotonic()) < end:
-        if link.peer is not None and now >= next_heartbeat:  # the peer sends only to known addresses
+        if link.peer is not None and now >= next_heartbeat:  # some peers only send where they received from
             next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
         for data, peer in link.read(_READ_TIMEOUT):
@@ -83,17 +83,17 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[An
                 parser = dialect.MAVLink(None)
                 parser.robust_parsing = True
             for message in parser.parse_buffer(data) or []:
-                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these have no header
+                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # which have no header
                     ids = message.get_srcSystem(), message.get_srcComponent()
-                    ignored = why_ignored(*ids)
+                    ignored = ignore_reason(*ids)
                     if fault := f"ignored: {ignored}" if ignored else both.add(ids[0], peer, now):
                         faults[ids] = fault
                     if ignored:
                         continue
                     systems.setdefault(ids[0], []).append(message)
                     if _is_px4(message):
-                        ask = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
-                        link.send(ask.pack(sender), peer)
+                        request = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
+                        link.send(request.pack(sender), peer)
     return senders, systems, faults
 
 
@@ -101,36 +101,36 @@ def _is_px4(message: Any) -> bool:
     return bool(message.get_type() == "HEARTBEAT" and message.autopilot == dialect.MAV_AUTOPILOT_PX4)
 
 
-def _judge_system(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
+def _check_system(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
     counts = Counter(message.get_type() for message in messages)
     types = list_names(type_ for type_, _ in counts.most_common())
     if counts[_POSITION]:
         seen = f"{_POSITION} at {counts[_POSITION] / seconds:.0f} Hz, of {types}"
-        advice = "" if counts["ODOMETRY"] else "evh and evv need ODOMETRY, which 'nedbus serve' requests"
+        advice = "" if counts["ODOMETRY"] else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
         return Finding("mavlink", name, "ok", seen, advice)
     seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}: {types}"
     advice = (
-        f"'nedbus serve --source mavlink:{link}' requests it; if none arrives, PX4 may have no estimate yet, or needs"
+        f"'nedbus serve --source mavlink:{link}' requests it; if none arrives, PX4 may have no estimate, or may need"
         f" 'mavlink stream -s {_POSITION} -r 30' in its shell"
     )
     return Finding("mavlink", name, "warning", seen, advice)
 
 
-def _judge_log(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
-    """Judge whether a PX4 can send its ULog stream on this link, without asking for it."""
-    pieces = [message for message in messages if message.get_type().startswith("LOGGING_DATA")]
-    if clients := {f"system {each.target_system} component {each.target_component}" for each in pieces}:
+def _check_log(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
+    """Check whether a PX4 can send its ULog stream on this link, without requesting it."""
+    data = [message for message in messages if message.get_type().startswith("LOGGING_DATA")]
+    if clients := {f"system {each.target_system} component {each.target_component}" for each in data}:
         seen = f"sends its ULog stream to {list_names(sorted(clients))}"
-        advice = "PX4 has one stream: 'nedbus serve' is refused while another program receives it, unless log=take"
+        advice = "PX4 streams to one client: it refuses 'nedbus serve' while another one receives, unless log=take"
         return Finding("mavlink", name, "ok" if f"system {_SYSTEM} " in seen else "warning", seen, advice)
     values = [each.param_value for each in messages if getattr(each, "param_id", "") == _BACKEND]
     (backend,) = (
         struct.unpack("<i", struct.pack("<f", values[-1])) if values else (_TO_MAVLINK,)
-    )  # PX4 copies the bytes
+    )  # PX4 sends integers as the bytes of a float
     if not backend & _TO_MAVLINK:
-        seen = f"{_BACKEND} is {backend}: it refuses to send its ULog stream"
-        return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 for file and MAVLink, and restart it")
+        seen = f"{_BACKEND} is {backend}: PX4 refuses to send its ULog stream"
+        return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 (file and MAVLink), and restart PX4")
     size = sum(len(message.get_msgbuf()) for message in messages)
-    seen = f"a PX4, on a link that carries {size / seconds / 1000:.0f} KB/s now"
-    advice = f"for all fields of all topics, 'nedbus serve --source \"mavlink:{link}?log=1\"': docs/live.md"
+    seen = f"a PX4; the link carries {size / seconds / 1000:.0f} kB/s"
+    advice = f"for all fields of all topics: 'nedbus serve --source \"mavlink:{link}?log=1\"': docs/live.md"
     return Finding("mavlink", name, "ok", seen, advice)

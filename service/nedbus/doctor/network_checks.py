@@ -1,10 +1,10 @@
-"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks, other keys."""
+"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks and other keys."""
 
 from collections.abc import Iterator
 from typing import Final
 
 from nedbus.client import SourceStatus
-from nedbus.events import by_vehicle, since_text, to_age
+from nedbus.events import by_vehicle, format_duration, format_since
 from nedbus_msgs import Address, get_topic
 
 from .finding import Finding, State, brief, list_names
@@ -13,15 +13,15 @@ from .observation import Observation
 _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _MAX_TEXT: Final = 300  # characters of text from a peer
-_SILENT_PERIODS: Final = 3.0  # periods of a topic without a message
-_MAX_TIME: Final = 1e11  # s since the epoch accepted from a service
+_SILENT_PERIODS: Final = 3.0  # message intervals without a message
+_MAX_TIME: Final = 1e11  # s; maximum Unix time accepted from a service
 _CLOCK_WARNING: Final = 0.5  # s
 _CLOCK_WRONG: Final = 5.0  # s
 _SYNCHRONISE: Final = "run NTP or PTP on both hosts; check them with 'timedatectl'"
 
 
 def check_routers(seen: Observation) -> Iterator[Finding]:
-    """Yield the number of sessions of each router; warn if it is nearly full."""
+    """Yield the number of sessions at each router; warn if it is close to the limit."""
     if not seen.routers:
         yield Finding("router", "", "ok", "connected; its other sessions are not visible to this client")
     for router in seen.routers:
@@ -36,7 +36,7 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
-    """Yield the read permission, derived from received messages, and the write permission, tested by a probe."""
+    """Yield the read permission, inferred from received messages, and the write permission, tested with a probe."""
     reading = _check_reading(seen)
     yield reading
     vehicle = seen.vehicle
@@ -51,8 +51,8 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
         advice = f"fine for a reader; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"
         yield Finding("write", vehicle, state, text, advice)
     else:
-        text = f"unknown: the router does not let this client read a probe of vehicle {vehicle}"
-        advice = f"allow {seen.prefix}/*/@doctor/* like config/router-secure.json5, or run the doctor as a reader"
+        text = f"unknown: the router does not let this client read a probe for vehicle {vehicle}"
+        advice = f"allow {seen.prefix}/*/@doctor/* as in config/router-secure.json5, or run the doctor as a reader"
         yield Finding("write", vehicle, "unknown", text, advice)
 
 
@@ -64,25 +64,26 @@ def _check_reading(seen: Observation) -> Finding:
         return Finding("read", "", "unknown", "read permission not tested: nothing is published")
     text = f"services report that they publish {list_names(published)}, but no message arrives here"
     if seen.verdict == "allowed":
-        advice = "a vehicle's certificate is for writing: use that of a reader"
+        advice = "a vehicle's certificate only permits writing: use a reader's certificate"
         return Finding("read", "", "warning", text, advice)
-    advice = f"check that these services may write, and this client may read these vehicles; {_ACCESS_RULES}"
+    advice = f"check that these services may write and this client may read these vehicles; {_ACCESS_RULES}"
     return Finding("read", "", "wrong", text, advice)
 
 
 def check_services(seen: Observation) -> Iterator[Finding]:
-    """Yield the findings on the version and the sources of each service."""
+    """Yield findings on the version and the sources of each service."""
     for service in seen.services:
         name = brief(service.service)
-        theirs = brief(service.version or "unknown")
-        if theirs.split(".")[:2] != seen.version.split(".")[:2]:
+        version = brief(service.version or "unknown")
+        if version.split(".")[:2] != seen.version.split(".")[:2]:
             advice = "install the same version on both sides; CHANGELOG.md lists changes of the wire format"
-            yield Finding("version", name, "warning", f"nedbus {theirs} there, {seen.version} here", advice)
+            text = f"the service runs nedbus {version}, this client {seen.version}"
+            yield Finding("version", name, "warning", text, advice)
         findings = [finding for source in service.sources for finding in _check_source(source)]
         yield from findings
         if all(finding.state == "ok" for finding in findings):
             host = brief(service.host or "an unknown host")
-            text = f"nedbus {theirs} on {host}, sources without faults: {len(service.sources)}"
+            text = f"nedbus {version} on {host}, sources without faults: {len(service.sources)}"
             yield Finding("service", name, "ok", text)
     if not seen.services:
         advice = "start one with 'nedbus serve'; publishing scripts do not count as services"
@@ -101,7 +102,7 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         ends = "it has stopped" if state == "failed" else "it is being restarted"
         yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; see the log of its service")
     elif state in {"waiting", "starting"}:
-        advice = "check that its vehicle is on and sends here; for MAVLink run 'nedbus doctor --mavlink LINK' there"
+        advice = "check that the vehicle is on and sends here; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
         yield Finding("source", name, "warning", f"{state}: no message yet", advice)
     if source.silent:
         advice = "PX4 may be losing them: remove rel= from all lines of its zenoh/pub.csv, see docs/live.md"
@@ -121,32 +122,32 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
             advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
             yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
-        advice = "check that the vehicle is on and its link is up; they recover by themselves"
+        advice = "check that the vehicle is on and its link is up; the source recovers automatically"
         seen = f"no more messages of {list_names(stale)}"
         yield Finding("source", name, "warning", seen, advice)
     if source.rejected > 0:
         why = f": {list_names(source.rejections)}" if source.rejections else ""
-        advice = "rejected messages are not published; the log of the service and @rejected keys have the reasons"
+        advice = "rejected messages are not published; see the service's log or the @rejected keys for reasons"
         yield Finding("source", name, "warning", f"{source.rejected} messages rejected{why}", advice)
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
-    """Yield the findings on the addresses of all vehicles, or of one."""
+    """Yield findings on the addresses of all vehicles, or of the selected one."""
     vehicle = seen.vehicle
     arrived = seen.delays.keys()
     known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
     for name, report in by_vehicle(seen.accounts).items():
-        now, told = report.now, report.vehicles[name]
-        if vehicle in (None, name) and told.severity != "info" and not told.is_forgotten(now):
-            severity: State = "wrong" if told.severity == "bad" else "warning"
+        now, current = report.now, report.vehicles[name]
+        if vehicle in (None, name) and current.severity != "info" and not current.is_forgotten(now):
+            severity: State = "wrong" if current.severity == "bad" else "warning"
             advice = f"see the events before it with 'nedbus why --vehicle {name}'"
-            text = f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}"
+            text = f"{current.text[:_MAX_TEXT]}{format_since(current.since, now)}"
             yield Finding("vehicle", name, severity, text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
-    for each in hidden if arrived or seen.ages else ():  # else this client may read nothing at all
+    for each in hidden if arrived or seen.ages else ():  # else this client may not read at all
         advice = "check that the router's access rules allow that service to write this vehicle: docs/security.md"
         yield Finding("vehicle", each, "wrong", "reported as published by a service, but no message arrives", advice)
     if flowing := [address for address in known if address in arrived]:
@@ -155,8 +156,8 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     if not known and not hidden:
         advice = "start its source: 'nedbus serve --source ...'"
         if seen.services:
-            advice = "a service answers: see the findings on its sources; they may publish other vehicles"
-        text = f"{'no vehicle' if vehicle is None else 'not'} seen under {seen.prefix}/"
+            advice = "a service answers: see the findings on its sources; it may publish other vehicles"
+        text = f"{'no vehicle' if vehicle is None else 'not'} found under {seen.prefix}/"
         state: State = "warning" if vehicle is None else "wrong"
         yield Finding("vehicle", vehicle or "", state, text, advice)
 
@@ -167,56 +168,56 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
     if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
         last = "no message yet" if address not in seen.ages else "its last message has no timestamp"
         if age is not None:
-            last = f"its last message is {to_age(age)} old"
-        advice = "its publisher is running: check its input, the source of a service or the loop of a script"
-        state: State = "wrong" if address in seen.ages else "warning"  # topics of a replay may begin later
+            last = f"its last message is {format_duration(age)} old"
+        advice = "its publisher runs but sends nothing: check its input, such as a service's source or a script's loop"
+        state: State = "wrong" if address in seen.ages else "warning"  # topics of a replay may start later
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
     if error := seen.errors.get(address):
-        advice = "check that the publisher of this key is nedbus; a newer layout needs a newer nedbus here"
+        advice = "check that nedbus publishes this key; a newer message layout needs a newer nedbus on this host"
         yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {error[:_MAX_TEXT]}", advice)
     if (publishers := seen.alive[address]) > 1:
-        advice = "readers receive a mixture of both: give one of them another --vehicle, or stop it"
+        advice = "readers receive a mixture of both: stop one, or give it another --vehicle"
         yield Finding("vehicle", name, "wrong", f"{publishers} publishers of this address", advice)
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:
-    """Yield the clocks that are off; if all others agree with each other, that of this host is off."""
-    clocks = {  # offset from the clock of this host, and its uncertainty [s]
+    """Yield clocks that are off; if all others agree with each other, this host's clock is off."""
+    clocks = {  # offset from this host's clock, and its uncertainty [s]
         f"service {brief(each.service)} on {brief(each.host)}": (each.now - seen.asked, seen.error)
         for each in seen.services
-        if each.now is not None and abs(each.now) < _MAX_TIME  # NaN is not
+        if each.now is not None and abs(each.now) < _MAX_TIME  # false for NaN
     }
     for address, delay in seen.delays.items():
         if delay is not None:
-            error = 0.0 if delay < 0 else _CLOCK_WARNING  # a positive delay includes that of the network
+            error = 0.0 if delay < 0 else _CLOCK_WARNING  # a positive delay includes the network's
             clocks[f"publisher of {address}"] = (-delay, error)
     off = {name: offset for name, (offset, error) in clocks.items() if abs(offset) > _CLOCK_WARNING + error}
     if len(off) > 1 and len(off) == len(clocks) and max(off.values()) - min(off.values()) < _CLOCK_WARNING:
         middle = sorted(off.values())[len(off) // 2]
         others = f"{len(off)} others, which agree with each other"
-        yield _judge_clock("this host", "this host's clock", -middle, others, _SYNCHRONISE)
+        yield _clock_finding("this host", "this host's clock", -middle, others, _SYNCHRONISE)
         return
     only = len(clocks) == len(off)
-    blame = "either of the two may be off." if only else "the other clocks agree with this host: set this one."
+    blame = "either clock may be off." if only else "the other clocks agree with this host's: set this one."
     for name, offset in off.items():
-        yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
+        yield _clock_finding(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:
         largest = max(abs(offset) for offset, _ in clocks.values())
-        yield Finding("clock", "", "ok", f"the clocks of all publishers agree with this host's to {to_age(largest)}")
+        yield Finding("clock", "", "ok", f"all clocks agree with this host's within {format_duration(largest)}")
 
 
-def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:
-    text = f"{clock} is {to_age(abs(offset))} {'ahead of' if offset > 0 else 'behind'} {reference}"
+def _clock_finding(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:
+    text = f"{clock} is {format_duration(abs(offset))} {'ahead of' if offset > 0 else 'behind'} {reference}"
     return Finding("clock", name, "wrong" if abs(offset) > _CLOCK_WRONG else "warning", text, advice)
 
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
-    """Yield other prefixes and topics of ROS 2, which readers of this prefix do not receive."""
+    """Yield other prefixes and ROS 2 topics, which readers of this prefix do not receive."""
     prefixes = set()
     for key in seen.elsewhere:
         vehicle, alive, _ = key.partition("/@alive/")
-        before = vehicle.split("/")[: -1 if alive else -2]  # vehicle and topic
-        if before and not before[0].isdecimal():  # `<domain>/fmu/out/vehicle_local_position` belongs to ROS 2
+        before = vehicle.split("/")[: -1 if alive else -2]  # without vehicle and topic
+        if before and not before[0].isdecimal():  # `<domain>/fmu/out/vehicle_local_position` is a ROS 2 topic
             prefixes.add("/".join(before))
     for prefix in sorted(prefixes - {""})[:5]:
         advice = f"use --prefix {prefix} or NEDBUS_PREFIX={prefix} to read them, or correct the publisher's prefix"
@@ -231,4 +232,4 @@ def check_other_keys(seen: Observation) -> Iterator[Finding]:
 NETWORK_CHECKS: Final = (
     check_routers, check_permissions, check_services, check_vehicles, check_clocks, check_other_keys,
 )  # fmt: skip
-"""Checks of the network behind a router; `examine` calls those before it."""
+"""Checks of the network behind a router."""

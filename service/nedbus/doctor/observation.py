@@ -1,4 +1,4 @@
-"""Observation of a network for a few seconds: services, tokens, messages and routers, input of the checks."""
+"""Observation of a network for a few seconds as input for the checks: services, tokens, messages and routers."""
 
 import time
 from collections import Counter
@@ -31,9 +31,9 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection
 
 T = TypeVar("T")
 
-_POLL: Final = 0.02  # s; also the error of that delay
+_POLL: Final = 0.02  # s; also the error of measured delays
 _QUERY_TIMEOUT: Final = 1.0  # s
-_MAX_SERVICES: Final = 20  # any peer may claim to be a service
+_MAX_SERVICES: Final = 20  # peers may claim to be services
 _MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
 _RING: Final = 16_384  # samples buffered per subscription
@@ -41,16 +41,16 @@ _RING: Final = 16_384  # samples buffered per subscription
 
 @dataclass(slots=True)
 class Observation:
-    """A network as seen by this client, and the scope of the examination.
+    """The network as seen by this client, and the scope of the examination.
 
-    `version`: of this nedbus; `vehicle`: the one to examine, None for all; `verdict`: its write permission.
-    `services`: their statuses, with the clocks as at `asked` +- `error` by ours [s since the epoch].
-    `alive`: number of publishers of each address, by tokens.
-    `ages`: age of the last message of each, at the end [s]; None without a timestamp.
-    `delays`: minimum time from sent to received of each with a message, by the clocks of both hosts [s]; None without
-    timestamps. `errors`: the last decoding error of each. `listened`: duration of the observation [s].
-    `elsewhere`: nedbus keys under other prefixes; `ros2`: publishers of ROS 2 topics.
-    `routers`: routers that disclose their sessions; `accounts`: histories of vehicles kept by services.
+    `version`: version of this nedbus. `vehicle`: vehicle to check, None for all; `verdict`: its write permission.
+    `services`: status of each service; clocks were read at `asked` +- `error` by this host's clock [Unix, s].
+    `alive`: number of publishers by address, from liveliness tokens.
+    `ages`: age of the last message by address at the end of the observation [s]; None without timestamp.
+    `delays`: minimum latency by address with messages, by the clocks of both hosts [s]; None without timestamps.
+    `errors`: last decoding error by address. `listened`: duration of the observation [s].
+    `elsewhere`: nedbus keys under other prefixes. `ros2`: publishers of ROS 2 topics.
+    `routers`: routers that disclose their sessions. `accounts`: event reports of services.
     """
 
     prefix: str
@@ -76,7 +76,7 @@ class Observation:
         return [source for service in self.services for source in service.sources]
 
     def observe(self, session: Session) -> None:
-        """Query, and listen for little more than 3 s."""
+        """Send the queries, and receive messages for at least 3 s."""
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
@@ -89,16 +89,16 @@ class Observation:
         self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
         tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
-        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
+        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # nedbus bridges
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             if (address := self._address_of(str(sample.key_expr))) is not None:
-                # Several publishers or a storage may answer.
+                # several publishers, or a storage, may answer
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
         tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add(take_messages())
-        self.delays = dict.fromkeys(self.delays)  # these messages waited during the queries, and appear delayed
+        self.delays = dict.fromkeys(self.delays)  # these were buffered during the queries, and seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)
@@ -110,7 +110,7 @@ class Observation:
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
     def _add(self, samples: Iterable[RawSample]) -> None:
-        """Add received messages, but for those of addresses beyond the limit."""
+        """Add received messages; ignore addresses beyond _MAX_KEYS."""
         for sample in samples:
             address = self._address_of(str(sample.key_expr))
             if address is None or (address not in self.delays and len(self.delays) >= _MAX_KEYS):
@@ -128,7 +128,7 @@ class Observation:
 
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
-    """Return a function that drains received samples, at most one full ring; deleting it ends the subscription."""
+    """Return a function that drains up to one full ring of samples; deleting it ends the subscription."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
     with translate_zenoh_errors():
         subscriber = session.declare_subscriber(key_expr, channel)
@@ -136,7 +136,7 @@ def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSamp
 
 
 def _age_of(sample: RawSample) -> float | None:
-    """Return the age of a sample by its publisher's clock [s]; None without a timestamp."""
+    """Return the time since a sample's Zenoh timestamp [s]; None without timestamp."""
     stamp = sample.timestamp
     return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
@@ -146,7 +146,7 @@ def _least(*ages: float | None) -> float | None:
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
-    """Parse keys; skip invalid ones."""
+    """Parse keys, and skip invalid ones."""
     parsed = []
     for key in keys:
         with suppress(ValueError):  # AddressError or DecodeError

@@ -1,4 +1,4 @@
-"""Probes of routers and certificates: `nedbus check` tests endpoints and files, the doctor also opens sessions."""
+"""Probes of endpoints, routers and certificates; `nedbus check` uses all but those that open a session."""
 
 import socket
 import ssl
@@ -18,7 +18,7 @@ from .finding import Finding, brief, worst_state
 
 _CONNECT_TIMEOUT: Final = 2.0  # s
 _PEM_FILES: Final = {"tls_ca": "the authority is", "tls_certificate": "this client is", "tls_key": ""}
-_ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
+_ALERTS: Final = {  # by substring of OpenSSL's reason for a TLS alert
     "CERTIFICATE_REQUIRED": "it requires a client certificate, and none is given",
     "UNKNOWN_CA": "it does not trust the authority that issued the client certificate",
     "CERTIFICATE_EXPIRED": "the client certificate has expired, by the router's clock",
@@ -26,11 +26,11 @@ _ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
     "": "it aborts the handshake",
 }
 _RENEW: Final = "renew it: 'nedbus pki renew', docs/security.md"
-_OTHER_HOST: Final = (62, 64)  # OpenSSL's codes
+_OTHER_HOST: Final = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
-    """Yield the findings on one router, up to the first wrong one."""
+    """Yield findings on one router; stop at the first wrong one."""
     if unreachable := reach_endpoint(endpoint):
         yield unreachable
         return
@@ -56,7 +56,7 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
 def reach_endpoint(endpoint: str) -> Finding | None:
     """Return a finding if an endpoint cannot be reached, else None; for UDP and QUIC only resolve the host name."""
     parts = split_endpoint(endpoint)
-    if parts is None:  # a socket in the file system
+    if parts is None:  # a Unix domain socket
         return None
     protocol, host, port = parts
     try:
@@ -67,8 +67,8 @@ def reach_endpoint(endpoint: str) -> Finding | None:
     except (socket.gaierror, UnicodeError):  # UnicodeError: an empty label, as in a..b
         seen, advice = f"cannot resolve host name {host}", "correct the name, or use the IP address"
     except ConnectionRefusedError:
-        seen = "connection refused: no program listens on this port"
-        advice = "start 'nedbus serve' or a Zenoh router there, or select another endpoint with --connect"
+        seen = "connection refused: nothing listens on this port"
+        advice = "start 'nedbus serve' or a Zenoh router there, or pass another endpoint with --connect"
     except TimeoutError:
         seen = f"no answer within {_CONNECT_TIMEOUT:g} s"
         advice = "check that the host is on, the address is correct, and no firewall drops the port"
@@ -80,13 +80,13 @@ def reach_endpoint(endpoint: str) -> Finding | None:
 
 
 def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | None) -> Iterator[Finding]:
-    """Yield the validity of the router's certificate, and a finding if either side rejects the other."""
+    """Yield the validity of the router's certificate, and a finding if either side rejects the other's."""
     pem = _read_certificate(host, port)
     if not pem:
-        seen, advice = "it does not speak TLS", "use tcp/, or the endpoint of a Zenoh router with TLS"
+        seen, advice = "it does not speak TLS", "use tcp/ instead of tls/, or the endpoint of a Zenoh router with TLS"
         yield Finding("endpoint", endpoint, "wrong", seen, advice)
         return
-    validity, certificate = _judge_validity("tls", endpoint, "the router shows", pem.encode())
+    validity, certificate = _check_validity("tls", endpoint, "the router presents", pem.encode())
     yield validity
     if tls is None:
         advice = "pass the certificate of its authority with --tls-ca or NEDBUS_TLS_CA"
@@ -99,7 +99,7 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
             tls.context().wrap_socket(plain, server_hostname=host) as connection,
         ):
             connection.settimeout(TIMINGS.tls_alert)
-            connection.recv(1)  # with TLS 1.3 the alert comes after the handshake
+            connection.recv(1)  # with TLS 1.3 an alert arrives after the handshake
     except ssl.SSLCertVerificationError as exc:
         if exc.verify_code in _OTHER_HOST:
             names = f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}" if certificate else ""
@@ -111,12 +111,12 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
             advice = "pass its authority as --tls-ca, or check that the router is yours"
         else:
             seen, advice = f"the router's certificate is not trusted: {exc.verify_message}", ""
-        if advice or validity.state != "wrong":  # else the validity says the same
+        if advice or validity.state != "wrong":  # else the validity finding reports the same
             yield Finding("tls", endpoint, "wrong", seen, advice)
     except ssl.SSLError as exc:
         seen = next(text for name, text in _ALERTS.items() if name in (exc.reason or ""))
         advice = "use --tls-certificate and --tls-key with a certificate signed by the router's authority"
-        yield Finding("tls", endpoint, "wrong", f"the router refuses: {seen}", advice)
+        yield Finding("tls", endpoint, "wrong", f"the router refuses this client: {seen}", advice)
 
 
 def _read_certificate(host: str, port: int) -> str:
@@ -127,7 +127,7 @@ def _read_certificate(host: str, port: int) -> str:
 
 
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:
-    """Check the TLS files of these settings; return findings by setting, and the files if they can be used."""
+    """Check the TLS files of these settings; return findings by setting, and the files if usable."""
     given = {name: path for name in _PEM_FILES if (path := getattr(settings, name)) is not None}
     found = [(name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items()]
     findings = [(name, finding) for name, finding in found if finding is not None]
@@ -147,21 +147,21 @@ def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls 
 
 
 def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
-    """Return the validity of a certificate file; None for a private key without faults."""
+    """Return the validity of a certificate file; for a private key, None if it is valid."""
     kind = "PRIVATE KEY" if name.endswith("_key") else "CERTIFICATE"
     try:
         check_pem(path, kind)
     except ConfigError as exc:
         return Finding("certificate", str(path), "wrong", exc.reason)
-    return _judge_validity("certificate", str(path), whose, path.read_bytes())[0] if kind == "CERTIFICATE" else None
+    return _check_validity("certificate", str(path), whose, path.read_bytes())[0] if kind == "CERTIFICATE" else None
 
 
-def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[Finding, Certificate | None]:
-    """Return the validity of a certificate, and the certificate if it is readable."""
+def _check_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[Finding, Certificate | None]:
+    """Return the validity of a certificate, and the certificate if readable."""
     try:
         certificate = Certificate.decode(pem, pem=True)
-    except ConfigError as exc:  # the package that reads it is missing
-        return Finding(check, subject, "unknown", "the expiry of the certificate is not checked", str(exc)), None
+    except ConfigError as exc:  # the extra `pki` is missing
+        return Finding(check, subject, "unknown", "certificate expiry not checked", str(exc)), None
     except ValueError as exc:
         return Finding(check, subject, "wrong", f"not a valid certificate: {exc}"), None
     now, seen = clock.now(), f"{whose} {brief(certificate)}"
@@ -173,5 +173,5 @@ def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[F
         advice = f"check the clock of this host: {now:%Y-%m-%d %H:%M} UTC"
         finding = Finding(check, subject, "wrong", f"{seen}: it is not valid yet", advice)
     elif certificate.is_due(now):
-        finding = Finding(check, subject, "warning", f"{seen}, {days:.0f} days from now", _RENEW)
+        finding = Finding(check, subject, "warning", f"{seen} ({days:.0f} days left)", _RENEW)
     return finding, certificate

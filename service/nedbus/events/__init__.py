@@ -1,18 +1,18 @@
 """Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
 
-To add a kind of event that is a flag of a message: a row in KINDS (`kinds.py`). One that needs more than a flag needs
-a detector, too, which yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
+To add a kind of event for a flag of a message, add a row to KINDS (`kinds.py`). A kind that depends on more than a flag
+also needs a detector that yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
 """
 
-from .account import KEPT, MAX_VEHICLES, Account
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR
 from .event import ALL, WINDOW, Condition, Event, State
+from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .faults import VALID, Expectation, faults_of
 from .kinds import KINDS, SEVERITIES, Kind, Severity, rank_vehicle
 from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle, from_json, joined, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
-from .times import CLOCKS, Times, since_text, to_age, to_clock, unit_of
+from .times import CLOCKS, Times, format_duration, format_since, format_utc, unit_of
 from .vehicle import Vehicle
 from .verdict import Verdict, verdict_of

@@ -19,17 +19,17 @@ REFERENCES: Final = {
     "vehicle_gps_position": _GNSS, "sensor_gps": _GNSS, AIR_DATA: ("barometer", ("baro_alt_meter", "baro_device_id")),
     "vehicle_local_position_groundtruth": ("ground truth", ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")),
 }  # fmt: skip
-"""Topics with a measurement: what made it, and its fields."""
+"""Topics with independent measurements: instrument and fields."""
 
 _ESTIMATE: Final = ("x", "y", "z", "vx", "vy", "z_valid", "xy_valid", "ref_lat", "ref_lon", "ref_alt")
-_INTERVAL: Final = 390_000  # us between two comparisons with a reference
-_MAX_AGE: Final = 500_000  # us between a measurement and the estimate compared with it
-_FRESH: Final = 1_500_000  # us for which a comparison counts
+_INTERVAL: Final = 390_000  # us between comparisons with a reference
+_MAX_AGE: Final = 500_000  # us between a measurement and the estimate
+_FRESH: Final = 1_500_000  # us for which a comparison is valid
 _TWO_G: Final = 19.6  # m/s^2
 
 
 class ReferenceDetector(ChangeDetector):
-    """Detector of a topic in REFERENCES: compares the estimate with it, beside the `own` detection of the topic."""
+    """Detector for a topic in REFERENCES: compares the estimate with it, and runs the topic's `own` detection."""
 
     def __init__(self, topic: str, comparison: Comparison, own: Detection | None) -> None:
         self._name, fields = REFERENCES[topic]
@@ -39,12 +39,12 @@ class ReferenceDetector(ChangeDetector):
         self.pause = 0.0 if own else 1.05e-6 * _INTERVAL
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the findings of a message, None if there are none."""
+        """Return the findings in a message, None if there are none."""
         found = super().add(message, missing)
         if 0 <= self.stamp - self._compared < _INTERVAL:
             return found
         self._compared, values = self.stamp, self._read_reference(message)
-        if not all(isinstance(each, int | float) for each in values):  # AIR_DATA is what its publisher defines
+        if not all(isinstance(each, int | float) for each in values):  # AIR_DATA may have any types
             return found
         new = self._comparison.add(self._name, self.stamp, values)
         return chain(found or (), new) if new else found
@@ -57,10 +57,7 @@ class ReferenceDetector(ChangeDetector):
 
 
 class Comparison:
-    """The differences between a valid estimate and all references.
-
-    `position` returns the detector of the position estimate in use.
-    """
+    """Comparison of a valid estimate with all references; `position` returns the detector of the estimate in use."""
 
     def __init__(self, position: Callable[[], ChangeDetector | None]) -> None:
         self._estimate = position
@@ -70,10 +67,10 @@ class Comparison:
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         self._height, self._position = _Contradiction("height", "z"), _Contradiction("position", "xy")
-        self._offsets: dict[str, tuple[object, float]] = {}  # of heights without a common origin
+        self._offsets: dict[str, tuple[object, float]] = {}  # of references with another height origin
 
     def add(self, name: str, stamp: int, values: tuple[float, ...]) -> list[Finding]:
-        """Compare the estimate with the fields of a reference; return the contradictions that begin or end."""
+        """Compare the estimate with a reference's fields; return contradictions that begin or end."""
         position = self._estimate()
         if position is None or abs(stamp - position.stamp) > _MAX_AGE:
             return []
@@ -85,7 +82,7 @@ class Comparison:
         project = MapProjection(latitude, longitude).project
         if name == "barometer":
             up = self._relative(name, height - values[0], (values[1], has_origin))
-            height_limit += speed * speed / _TWO_G  # dynamic pressure
+            height_limit += speed * speed / _TWO_G  # dynamic pressure error
         elif name == "ground truth":
             up = self._relative(name, height - values[5] + values[2], has_origin)
             distance = math.dist((x - values[0], y - values[1]), project(values[3], values[4]))
@@ -98,11 +95,11 @@ class Comparison:
             self._offsets.clear()
         if xy_valid != 1 or "xy_valid" in position.missing:
             distance = math.nan
-        found = self._height.judge(name, stamp, up, height_limit), self._position.judge(name, stamp, distance, limit)
+        found = self._height.update(name, stamp, up, height_limit), self._position.update(name, stamp, distance, limit)
         return [each for each in found if each]
 
     def _relative(self, name: str, difference: float, origin: object) -> float:
-        """Return a difference of heights less that of the first comparison with this origin."""
+        """Return a height difference minus the one at the first comparison with this origin."""
         if name not in self._offsets or self._offsets[name][0] != origin:
             self._offsets[name] = (origin, difference)
         return difference - self._offsets[name][1]
@@ -110,9 +107,9 @@ class Comparison:
 
 @dataclass(slots=True)
 class _Contradiction:
-    """A quantity that all references contradict: by more than their limits, in the same direction, for some time.
+    """State of one quantity, contradicted while all references exceed their limits in the same direction.
 
-    `errors`: the last time [us], error and limit [m] by reference. `since`: when all were beyond [us], or 0.
+    `errors`: last time [us], error and limit [m] by reference. `since`: time when all exceeded their limits [us], or 0.
     """
 
     quantity: str
@@ -122,8 +119,8 @@ class _Contradiction:
     worst: float = 0.0
     text: str = ""
 
-    def judge(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
-        """Add an error, NaN if there is none; return the begin or end of a contradiction."""
+    def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
+        """Add an error, NaN if not measured; return the begin or end of a contradiction."""
         self.errors[name] = (stamp, error, limit)
         if not self.since and not abs(error) > limit:
             return None
@@ -137,7 +134,7 @@ class _Contradiction:
         directions = {math.copysign(abs(off) > factor * most, off) for off, most in fresh.values()}
         if directions not in ({1.0}, {-1.0}):
             self.since, self.worst, self.text = 0, 0.0, ""
-            return Finding(kind, "end", f"{text}: over") if text else None
+            return Finding(kind, "end", f"{self.quantity} no longer contradicted") if text else None
         self.since, self.worst = self.since or stamp, max(self.worst, error, key=abs)
         lasted = (stamp - self.since) / 1e6
         if lasted < rules.CONTRADICTED[self.quantity]:
@@ -145,5 +142,5 @@ class _Contradiction:
         side = "off" if self.quantity == "position" else "above" if self.worst > 0.0 else "below"
         self.text = f"{self.quantity} {abs(self.worst):.0f} m {side} {' and '.join(sorted(fresh))}"
         numbers = {"distance": self.worst}
-        begin = Finding(kind, "begin", f"{self.text} while {self.flag} is valid", numbers=numbers, age=lasted)
+        begin = Finding(kind, "begin", f"{self.text} while {self.flag}_valid is true", numbers=numbers, age=lasted)
         return None if text else begin

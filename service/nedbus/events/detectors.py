@@ -1,4 +1,4 @@
-"""Event detectors for flags, flight modes, GNSS receivers, batteries and EKFs."""
+"""Event detectors for flags, arming, flight modes, GNSS receivers, batteries and EKFs."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,24 +19,24 @@ _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _INTERFERENCE: Final = ("jamming_indicator", "jamming_state", "spoofing_state")
 
 EKF_SELECTOR: Final = "estimator_selector_status"
-"""The topic that names the EKF in use."""
+"""Topic that names the primary EKF."""
 
 _EKF_FAULTS: Final = [kind for kind in flagged("EstimatorStatusFlags") if kind.name != "not_fused"]
 HEALTHY: Final[Fields] = {flag: not kind.bad for kind in _EKF_FAULTS for flag in kind.flags}
-"""The flags of an EKF without a fault."""
+"""Flags of an EKF without faults."""
 
-_MAX_EKFS: Final = 9  # instances; 255 stands for none
+_MAX_EKFS: Final = 9  # instances; 255 means none
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
     """A change detected in one message; Vehicle turns it into an event.
 
-    `severity`: None if it is that of its kind.
-    `first`: the text of an end if the condition has held since the first message.
-    `initial`: it already held in the first message, and becomes a condition without an event.
-    `age`: how long ago it began [s].
-    `switch`: without effect if the condition is active at its begin, or not active at its end.
+    `severity`: None for the default of its kind.
+    `first`: text of an end if the condition was already active in the first message.
+    `initial`: active in the first message; it becomes a condition without an event.
+    `age`: time since it began [s].
+    `switch`: ignored unless it changes the condition: begins an inactive one, or ends an active one.
     """
 
     kind: str
@@ -52,13 +52,13 @@ class Finding:
 
 
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
-"""Yields findings from the fields of two messages, by name; those of the first are empty at the first message."""
+"""Yields findings from the fields of the previous message, {} at first, and of the current one."""
 Detection = tuple[Sequence[str], Sequence[str], Detect]
-"""Fields whose changes are detected, further fields that this needs, and the function."""
+"""Fields whose changes trigger the function, further fields that it needs, and the function."""
 
 
 class FieldReader:
-    """Fast access to fields of a model, a row, or a dict; fields that it lacks have the value `absent`."""
+    """Fast access to fields of a model, a row or a dict; missing fields have the value `absent`."""
 
     def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
         self.names, self._absent = tuple(names), absent
@@ -71,17 +71,17 @@ class FieldReader:
             return self._of_fields(message) if type(message) is dict else self._of_message(message)
         except KeyError:
             return tuple(cast("Fields", message).get(name, self._absent) for name in self.names)
-        except AttributeError:  # a message without a file has the fields that its publisher gave it
+        except AttributeError:  # the publisher defines the fields of a topic without a .msg file
             return tuple(getattr(message, name, self._absent) for name in self.names)
 
 
 class ChangeDetector:
-    """Detector of one stream; fast as long as none of the `compared` fields changes.
+    """Detector for one stream; calls `detect` only when one of the `compared` fields changes.
 
-    `detect` gets None for fields that were not provided. `context`: names of further fields that it gets.
+    `detect` receives None for fields that were not provided. `context`: further fields passed to it.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
-    `stamp`, `earlier`: its timestamp and that of the one before [us].
-    `pause`: seconds after a message in which further ones are not needed, until `due` by the account's clock.
+    `stamp`, `earlier`: timestamps of the last message and of the one before [us].
+    `pause`: minimum interval between messages [s]; earlier ones, until `due` on the event log's clock, are skipped.
     """
 
     pause = 0.0
@@ -97,7 +97,7 @@ class ChangeDetector:
         self.stamp = self.earlier = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the findings of a message whose `missing` fields were not provided; None if nothing has changed."""
+        """Return the findings in a message whose `missing` fields were not provided; None if nothing has changed."""
         values = self._read(message)
         self.earlier, self.stamp, state = self.stamp, values[0], values[1:]
         last, self.last = self.last, message
@@ -113,7 +113,7 @@ class ChangeDetector:
         self.stamp = self.earlier = 0
 
     def again(self, before: Fields) -> Iterator[Finding]:
-        """Return the findings of the last message as if the one before had had these fields."""
+        """Return the findings in the last message as if it followed one with these fields."""
         return iter(()) if self.last is None else self._detect(before, self._by_name(self.last, self.missing))
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
@@ -122,16 +122,16 @@ class ChangeDetector:
 
 
 class TextDetector(ChangeDetector):
-    """Detector of PX4's own texts, each of which is an event, even if it repeats the one before."""
+    """Detector for PX4's own texts; each is an event, even if it repeats the previous one."""
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the finding of a message."""
+        """Return the finding in a message."""
         self._state = ()
         return super().add(message, missing)
 
 
 def detection_of(message: str) -> Detection | None:
-    """Return the detection of a message type, None if it has no events; positions have a detector of their own."""
+    """Return the detection for a message type, None if it has no events; positions use PositionDetector."""
     kinds = flagged(message)
     fields, context, further = _FURTHER.get(message, ((), (), None))
     compared = *fields, *(flag for kind in kinds for flag in kind.flags)
@@ -145,9 +145,9 @@ def detection_of(message: str) -> Detection | None:
 
 
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the conditions that begin or end; a change from or to an unknown value is not an event."""
+    """Yield conditions that begin or end; a change from or to an unknown value is not an event."""
     for kind in kinds:
-        found: dict[tuple[bool, Change], list[str]] = {}  # key: is an event, not an initial condition; change
+        found: dict[tuple[bool, Change], list[str]] = {}  # by (is an event rather than initial, change)
         for name in kind.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == kind.bad and kind.initial:
@@ -173,7 +173,7 @@ def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the changes of fix, satellites, jamming and spoofing in a SensorGps."""
+    """Yield changes of fix type, number of satellites, jamming and spoofing in a SensorGps."""
     fix, was = after["fix_type"], before.get("fix_type")
     satellites, earlier = after["satellites_used"], before.get("satellites_used")
     if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
@@ -182,28 +182,28 @@ def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
     elif was is not None and fix is not None and was != fix:
         names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
         numbers = {"fix_before": was, "fix": fix}
-        text = f"GPS fix {names[0]} to {names[1]}"
+        change = f"{names[0]} to {names[1]}"
         if satellites is not None and earlier is not None and satellites != earlier:
             numbers |= {"satellites_before": earlier, "satellites": satellites}
-            text += f", {earlier} satellites to {satellites}"
+            change += f", satellites {earlier} to {satellites}"
         if was >= rules.MIN_FIX_TYPE > fix:
-            yield Finding("gps_fix_lost", "begin", text, names, numbers)
+            yield Finding("gps_fix_lost", "begin", f"GPS fix lost: {change}", names, numbers)
         elif was < rules.MIN_FIX_TYPE <= fix:
-            yield Finding("gps_fix_lost", "end", text, names, numbers)
+            yield Finding("gps_fix_lost", "end", f"GPS fix regained: {change}", names, numbers)
         elif names[0] != names[1]:
-            yield Finding("gps_fix", "once", text, names, numbers)
+            yield Finding("gps_fix", "once", f"GPS fix changed: {change}", names, numbers)
     last = _gps_levels(before)
     for kind, (level, begin, end, numbers) in _gps_levels(after).items():
         if level in (0, 2) and level != last[kind][0]:
             initial = level == 2 and (last[kind][0] is None or not before)
-            is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS at all
+            is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS receiver
             severity: Severity | None = "info" if is_info else None
             found = Finding(kind, "begin", begin, (), numbers, severity=severity, initial=initial, switch=True)
             yield found if level else Finding(kind, "end", end, (), numbers, switch=True)
 
 
 def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
-    """Return conditions with level, texts and numbers; one begins at level 2 and ends at 0, None is unknown."""
+    """Return level, texts and numbers by kind; a condition begins at level 2 and ends at 0; None is unknown."""
     satellites, few = gps.get("satellites_used"), None
     if satellites is not None and satellites != _UNKNOWN_SATELLITES:
         few = (satellites < rules.FEW_SATELLITES) + (satellites < rules.ENOUGH_SATELLITES)
@@ -214,21 +214,21 @@ def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
     spoof = f"GNSS spoofing: state {spoofed}"
     return {
         "few_satellites": (few, f"only {count}", count, {"satellites": satellites}),
-        "jamming": (jamming, f"{jam}{state}", f"{jam}: over", {"indicator": indicator, "state": jammed}),
-        "spoofing": (2 * (spoofed > 1), spoof, f"{spoof}: over", {"state": spoofed}),
+        "jamming": (jamming, f"{jam}{state}", "GNSS jamming ended", {"indicator": indicator, "state": jammed}),
+        "spoofing": (2 * (spoofed > 1), spoof, "GNSS spoofing ended", {"state": spoofed}),
     }
 
 
 def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the end of a fake position in an EstimatorStatusFlags that nothing replaces."""
+    """Yield the end of fake position fusion in an EstimatorStatusFlags if no other horizontal aiding replaces it."""
     was, now = ([name for name in rules.AIDING if fields.get(name)] for fields in (before, after))
     if was and not now and rules.FAKE_AIDING.keys() >= set(was):
-        text = f"no horizontal aiding: {', '.join(map(rules.AIDING.__getitem__, was))} ended, nothing else is fused"
+        text = f"no horizontal aiding: EKF stopped fusing {', '.join(map(rules.AIDING.__getitem__, was))}"
         yield Finding("not_aided", "once", text)
 
 
 def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the changes of arming and mode in a VehicleStatus."""
+    """Yield changes of arming state and flight mode in a VehicleStatus."""
     was, now = before.get("arming_state"), after["arming_state"]
     if now is not None and (was is None or (was == _ARMED) != (now == _ARMED)):
         kind = "armed" if now == _ARMED else "disarmed"
@@ -236,19 +236,19 @@ def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("nav_state"), after["nav_state"]
     if was is not None and now is not None and was != now:
         names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
-        yield Finding("mode", "once", f"mode {names[0]} to {names[1]}", names, {"from": was, "to": now})
+        yield Finding("mode", "once", f"mode changed from {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
 
 def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the findings of a VehicleLandDetected."""
+    """Yield takeoff and landing from a VehicleLandDetected."""
     was, now = before.get("landed"), after["landed"]
     if was is not None and now is not None and was != now:
-        kind, text = ("landed", "landed") if now else ("takeoff", "took off")
+        kind, text = ("landed", "landing detected") if now else ("takeoff", "takeoff detected")
         yield Finding(kind, "once", text)
 
 
 def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the battery warnings of a BatteryStatus."""
+    """Yield battery warnings from a BatteryStatus."""
     known = ({"connected": True, "warning": 0} | before, after)
     was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
     if warning is None or was is None or was == warning:
@@ -266,28 +266,28 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the EKF that an EKF_SELECTOR names; its fields are whatever its publisher defines."""
+    """Yield the primary EKF from an EKF_SELECTOR message, whose fields the publisher defines."""
     was, now = (each.get("primary_instance") for each in (before, after))
     if type(now) is int and now in range(_MAX_EKFS):
         yield selected(now, was if type(was) is int and was in range(_MAX_EKFS) else None)
 
 
 def selected(now: int, was: int | None) -> Finding:
-    """Return the finding of an EKF that is in use now, which is no event if the one before is unknown."""
+    """Return the finding that an EKF became primary; not an event if the previous one is unknown."""
     numbers = {"to": now} if was is None else {"from": was, "to": now}
-    text = f"EKF {now} in use, was EKF {was}"
+    text = f"primary EKF changed from {was} to {now}"
     return Finding("ekf_changed", "once", text, numbers=numbers, initial=was is None)
 
 
 def detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the faults of an EKF that is not in use."""
+    """Yield the faults of an EKF that is not primary."""
     for each in detect_flags(_EKF_FAULTS, before, after):
         names = tuple(f"{instance}:{name}" for name in each.names)
-        text = f"EKF {instance}, not in use: {each.text.removeprefix('EKF ')}"
+        text = f"EKF {instance} (not primary): {each.text.removeprefix('EKF ')}"
         yield replace(each, kind="other_ekf", severity=None, text=text, names=names)
 
 
-# Further detection in a message, beyond flags: the fields that it compares, and those that it needs besides.
+# Detection beyond flags, by message.
 _FURTHER: Final[Mapping[str, Detection]] = {
     "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), detect_aiding),
     "LogMessage": (("severity", "text"), (), detect_text),

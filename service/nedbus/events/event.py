@@ -1,4 +1,4 @@
-"""Events, conditions and states of a vehicle, and the events that may explain an event."""
+"""Events, conditions and states of a vehicle, and the search for possible causes of an event."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import LARGE_CORRECTION
 
 WINDOW: Final = 10.0
-"""Seconds before an event in which other events count as evidence; the begin of an active condition always does."""
+"""Seconds before an event in which other events are evidence; the begin of an active condition always is."""
 
 ALL: Final = "*"
-"""Vehicle name of events that concern all vehicles: those of the link and of the reader itself."""
+"""Vehicle name of events that concern all vehicles: those of the router link and of the reader."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
-"""A time by the account's clock [s]; the bounds validate reports of peers."""
+"""Time on the event log's clock [s]; the bounds validate reports from peers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +27,11 @@ class Event:
     """One event of a vehicle.
 
     `kind`: a key of KINDS. `change`: "begin" or "end" of a condition, or "once".
-    `time`: seconds by the account's clock: the steady clock of this host (live), Unix time (in a report), or since the
-    start of a file. `boot`: seconds since the vehicle's boot, None if no message has given it.
+    `time`: time [s] on the steady clock of this host (live), as Unix time (in a report), or since the start of a file.
+    `boot`: seconds since the vehicle's boot, None if unknown.
     `numbers`: values by name, in SI units and NED. `names`: flags, sensors, or the values before and after.
-    `lasted`: duration of a condition that ends [s], None if it began before the first message.
-    `evidence`: possible causes: events at most WINDOW seconds earlier, and conditions that are still active.
+    `lasted`: duration of the condition that ends [s], None if it began before the first message.
+    `evidence`: possible causes: events at most WINDOW seconds earlier, and conditions still active.
     """
 
     vehicle: str
@@ -49,17 +49,17 @@ class Event:
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """A key that is equal for the same event in the reports of two services."""
+        """Key that is equal for the same event in the reports of two services."""
         return self.kind, self.time, self.names, self.origin == "px4" and self.text
 
     @property
     def origin(self) -> str:
-        """Its author: "px4" of PX4's own texts, "nedbus" of events derived from messages."""
+        """The author: "px4" for PX4's own texts, "nedbus" for events derived from messages."""
         return "px4" if self.kind == "text" else "nedbus"
 
     @property
     def words(self) -> str:
-        """Its text; PX4's own in quotes."""
+        """The text, in quotes if it is PX4's own."""
         return f'PX4: "{self.text}"' if self.origin == "px4" else self.text
 
     def later(self, seconds: float) -> Event:
@@ -72,8 +72,8 @@ class Event:
 class Condition:
     """A condition of a vehicle.
 
-    `since`: its begin by the account's clock [s]. `begin`: the event that began it.
-    `initial`: it already held in the first message, so its real begin is unknown.
+    `since`: start on the event log's clock [s]. `begin`: the event that began it.
+    `initial`: it was active in the first message; its true start is unknown.
     """
 
     kind: str
@@ -90,7 +90,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The state of a vehicle: severity ("info" if all is well), text and begin of the worst condition, all of them."""
+    """State of a vehicle: severity, text and start of its worst condition, and all conditions; "info" if healthy."""
 
     severity: Severity
     text: str
@@ -99,10 +99,10 @@ class State:
 
 
 def rank(condition: Condition, until: float | None, *, is_now: bool = True) -> tuple[int, bool, bool, int, float]:
-    """Return the sort key of conditions, the worst first; `until`: the end, None while it is active.
+    """Return a sort key for conditions, worst first; `until`: the end, None while it is active.
 
-    One of severity bad before one to watch, now an active one before one that has ended or a single event, then a large
-    correction of the estimate, then the more important kind, then the longest, or the single event of largest numbers.
+    Order: severity; with `is_now` active conditions before those that ended and single events; large corrections of the
+    estimate; importance of the kind; duration, or the largest number of a single event.
     """
     numbers = map(abs, condition.begin.numbers.values()) if condition.begin.change == "once" else ()
     size = max(numbers, default=round((math.inf if until is None else until) - condition.since, 2))
@@ -112,7 +112,7 @@ def rank(condition: Condition, until: float | None, *, is_now: bool = True) -> t
 
 
 def state_of(conditions: Iterable[Condition]) -> State:
-    """Return the state of a vehicle: that of the worst of these conditions and recent single events."""
+    """Return the state of a vehicle, set by the worst of these conditions and recent single events."""
     counting = (each for each in conditions if each.severity != "info" and not KINDS[each.kind].stateless)
     ordered = sorted(counting, key=lambda each: rank(each, each.since if each.begin.change == "once" else None))
     if not ordered:
@@ -122,10 +122,10 @@ def state_of(conditions: Iterable[Condition]) -> State:
 
 
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
-    """Return the possible causes of an event: within WINDOW seconds, or still active.
+    """Return the possible causes of an event: the latest of each kind within WINDOW seconds, or still active.
 
-    Of each kind the latest. Begins and PX4's texts, which are all returned, explain a begin; ends since the begin
-    explain an end; all explain a correction of the estimate.
+    Begins and PX4's texts may explain a begin, ends since the begin may explain an end, and both may explain a
+    correction of the estimate. All PX4 texts are returned, not just the latest.
     """
     kind, latest = KINDS[event.kind], dict[object, Event]()
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""
@@ -133,7 +133,7 @@ def explain(event: Event, before: Iterable[Event], conditions: Iterable[Conditio
     for each in before:
         is_bad = each.severity != "info" or (each.kind != "text" and (event.change == "end" or kind.correction))
         is_near = earliest <= each.time <= event.time
-        is_link = each.kind == "link_down"  # its losses are detected after its end
+        is_link = each.kind == "link_down"  # the losses that it causes are detected after it ends
         change = "begin" if each.kind == "text" else each.change
         is_of_change = is_link or (is_bad and change != excluded)
         if each is not event and each.kind in kind.causes and is_near and is_of_change:

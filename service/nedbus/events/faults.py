@@ -6,20 +6,20 @@ from typing import Final
 
 from .event import ALL
 from .report import AccountReport, VehicleReport, by_vehicle
-from .times import since_text, to_age, to_clock
+from .times import format_duration, format_since, format_utc
 
 VALID: Final[Mapping[str, str]] = {"xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid"}
-"""Quantities whose validity a health check can require, with their flags in VehicleLocalPosition."""
+"""Quantities whose validity a health check can require, and their flags in VehicleLocalPosition."""
 
-_MAX_RECENT: Final = 20  # for recent events
+_MAX_RECENT: Final = 20  # recent events listed
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
     """The criteria of a health check.
 
-    `expect`: names of vehicles that must be heard. `vehicles`: the minimum number of vehicles. `valid`: keys of VALID.
-    `within`: seconds without an event of severity bad or watch. `well`: no vehicle may be in a bad state.
+    `expect`: names of required vehicles. `vehicles`: minimum number of vehicles. `valid`: required keys of VALID.
+    `within`: seconds that must be free of bad and watch events. `well`: no vehicle may be in a bad state.
     """
 
     expect: tuple[str, ...] = ()
@@ -30,15 +30,15 @@ class Expectation:
 
 
 def faults_of(reports: Sequence[AccountReport], expected: Expectation, *, only: str | None = None) -> list[str]:
-    """Return the faults that fail a health check, one line each; `only`: check the services of this host alone."""
+    """Return the faults that fail a health check, one line each; `only`: the host to consider."""
     checked = [report for report in reports if only is None or report.host == only]
     vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
     missing = [name for name in expected.expect if name not in vehicles]
     faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
-    flying = [name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent]
-    if len(flying) < (expected.vehicles or 0):
-        names = f": {', '.join(flying[:20])}" if flying else ""
-        faults.append(f"{len(flying)} of {expected.vehicles} vehicles are heard{names}")
+    active = [name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent]
+    if len(active) < (expected.vehicles or 0):
+        names = f": {', '.join(active[:20])}" if active else ""
+        faults.append(f"messages arrive from {len(active)} of {expected.vehicles} vehicles{names}")
     for name, (now, vehicle) in vehicles.items():
         if not expected.expect or name in expected.expect:
             faults += [f"vehicle {name}: {fault}" for fault in _faults_of_vehicle(name, vehicle, now, expected)]
@@ -50,16 +50,16 @@ def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: 
     unknown = [each for each in expected.valid if VALID[each] in vehicle.unknown]
     if vehicle.is_silent:
         if name in expected.expect or not vehicle.is_forgotten(now):
-            yield f"{vehicle.text}{since_text(vehicle.since, now)}"
+            yield f"{vehicle.text}{format_since(vehicle.since, now)}"
     elif invalid:
         since = min(filter(None, (vehicle.flags[VALID[each]] for each in invalid)), default=None)
-        yield f"{', '.join(invalid)} not valid{since_text(since, now)}"
+        yield f"{', '.join(invalid)} not valid{format_since(since, now)}"
     elif expected.well and vehicle.severity == "bad":
-        yield f"{vehicle.text}{since_text(vehicle.since, now)}"
+        yield f"{vehicle.text}{format_since(vehicle.since, now)}"
     elif expected.valid and not vehicle.has_position:
         yield "publishes no position"
     if unknown and not vehicle.is_silent:
-        yield f"the validity of {', '.join(unknown)} is unknown, as the vehicle does not send it"
+        yield f"validity of {', '.join(unknown)} is unknown: the vehicle does not send it"
 
 
 def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
@@ -70,7 +70,7 @@ def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> I
             is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
             if is_recent and is_selected and event.severity != "info":
                 name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
-                at = f"{to_clock(event.time)} UTC, {to_age(report.now - event.time)} ago"
+                at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
                 lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_RECENT]
     if len(lines) > _MAX_RECENT:

@@ -1,4 +1,4 @@
-"""The table of all kinds of events: where they come from, how bad they are, and what may explain them."""
+"""Table of all kinds of events: source, severity and possible causes."""
 
 import re
 from collections.abc import Mapping
@@ -9,27 +9,27 @@ from .rules import FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, REJECTED
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
-"""Worst first. bad: the vehicle cannot do its task; watch: may become bad; info: part of any flight."""
+"""Worst first. bad: the vehicle cannot do its task; watch: this may become bad; info: routine."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """A kind of event.
 
-    `severity`: of a begin or single event; `on_ground` replaces it while the vehicle is disarmed. An end is info.
-    `message`: the PX4 message that it is detected in, "" if another.
+    `severity`: severity of a begin or a single event; `on_ground` replaces it while the vehicle is disarmed. An end is
+    always info. `message`: the PX4 message in which it is detected, "" for other sources.
     `causes`: kinds that may explain it. `row`: its row in plots, by default its name.
 
-    `fault`: `nedbus why` tells its story, whatever else happens. `validity`: a quantity of the estimate is not valid.
-    `correction`: the estimate is corrected, so that begins and ends of conditions may explain it.
-    `phase`: it belongs to any flight, and is shown although it is info.
-    `stateless`: it does not count towards the state of the vehicle. `kept_on_reboot`: a reboot does not end it.
+    `fault`: `nedbus why` always reports it as a fault. `validity`: a quantity of the estimate is invalid.
+    `correction`: the estimate is corrected; both begins and ends of conditions may explain it.
+    `phase`: a phase of any flight, shown although its severity is info.
+    `stateless`: it does not affect the vehicle's state. `kept_on_reboot`: it survives a reboot.
 
-    A kind with `flags` is a condition that holds while any of these fields of the message has the value `bad`; the
-    value in `flags` is a label. Flags that change in the same message become one event.
-    `begin`, `end`: event texts, with `{}` for the labels. `first`: text for the end of an initial condition.
+    A kind with `flags` is a condition, active while any of these fields of the message equals `bad`; the values of
+    `flags` are labels. Flags that change in the same message become one event.
+    `begin`, `end`: event texts, with `{}` for the labels. `first`: text of the end of an initial condition.
     `minor`: flags whose begin is info. `initial`: a flag that is bad in the first message begins a condition.
-    `once_armed`: what holds in the first messages is a condition once the vehicle has been armed for PAUSE.
+    `once_armed`: active in the first messages, it takes effect once the vehicle has been armed for PAUSE.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Kind:
     once_armed: bool = False
 
     def conditions(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the flags of an event, each of which is a condition of its own; "" for a kind without flags."""
+        """Return the flags of an event, one condition each; `("",)` for a kind without flags."""
         return names if self.flags else ("",)
 
 
@@ -102,12 +102,12 @@ _ROWS: Final = (
     ),
     Kind(
         "failsafe", "bad", "VehicleStatus", ("text", *_INVALID, *_SENSING, "failsafe_flag", "gcs_lost", "battery"),
-        fault=True, flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe ends",
+        fault=True, flags={"failsafe": "failsafe"}, initial=True, begin="failsafe", end="failsafe cleared",
     ),
     Kind("battery", "bad", "BatteryStatus", ("text",), fault=True),
     Kind(
         "dead_reckoning", "watch", _ESTIMATE, ("text", *_SENSING), flags={"dead_reckoning": "dead reckoning"},
-        initial=True, begin="dead reckoning", end="dead reckoning ends",
+        initial=True, begin="dead reckoning", end="dead reckoning ended",
     ),
     Kind(
         "estimator_fault", "watch", _FLAGS, ("text",), flags=FAULTS, initial=True, begin="EKF fault: {}",
@@ -126,7 +126,7 @@ _ROWS: Final = (
     Kind(
         "not_fused", "watch", _FLAGS,
         ("gps_fix_lost", "few_satellites", *_JAMMED, "innovation_rejected", "estimator_fault"), on_ground="info",
-        flags=FUSED, bad=False, minor=frozenset(HEIGHTS), begin="no longer fused: {}", end="fused: {}",
+        flags=FUSED, bad=False, minor=frozenset(HEIGHTS), begin="EKF stopped fusing {}", end="EKF started fusing {}",
     ),
     _not_global("xy"),
     _not_global("z"),
@@ -139,8 +139,8 @@ _ROWS: Final = (
     Kind("origin_set", "info", _ESTIMATE, _SENSING, correction=True),
     Kind(
         "gcs_lost", "watch", "VehicleStatus", ("text",), on_ground="info",
-        flags={"gcs_connection_lost": "ground station"},
-        begin="link to the ground station lost", end="link to the ground station restored",
+        flags={"gcs_connection_lost": "GCS connection"},
+        begin="GCS connection lost", end="GCS connection regained",
     ),
     Kind(
         "failsafe_flag", "watch", "FailsafeFlags", ("text", *_INVALID, *_SENSING), on_ground="info",
@@ -180,24 +180,24 @@ class _Kinds(dict[str, Kind]):
 
 
 KINDS: Final = _Kinds({kind.name: kind for kind in _ROWS})
-"""All kinds of events by name, the most important condition first; a name from a newer service has a plain kind."""
+"""All kinds of events by name, the most important first; unknown names, as from a newer service, get a default kind."""
 
 
 def importance(kind: str) -> int:
-    """Return the place of a kind in KINDS."""
+    """Return the rank of a kind in KINDS; 0 is the most important."""
     return [*KINDS, kind].index(kind)
 
 
 def rank_vehicle(name: str, severity: Severity) -> tuple[int, str]:
-    """Return the sort key of vehicles: the worst first, then in natural order (2 before 10)."""
+    """Return a sort key for vehicles: worst severity first, then natural order of names (2 before 10)."""
     return SEVERITIES.index(severity), re.sub(r"\d+", lambda found: found[0].zfill(20), name)
 
 
 def flagged(message: str) -> list[Kind]:
-    """Return the kinds that are flags of a message."""
+    """Return the kinds detected from flags of a message."""
     return [kind for kind in KINDS.values() if kind.message == message and kind.flags]
 
 
 def kinds_of(message: str) -> frozenset[str]:
-    """Return the names of the kinds that are detected in a message."""
+    """Return the names of all kinds detected in a message."""
     return frozenset(kind.name for kind in KINDS.values() if kind.message == message)

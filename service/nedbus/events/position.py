@@ -1,4 +1,4 @@
-"""Event detector of the position estimate: flags, resets, origin changes, and unexplained jumps."""
+"""Event detector for the position estimate: flags, resets, origin changes and unexplained jumps."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,11 +17,10 @@ _COMPARED: Final = (
     "xy_valid", *(flag for kind in _KINDS for flag in kind.flags if flag != "xy_valid"), *RESET_COUNTERS.values(),
     "ref_timestamp",
 )  # fmt: skip
-_MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; a smaller step cannot be a jump at any velocity
-_MAX_INTERVAL: Final = 0.5  # s between two messages; longer intervals are not checked for jumps
-_SURE_INTERVAL: Final = 0.1  # s; over a longer one, motion by the rates at its ends is less certain
-# Of each quantity that may be reset: its values, the rates that may have moved each of them, the numbers of its event,
-# and the text.
+_MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; smaller steps are never jumps
+_MAX_INTERVAL: Final = 0.5  # s between messages; longer intervals are not checked for jumps
+_SURE_INTERVAL: Final = 0.1  # s; beyond, rates at the two ends do not give the motion accurately
+# By quantity with a reset counter: its fields, rates of change of each field, names in the event's `numbers`, text.
 _Quantity = tuple[tuple[str, ...], tuple[tuple[str, ...], ...], tuple[str, ...], str]
 _RESETS: Final[Mapping[Quantity, _Quantity]] = {
     "xy": (
@@ -33,7 +32,7 @@ _RESETS: Final[Mapping[Quantity, _Quantity]] = {
     "heading": (("heading",), ((),), ("heading",), "heading by {degrees:z.0f} deg"),
 }  # fmt: skip
 _ORIGIN: Final = ("ref_lat", "ref_lon", "ref_alt")
-# Fields read when a compared one changes, with their values if absent.
+# Fields read when a compared field changes, with their defaults.
 _CONTEXT: Final = dict.fromkeys(
     (
         *(f"delta_{name}" for name in _RESETS),
@@ -47,7 +46,7 @@ Step = tuple[float, float, float]  # begin [s], unexplained motion north and eas
 
 
 class PositionDetector(ChangeDetector):
-    """Detector of a VehicleLocalPosition, or of another estimate with the same fields."""
+    """Detector for VehicleLocalPosition and other estimates with the same fields."""
 
     def __init__(self) -> None:
         super().__init__(_COMPARED, [*_CONTEXT], self._detect_position)
@@ -57,7 +56,7 @@ class PositionDetector(ChangeDetector):
         self._jump: Step | None = None  # in progress
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the findings of a message, None if nothing has changed."""
+        """Return the findings in a message, None if nothing has changed."""
         before, motion = self._motion, self._read_motion(message)
         self._motion_before, self._motion = before, motion
         if (found := super().add(message, missing)) is not None:
@@ -68,7 +67,7 @@ class PositionDetector(ChangeDetector):
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """The flags that the last message did not provide."""
+        """Flags that the last message did not provide."""
         last, absent = zip(_COMPARED, self._state, strict=False), self.missing
         return tuple(name for name, value in last if value is None or name in absent)
 
@@ -93,7 +92,7 @@ class PositionDetector(ChangeDetector):
         yield from detect_flags(_KINDS, before, after)
 
     def _unexplained_step(self) -> Step | None:
-        """Return the motion since the last message that the velocity does not explain, None if it is small."""
+        """Return the motion since the last message that velocity does not explain; None if below the jump limit."""
         seconds = (self.stamp - self.earlier) / 1e6
         if not 0 < seconds <= _MAX_INTERVAL:
             return None
@@ -109,13 +108,13 @@ class PositionDetector(ChangeDetector):
             self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
         elif jump is not None:
             distance, seconds = math.hypot(*jump[1:]), self.stamp / 1e6 - jump[0]
-            text = f"position jumps by {distance:.1f} m within {seconds:.2f} s, without a reset"
+            text = f"position jumped by {distance:.1f} m in {seconds:.2f} s without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
             yield Finding("jump", "once", text, numbers=numbers)
 
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
-    """Return the finding of a reset, with the size of each quantity that the data has."""
+    """Return the finding of a reset, with the size of the step in each quantity if known."""
     numbers: dict[str, float] = {}
     known, unknown = [], []
     for name in quantities:
@@ -133,9 +132,9 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
 
 
 def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:
-    """Return the step between two messages at a reset, None if unknown.
+    """Return the size of a reset between two messages, None if unknown.
 
-    It is the delta if the data agrees with it, else the difference of the two samples less the motion meanwhile.
+    This is the message's delta if the data confirms it, else the difference of the samples minus the motion in between.
     """
     values, rates, *_ = _RESETS[name]
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
@@ -143,27 +142,27 @@ def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float
     observed = observed if name != "heading" else [*map(wrap, observed)]
     count = (after[RESET_COUNTERS[name]] - before[RESET_COUNTERS[name]]) % 256
     delta = after[f"delta_{name}"]
-    told = delta if isinstance(delta, tuple) else (delta,)
-    is_told = count == 1 and all(map(math.isfinite, told))
+    reported = delta if isinstance(delta, tuple) else (delta,)
+    is_reported = count == 1 and all(map(math.isfinite, reported))
     if not all(map(math.isfinite, observed)):
-        return told if is_told else None
-    # Velocity changes at an unknown moment between the two, and z need not move with vz: each rate is possible.
+        return reported if is_reported else None
+    # Velocity changes at an unknown time between the two, and vz need not be the rate of z: allow for each rate.
     motions = [
         [rate * seconds for of in names for rate in (before[of], after[of]) if math.isfinite(rate)] or [0.0]
         for names in rates
     ]
     margin = SMALL_RESET * max(1.0, seconds / _SURE_INTERVAL)
-    if is_told and all(
+    if is_reported and all(
         min(0.0, *motion) - margin <= step - size <= max(0.0, *motion) + margin
-        for step, size, motion in zip(observed, told, motions, strict=True)
+        for step, size, motion in zip(observed, reported, motions, strict=True)
     ):
-        return told
+        return reported
     steps = tuple(step - sum(motion[:2]) / len(motion[:2]) for step, motion in zip(observed, motions, strict=True))
-    return steps if is_told or 0 < seconds <= _MAX_INTERVAL else None
+    return steps if is_reported or 0 < seconds <= _MAX_INTERVAL else None
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield an origin that is set or moved; a change of its timestamp alone is ignored."""
+    """Yield an origin that was set or moved; a change of `ref_timestamp` alone is ignored."""
     had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
     if has and not had:
         text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"

@@ -1,4 +1,4 @@
-"""The account that a service sends to its peers: recent events, and the state of each vehicle."""
+"""Report from a service to its peers: recent events, and the state of each vehicle."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import check_vehicle
 
-from .account import KEPT, MAX_VEHICLES, Account
 from .event import Condition, Event, Seconds
+from .event_log import KEPT, MAX_VEHICLES, EventLog
 from .kinds import KINDS, rank_vehicle
 
 ACCOUNT_PARAMETER: Final = "events"
-"""Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
+"""Parameter of a status query that requests this report instead of the status; its value is the period [s]."""
 
 _MAX_TOPICS: Final = 30  # per vehicle
 _Name = Annotated[str, AfterValidator(check_vehicle)]
@@ -24,10 +24,10 @@ _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """The state of one vehicle: severity ("info" if all is well), text, begin, and the kinds of its conditions.
+    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, kinds of all.
 
-    `flags`: validity flags of its position that are false, each with its begin if known. `topics`: published topics.
-    `has_position`: True if it publishes a position. `held`: active conditions whose begin is not among the events.
+    `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
+    `has_position`: it publishes a position. `held`: active conditions whose begin is not among the events.
     `unknown`: flags that its position does not provide.
     """
 
@@ -43,7 +43,7 @@ class VehicleReport:
 
     @property
     def is_silent(self) -> bool:
-        """True if no messages arrive from the vehicle."""
+        """True if no message arrives from the vehicle."""
         return "silent" in self.kinds or "gone" in self.kinds
 
     def is_forgotten(self, now: float) -> bool:
@@ -53,7 +53,7 @@ class VehicleReport:
 
 @dataclass(frozen=True, slots=True)
 class AccountReport:
-    """The account of one service; times are seconds since the epoch by the clock of its host."""
+    """Report of one service; times are Unix times by its host's clock [s]."""
 
     service: str
     host: str
@@ -62,7 +62,7 @@ class AccountReport:
     events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
 
     def split(self, number: int) -> list[AccountReport]:
-        """Return the report in at least two, about `number` parts; none if it has at most one vehicle and one event."""
+        """Split the report into about `number` parts, at least two; [] if it has at most one vehicle and one event."""
         vehicles, events = list(self.vehicles.items()), self.events
         many, some = -(-len(vehicles) // number), -(-len(events) // number)
         return [
@@ -75,17 +75,17 @@ _REPORT: Final = TypeAdapter(AccountReport)
 
 
 def report_of(
-    account: Account, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
+    event_log: EventLog, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
 ) -> AccountReport:
-    """Return a report of all events kept of the last `within` seconds, and the state of each vehicle.
+    """Return a report of the events in the last `within` seconds, and the state of each vehicle.
 
-    `now`: by the account's clock [s]; `to_utc`: what its times need to become Unix time [s].
+    `now`: time on the event log's clock [s]; `to_utc`: offset from that clock to Unix time [s].
     """
-    events = [event for event in account.events if event.time > now - within]
+    events = [event for event in event_log.events if event.time > now - within]
     reported = {event.identity for event in events}
     vehicles = {}
-    for name, vehicle in list(account.vehicles.items()):
-        state = account.state(name, now)
+    for name, vehicle in list(event_log.vehicles.items()):
+        state = event_log.state(name, now)
         held = list(vehicle.conditions.items())
         flags = {flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if KINDS[kind].validity}
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
@@ -100,13 +100,13 @@ def report_of(
 
 
 def joined(parts: Sequence[AccountReport]) -> AccountReport:
-    """Return the report that a service has sent in these parts."""
+    """Join the parts of a report."""
     vehicles = {name: vehicle for part in parts for name, vehicle in part.vehicles.items()}
     return replace(parts[0], vehicles=vehicles, events=tuple(event for part in parts for event in part.events))
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
-    """Return a report for each vehicle, the worst first, preferably from a service that hears the vehicle."""
+    """Return one report per vehicle, worst vehicle first, preferably from a service that receives its messages."""
     found: dict[str, AccountReport] = {}
     for report in reports:
         for name in report.vehicles:
@@ -116,7 +116,7 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 
 
 def from_json(content: object) -> AccountReport | None:
-    """Parse the reply of a peer; return None if it is not a report, such as the reply of an older service."""
+    """Validate the reply of a peer; return None if it is not a report, as from an older service."""
     try:
         return _REPORT.validate_python(content)
     except ValidationError:

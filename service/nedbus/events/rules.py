@@ -1,4 +1,4 @@
-"""Labels of flags, thresholds, and names of modes, for the table of kinds and the event detectors."""
+"""Flag labels, thresholds and mode names for the table of kinds and the event detectors."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -8,9 +8,9 @@ _AIDING: Final = {
     "cs_ev_vel": "vision velocity", "cs_opt_flow": "optical flow", "cs_aux_gpos": "auxiliary position",
 }  # fmt: skip
 FAKE_AIDING: Final = {"cs_fake_pos": "fake position", "cs_valid_fake_pos": "valid fake position"}
-"""What the EKF fuses in place of a measured position, for as long as it trusts that."""
+"""Fake position measurements, which the EKF fuses in the absence of horizontal aiding."""
 AIDING: Final[Mapping[str, str]] = {**_AIDING, **FAKE_AIDING}
-"""All horizontal aiding."""
+"""All sources of horizontal aiding."""
 
 HEIGHTS: Final = {
     "cs_gps_hgt": "GNSS height", "cs_gnss_yaw": "GNSS yaw", "cs_ev_yaw": "vision yaw", "cs_ev_hgt": "vision height",
@@ -22,12 +22,12 @@ FAULTS: Final = {
     "cs_rng_fault": "range finder", "cs_gnss_yaw_fault": "GNSS yaw", "cs_ev_yaw_fault": "vision yaw",
     "cs_baro_fault": "barometer", "cs_gnss_fault": "GNSS", "cs_gnss_hgt_fault": "GNSS height",
     "fs_bad_mag_x": "magnetometer x", "fs_bad_mag_y": "magnetometer y", "fs_bad_mag_z": "magnetometer z",
-    "fs_bad_hdg": "heading", "fs_bad_mag_decl": "declination", "fs_bad_airspeed": "airspeed",
+    "fs_bad_hdg": "heading", "fs_bad_mag_decl": "magnetic declination", "fs_bad_airspeed": "airspeed",
     "fs_bad_sideslip": "sideslip", "fs_bad_optflow_x": "optical flow x", "fs_bad_optflow_y": "optical flow y",
-    "fs_bad_acc_vertical": "accelerometer, vertical", "fs_bad_acc_clipping": "accelerometer clipping",
-    "fs_bad_acc_bias": "accelerometer bias", "fs_bad_vel_n": "velocity north", "fs_bad_vel_e": "velocity east",
-    "fs_bad_vel_d": "velocity down", "fs_bad_pos_n": "position north", "fs_bad_pos_e": "position east",
-    "fs_bad_pos_d": "position down",
+    "fs_bad_acc_vertical": "vertical accelerometer", "fs_bad_acc_clipping": "accelerometer clipping",
+    "fs_bad_acc_bias": "accelerometer bias", "fs_bad_vel_n": "north velocity", "fs_bad_vel_e": "east velocity",
+    "fs_bad_vel_d": "vertical velocity", "fs_bad_pos_n": "north position", "fs_bad_pos_e": "east position",
+    "fs_bad_pos_d": "vertical position",
 }  # fmt: skip
 REJECTED: Final = {
     "reject_hor_vel": "horizontal velocity", "reject_ver_vel": "vertical velocity",
@@ -45,41 +45,41 @@ _FAILSAFE_FLAGS: Final = (
     "navigator_failure", "parachute_unhealthy", "traffic_avoidance_unhealthy", "remote_id_unhealthy", "gnss_lost",
 )  # fmt: skip
 FAILSAFE_FLAGS: Final[Mapping[str, str]] = {
-    **{name: name.replace("_relaxed", " by relaxed limits").replace("_", " ") for name in _FAILSAFE_FLAGS},
-    "fd_critical_failure": "attitude or altitude beyond its limit", "fd_esc_arming_failure": "ESC failed to arm",
+    **{name: name.replace("_relaxed", " (relaxed limits)").replace("_", " ") for name in _FAILSAFE_FLAGS},
+    "fd_critical_failure": "attitude or altitude limit exceeded", "fd_esc_arming_failure": "ESC failed to arm",
     "fd_imbalanced_prop": "imbalanced propeller", "fd_motor_failure": "motor failure",
-    "fd_alt_loss": "uncommanded loss of altitude",
+    "fd_alt_loss": "uncommanded altitude loss",
 }  # fmt: skip
 
 POSITIONS: Final = ("vehicle_local_position", "external_ins_local_position", "estimator_local_position")
-"""Topics with the validity of the position, in order of preference."""
+"""Topics with position validity flags, in order of preference."""
 
 RECENT: Final = 60.0
-"""Seconds during which a single event counts towards the state of a vehicle."""
+"""Seconds for which a single event affects the state of a vehicle."""
 
-MAX_SILENCE: Final = 3.0  # s without a position until a vehicle is silent, if its stream has no state
-MIN_FIX_TYPE: Final = 3  # SensorGps.fix_type of a 3D fix
+MAX_SILENCE: Final = 3.0  # s without a position after which a vehicle is silent, if the state of its stream is unknown
+MIN_FIX_TYPE: Final = 3  # SensorGps.FIX_TYPE_3D
 FEW_SATELLITES: Final = 6  # the condition begins below this (PX4's EKF2_REQ_NSATS) and ends at ENOUGH_SATELLITES
 ENOUGH_SATELLITES: Final = 7
 JAMMING_BEGIN: Final = 80  # jamming_indicator; "too high" in PX4's guide to flight log analysis
 JAMMING_END: Final = 60
-JUMP_DISTANCE: Final = 1.0  # m of unexplained motion; JUMP_SHARE of the distance flown is added
+JUMP_DISTANCE: Final = 1.0  # m of unexplained motion, plus JUMP_SHARE of the distance flown
 JUMP_SHARE: Final = 0.2
-LARGE_CORRECTION: Final = 10.0  # m or m/s; a verdict begins with a larger reset or jump if no fault is bad
-SMALL_RESET: Final = 0.5  # m or m/s; the severity of a smaller reset is info
-# A reference contradicts a valid estimate that is off by more than this limit, the share of the height, SIGMAS of the
-# receiver's accuracy, and the way flown in its delay. Healthy logs: at most 2.9 m, and 2.2 m at 18 m/s.
-HEIGHT_LIMIT: Final = 8.0  # m; twice that and all that is added if there is only one reference
+LARGE_CORRECTION: Final = 10.0  # m or m/s; without a bad fault, a larger reset or jump heads the verdict
+SMALL_RESET: Final = 0.5  # m or m/s; a smaller reset is info
+# A reference contradicts a valid estimate beyond the limit plus HEIGHT_SHARE of the height, SIGMAS of the receiver's
+# accuracy, and the distance flown during GNSS_DELAY. Maxima in healthy logs: 2.9 m, and 2.2 m at 18 m/s.
+HEIGHT_LIMIT: Final = 8.0  # m; the whole limit is doubled if there is only one reference
 HEIGHT_SHARE: Final = 0.05
 POSITION_LIMIT: Final = 4.0  # m
 GNSS_DELAY: Final = 0.5  # s
 SIGMAS: Final = 3.0
-UNKNOWN_ACCURACY: Final = 10.0  # m
-CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all references must contradict the estimate
-FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of a kind of them, within WINDOW; of further ones only the last
-MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; of further ones only the last
-PAUSE: Final = 5.0  # s without a further one after which flapping, losses, rejections or an overload have ended
-MAX_BURST: Final = 20.0  # s after which losses are reported even if they continue
+UNKNOWN_ACCURACY: Final = 10.0  # m, in place of a missing eph or epv
+CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all references must disagree with the estimate
+FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of its kind, within WINDOW; beyond, only the last is reported
+MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; beyond, only the last is reported
+PAUSE: Final = 5.0  # s without a recurrence after which flapping, losses, rejections or an overload have ended
+MAX_BURST: Final = 20.0  # s after which continuing losses are reported
 
 MODES: Final[Mapping[int, str]] = {
     0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 6: "Position Slow",
@@ -87,7 +87,7 @@ MODES: Final[Mapping[int, str]] = {
     15: "Stabilized", 17: "Takeoff", 18: "Land", 19: "Follow", 20: "Precision Land", 21: "Orbit", 22: "VTOL Takeoff",
     **{number: f"External {number - 22}" for number in range(23, 31)},
 }  # fmt: skip
-"""Names of nav_state in QGroundControl."""
+"""Flight mode names by nav_state, as in QGroundControl."""
 
 FIXES: Final[Mapping[int, str]] = {
     0: "none", 1: "none", 2: "2D", 3: "3D", 4: "DGPS", 5: "RTK float", 6: "RTK fixed", 8: "extrapolated",
@@ -98,4 +98,4 @@ WARNINGS: Final[Mapping[int, str]] = {
 LEVELS: Final[Mapping[int, str]] = dict(
     enumerate(("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"))
 )
-"""Names of LogMessage.severity, as in MAVLink."""
+"""Names of LogMessage.severity, as in MAV_SEVERITY."""

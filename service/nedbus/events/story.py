@@ -1,4 +1,4 @@
-"""Stories for `nedbus why`: each fault with its duration, evidence, and the topics that lack evidence."""
+"""Stories for `nedbus why`: each fault with its period, its evidence, and missing topics that may have more."""
 
 import math
 from collections.abc import Collection, Iterable, Sequence
@@ -10,22 +10,22 @@ from .kinds import KINDS, importance
 from .rules import RECENT
 from .times import Times
 
-TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
+TOGETHER: Final = 1.0  # s between the starts of conditions of one story
 _INVALID: Final = " not valid"
 _GPS: Final = "vehicle_gps_position"
 _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
-"""Topics with evidence about an invalid estimate."""
+"""Topics that may explain an invalid estimate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span(Condition):
-    """A condition with its end: the time `until` and the event `end`, both None while it is active."""
+    """A condition with its end, the time `until` and the event `end`; both are None while it is active."""
 
     until: float | None = None
     end: Event | None = None
 
     def holds(self, time: float) -> bool:
-        """Return True if the condition is active at a time, or a single event is recent."""
+        """Return True if the condition is active at `time`, or the single event is recent."""
         until = math.inf if self.until is None else self.until + RECENT * (self.until == self.since)
         return self.since <= time < until
 
@@ -35,10 +35,10 @@ class Story:
     """One fault of a vehicle.
 
     `spans`: its conditions, the main one first. `what`: their text.
-    `since`, `until`: by the account's clock [s]; `until` is None while it is active.
-    `begin`: the event that began it, None if it already held in the first message. `end`: the event that ended it.
-    `before`: the evidence, oldest first. `meanwhile`: other events until its end. `after`: events at its end.
-    `lacking`: topics that could have evidence, but are not in the data.
+    `since`, `until`: times on the event log's clock [s]; `until` is None while it is active.
+    `begin`: the event that began it, None if it was active in the first message. `end`: the event that ended it.
+    `before`: the evidence, oldest first. `meanwhile`: other events during the fault. `after`: events at its end.
+    `lacking`: topics missing from the data that may have evidence.
     """
 
     spans: tuple[Span, ...]
@@ -58,7 +58,7 @@ class Story:
         return any(each.severity == "bad" for each in self.spans)
 
     def when(self, times: Times, now: float) -> str:
-        """Return when it held, and for how long; `now` is the end of a file."""
+        """Format the period of the fault; `now`: the current time, or the end of the file."""
         return times.period(self.begin, self.end, (now if self.until is None else self.until) - self.since)
 
 
@@ -69,10 +69,10 @@ def stories_of(
     topics: Collection[str] = (),
     at: float | None = None,
 ) -> list[Story]:
-    """Return the stories of one vehicle in order of time; empty if it has no faults.
+    """Return the stories of one vehicle in order of time; [] if it has no faults.
 
-    `events`: all events of the vehicle, in order. `conditions`: those active after the last event.
-    `topics`: the topics that the vehicle publishes. `at`: return only the stories at this time, or the last one before.
+    `events`: all events of the vehicle, in order. `conditions`: conditions active after the last event.
+    `topics`: published topics. `at`: return only stories active at this time, else the last one before.
     """
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
     chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
@@ -94,7 +94,7 @@ def stories_of(
 def story_of(
     event: Event, events: Sequence[Event], conditions: Iterable[Condition] = (), *, topics: Collection[str] = ()
 ) -> Story | None:
-    """Return the story of the condition that an event begins or ends, or of a single event."""
+    """Return the story of a single event, or of the condition that an event begins or ends."""
     spans = spans_of(events, conditions)
     ends = ((span, each) for span in spans for each in (span.begin, span.end) if each is not None)
     span = next((span for span, each in ends if each.identity == event.identity), None)
@@ -102,9 +102,9 @@ def story_of(
 
 
 def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
-    """Return the conditions and single events of one vehicle, ordered by begin.
+    """Return the conditions and single events of one vehicle as spans, ordered by start.
 
-    `conditions`: active or initial conditions; those whose begin is not among the events are added.
+    `conditions`: active or initial conditions, added if their begin is not among the events.
     """
     known = {event.identity for event in events}
     unreported = [
@@ -119,7 +119,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
         ended = dict.fromkeys([active.pop(key) for key in keys if key in active])
         spans.extend(replace(span, until=event.time, end=event) for span in ended)
 
-    def order(step: Event | Span) -> tuple[float, bool, bool]:  # at equal times reboots, initial conditions, others
+    def order(step: Event | Span) -> tuple[float, bool, bool]:  # at equal times: reboots, initial conditions, others
         return (step.since, True, False) if isinstance(step, Span) else (step.time, step.kind != "reboot", True)
 
     steps: list[Event | Span] = [*events, *(each for each in unreported if each.initial)]
@@ -134,7 +134,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
             spans.append(Span(step.kind, step.severity, step.text, step.time, step, until=step.time))
             if step.kind == "reboot":
                 end([key for key in active if not KINDS[key[0]].kept_on_reboot], step)
-        elif step.kind != "duplicate" or keys[0] not in active:  # each of its services reports a duplicate
+        elif step.kind != "duplicate" or keys[0] not in active:  # every service of the vehicle reports a duplicate
             end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
             since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
             active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))
@@ -144,14 +144,14 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
 
 
 def state_at(spans: Iterable[Span], time: float) -> State:
-    """Return the state of a vehicle at a time."""
+    """Return the state of the vehicle at `time`."""
     return state_of(span for span in spans if span.holds(time))
 
 
 def _make_story(
     group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str]
 ) -> Story:
-    """Return the story of a group of conditions; its begin and evidence are those of the first."""
+    """Return the story of a group of conditions; start and evidence are those of the first one."""
     span = group[0]
     until = None if any(each.until is None for each in group) else max(each.until or 0.0 for each in group)
     end = next((each.end for each in group if each.end is not None and each.until == until), None)
@@ -186,7 +186,7 @@ def _make_story(
 
 
 def _without_parts(stories: Sequence[Story]) -> list[Story]:
-    """Drop stories that are part of an earlier bad story, or evidence of a bad story."""
+    """Drop stories that are part of an earlier bad story, or evidence for a bad story."""
     kept: list[Story] = []
     for story in stories:
         if not any(_is_part(story, each) for each in kept):
@@ -196,7 +196,7 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _is_part(story: Story, of: Story) -> bool:
-    """Return True if a story is part of another, and neither more important nor a lasting one that outlasts it."""
+    """Return True if a story is part of another one, unless it is bad and more important or outlasts it."""
     begin, kind = story.spans[0].begin, story.spans[0].kind
     if not of.is_bad or begin not in (*of.before, *of.meanwhile, *of.after):
         return False
@@ -206,7 +206,7 @@ def _is_part(story: Story, of: Story) -> bool:
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
-    """Return a span and all that belong to the same story: validity lost with it, or held throughout like it."""
+    """Return all spans of one story: `span`, and validity lost with it, or initial conditions like it."""
 
     def is_part(each: Span) -> bool:
         if KINDS[span.kind].validity:

@@ -1,4 +1,4 @@
-"""Formatting and parsing of times, as UTC if known or as seconds since boot, and of durations."""
+"""Times of events as text: UTC if known, else seconds since boot; and durations."""
 
 import math
 import re
@@ -17,14 +17,14 @@ CLOCKS: Final[Mapping[str, str]] = {
     "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
     "boot": "seconds since boot, no message contains UTC", "start": "seconds since the start of the recording",
 }  # fmt: skip
-"""The clocks of times. UTC and seconds since boot may differ between vehicles."""
+"""Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Conversion of event times to UTC, for live data or for a file.
+    """Conversion of event times to UTC, for live data or a file.
 
-    `is_live`: the account's clock is the clock of this host, `ahead` seconds behind Unix time.
+    `is_live`: event times are on a clock of this host, which is `ahead` seconds behind Unix time.
     `offsets`: Unix time minus time since boot [s], for each vehicle whose messages contain it.
     """
 
@@ -39,45 +39,45 @@ class Times:
         return None if event.boot is None else self.utc_of_boot(event.vehicle, event.boot)
 
     def utc_of_boot(self, vehicle: str, boot: float) -> float | None:
-        """Return the Unix time of a time since a vehicle's boot [s], which may be Unix time already."""
+        """Convert a time since a vehicle's boot to Unix time [s]; `boot` may be Unix time already. None if unknown."""
         utc = boot + (0.0 if is_unix_time(boot * 1e6) else self.offsets.get(vehicle, math.nan))
         return utc if is_unix_time(utc * 1e6) else None
 
     def clock(self, event: Event) -> str:
-        """Return the clock of an event's time, a key of CLOCKS."""
+        """Return the key in CLOCKS of the clock used for an event."""
         if self.is_live or self.utc(event) is not None:
             return "host" if self.is_live else "vehicle"
         return "start" if event.boot is None else "boot"
 
     def text(self, event: Event) -> str:
-        """Format the time of an event, without a date, as `find` reads it: 14:05:12.3, 123.400 or +12.300."""
+        """Format the time of an event without date, as `find` parses it: 14:05:12.3, 123.400 or +12.300."""
         utc = self.utc(event)
         if utc is None:
             return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"
-        return to_clock(utc)
+        return format_utc(utc)
 
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
-        """Format when something held, and for how long [s]; None: from the first message, or until the last one."""
+        """Format a period and its duration [s]; None: since before the first message, or until after the last."""
         still = f"until {'now' if self.is_live else 'the end'}"
         if begin is None:
-            return f"from the first message on, {still} ({to_age(lasted)})"
+            return f"from the first message {still} ({format_duration(lasted)})"
         since = f"{self.text(begin)} {unit_of(self.clock(begin))}"
         if end is None:
-            return f"at {since}" if lasted == 0 else f"from {since}, {still} ({to_age(lasted)})"
-        return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({to_age(lasted)})"
+            return f"at {since}" if lasted == 0 else f"from {since}, {still} ({format_duration(lasted)})"
+        return f"from {self.text(begin)} to {self.text(end)} {unit_of(self.clock(end))} ({format_duration(lasted)})"
 
     def find(self, text: str, near: Event) -> float:
-        """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the account's time [s].
+        """Parse 14:05:12 (UTC), 123.4 (since boot) or +12.3 (since the start); return the event log's time [s].
 
-        `near`: an event of the same vehicle; the closest such time is returned.
+        `near`: an event of the same vehicle; an ambiguous time resolves to the one closest to it.
 
-        Raises ValueError for other text, or if no message gives UTC or the time since boot, or live data has no start.
+        Raises ValueError for other text, for UTC or time since boot if no message contains it, for +12.3 in live data.
         """
         text = text.strip()
         if found := _CLOCK.fullmatch(text):
             utc = self.utc(near)
             if utc is None:
-                raise ValueError("no message of this vehicle gives UTC")
+                raise ValueError("no message of this vehicle has UTC")
             midnight = datetime.fromtimestamp(utc, UTC).replace(hour=0, minute=0, second=0, microsecond=0)
             since = timedelta(hours=int(found[1]), minutes=int(found[2]), seconds=float(found[3] or 0))
             step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200  # closest, also across midnight
@@ -90,25 +90,25 @@ class Times:
             raise ValueError("not a time")
         if text[0] in "+-":
             if self.is_live:
-                raise ValueError("live data has no start to count from")
+                raise ValueError("live data has no start")
             return seconds
         if near.boot is None and self.is_live:
-            raise ValueError("no message of this vehicle gives the time since boot")
+            raise ValueError("no message of this vehicle has the time since boot")
         return near.time + seconds - (near.time if near.boot is None else near.boot)
 
 
 def unit_of(clock: str) -> str:
-    """Return the unit of the times of a clock."""
+    """Return the unit of a clock's times: UTC, or s with its epoch."""
     return CLOCKS[clock].partition(",")[0].replace("seconds", "s")
 
 
-def to_clock(utc: float) -> str:
+def format_utc(utc: float) -> str:
     """Format a Unix time as UTC, such as 14:05:12.3."""
     tenths = round(utc * 10)
     return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"
 
 
-def to_age(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration [s] in ms, s, min or h."""
     if seconds < 1:
         return f"{max(0.0, seconds) * 1e3:.0f} ms"
@@ -117,6 +117,6 @@ def to_age(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
 
 
-def since_text(since: float | None, now: float) -> str:
-    """Format the begin of a condition as a suffix of its text; "" if unknown."""
-    return "" if since is None else f", since {to_clock(since)} UTC ({to_age(now - since)})"
+def format_since(since: float | None, now: float) -> str:
+    """Format the begin of a condition as a suffix for its text; "" if unknown."""
+    return "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"

@@ -1,4 +1,4 @@
-"""The state of one vehicle: detectors of its streams, active conditions, and recent events."""
+"""State of one vehicle: detectors for its streams, active conditions and recent events."""
 
 from __future__ import annotations
 
@@ -18,61 +18,60 @@ from .event import WINDOW, Condition, Event, State, explain, state_of
 from .kinds import KINDS, kinds_of
 from .position import PositionDetector
 from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
-from .times import to_age
+from .times import format_duration
 
 _EKF: Final = "estimator_status_flags"
-_REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
+_REBOOT: Final = 1_000_000  # us; a larger step back in time is a reboot, a smaller one is reordering
 _MAX_RECENT: Final = 100
-_MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
+_MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
-# Groups of topics in order of preference: the best one that arrives gives the conditions of its message.
+# Groups of topics in order of preference; conditions come from the best one received.
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _GROUPS: Final = (POSITIONS, _RECEIVERS)
-_SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # by which two estimates are equal
+_SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = detectors.FieldReader(_SAMPLE)
 
 
 class Vehicle:
-    """The events and conditions of one vehicle.
+    """Events and conditions of one vehicle.
 
-    `on_event` is called with each event. `common` has the conditions that concern all vehicles.
+    `on_event`: callback for each event. `common`: holder of the conditions that concern all vehicles.
 
-    `conditions`: active conditions by kind and flag. `initial`: conditions that held in the first messages.
-    `topics`: the topics that it publishes.
-    `main`: the address of the position estimate in use: vehicle_local_position if published, else another estimate.
-    `heard`: time of the last message, by the account's clock [s], or of the last update while it has a publisher.
-    `time`: time of the last message with a detector. `boot`: its time since boot [s].
-    `recent`: the most recent events, searched for evidence.
+    `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
+    `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
+    `last_seen`: time of the last message on the event log's clock [s], or of the last update with a live publisher.
+    `time`: time of the last message with a detector [s]. `boot`: its time since boot [s].
+    `recent`: recent events, searched for evidence.
     """
 
     def __init__(self, name: str, on_event: Callable[[Event], None], common: Vehicle | None = None) -> None:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
-        self._on_ground: dict[tuple[str, str], Condition] = {}  # of the first messages, which count once it is armed
+        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; active once it is armed
         self._armed_at = math.inf
         self.topics: set[str] = set()
         self.main: Address | None = None
         self.armed: bool | None = None
-        self.time = self.heard = 0.0
+        self.time = self.last_seen = 0.0
         self.boot: float | None = None
         self._on_event = on_event
         self._common = common
         self.recent: deque[Event] = deque(maxlen=_MAX_RECENT)
         self._detectors: dict[Address, ChangeDetector | None] = {}
-        self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use of each group
+        self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use, by group
         self._main_time = math.inf  # time of the last position
         self._rebooted = -math.inf
-        self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}  # of a condition, and of a kind
+        self._changes: dict[tuple[str, tuple[str, ...] | None], deque[Event]] = {}  # by condition, and by kind
         self._suppressed: Counter[tuple[str, tuple[str, ...] | None]] = Counter()  # changes of flapping conditions
-        self._bursts: dict[str, _Burst] = {}  # of messages lost or rejected, and ms of dropouts, by kind
-        self._ekf = 0  # instance of the EKF in use
+        self._bursts: dict[str, _Burst] = {}  # lost and rejected messages and dropouts [ms], by kind
+        self._ekf = 0  # instance of the primary EKF
         self._position: PositionDetector | None = None  # of `main`
         self._comparison = Comparison(lambda: self._position)
-        self._equal: dict[int, bool] = {}  # by EKF, if its estimate is the vehicle's
+        self._equal: dict[int, bool] = {}  # by EKF: its estimate equals the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
-        """Add a message; `lost` is the number of messages lost before it."""
+        """Add a message; `lost`: number of messages lost before it."""
         if lost:
             self._count("lost", time, lost, address.stream)
         try:
@@ -93,9 +92,9 @@ class Vehicle:
             self._main_time = time
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
-                    self.emit(Finding(kind, "end", f"{address.stream} is back"), address.topic, time)
-        # If the message before the last one is close in time, the last one was damaged: no reboot.
-        # PX4's texts wait in queues, and a log may begin with old ones.
+                    self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
+        # If the message before the previous one is close in time, the previous one was damaged: no reboot.
+        # PX4's texts are queued, and a log may begin with old ones.
         is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
         if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
@@ -109,7 +108,7 @@ class Vehicle:
                 self._use_ekf(int(each.numbers["to"]))
 
     def add_dropout(self, seconds: float, time: float) -> None:
-        """Record that the logger recorded nothing from `time` on; the vehicle is not silent meanwhile."""
+        """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
         self._count("dropout", time, round(1e3 * seconds))
         if self.main is not None:
             self._main_time = max(self._main_time, time + seconds)
@@ -122,7 +121,7 @@ class Vehicle:
         self._count("rejected", time, 1, topic)
 
     def settle(self, time: float) -> None:
-        """Report bursts of losses and rejections, and flapping, that have ended, and what a flight began without."""
+        """Report bursts and flapping that have ended; activate initial conditions once armed for PAUSE."""
         for kind, burst in list(self._bursts.items()):
             if time - burst.end <= PAUSE and (kind != "lost" or time - burst.begin <= MAX_BURST):
                 continue
@@ -136,7 +135,7 @@ class Vehicle:
                 self.emit(Finding(kind, "end", f"rejections stopped ({messages})", (), numbers), "", burst.end)
             else:
                 duration = burst.count / 1e3
-                text = f"the logger recorded nothing for {to_age(duration)}"
+                text = f"logging dropout of {format_duration(duration)}"
                 self.emit(Finding(kind, "once", text, numbers={"duration": duration}), "", burst.begin)
         if self._on_ground and time - self._armed_at >= PAUSE:
             self.conditions |= self._on_ground
@@ -151,13 +150,13 @@ class Vehicle:
                 del self._changes[key]
 
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
-        """Update from the state of the position's stream: "stale", "gone", "duplicate" or another, None if unknown."""
+        """Update from the state of the position stream: "stale", "gone", "duplicate" or another, None if unknown."""
         self.settle(time)
         if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
-            several = f"several publishers of {stream}: readers receive a mixture"
+            several = f"several publishers of {stream}: readers receive a mixture of their messages"
             begin = Finding("duplicate", "begin", several, switch=True)
-            end = Finding("duplicate", "end", f"one publisher of {stream} is left", switch=True)
+            end = Finding("duplicate", "end", f"only one publisher of {stream} left", switch=True)
             self.emit(begin if state == "duplicate" else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
@@ -171,7 +170,7 @@ class Vehicle:
         self.emit(Finding(silent, "begin", text, numbers={"age": age}), stream, time, changed=since)
 
     def state(self, time: float) -> State:
-        """Return the current state: active and flapping conditions, and single events of the last minute."""
+        """Return the current state, set by active and flapping conditions and single events of the last minute."""
         is_flying = self.armed is not False
         found = [each for each in self.conditions.values() if is_flying or KINDS[each.kind].on_ground != "info"]
         kinds = {each.kind for each in found}
@@ -187,9 +186,9 @@ class Vehicle:
         return state_of(dict.fromkeys(found))  # a condition with several flags counts once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
-        """Begin or end the conditions of a finding, and report its event unless it is initial or flapping.
+        """Begin or end the conditions of a finding; report its event unless it is initial or flapping.
 
-        `changed`: the time at which the condition began or ended, if it is earlier than `time`.
+        `changed`: time when the condition began or ended, if earlier than `time`.
         """
         changed = time if changed is None else changed
         kind, text, lasted = KINDS[found.kind], found.text, None
@@ -205,7 +204,7 @@ class Vehicle:
             held = [self.conditions.pop(key) for key in keys if key in self.conditions]
             if known := [each.since for each in held if not each.initial]:
                 lasted = max(0.0, changed - min(known))
-                text = f"{text} after {to_age(lasted)}"
+                text = f"{text} after {format_duration(lasted)}"
             elif found.first:
                 text = found.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
@@ -223,12 +222,12 @@ class Vehicle:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """The flags that the position estimate in use does not provide."""
+        """Flags that the position estimate in use does not provide."""
         return () if self._position is None else self._position.unknown
 
     @property
     def held_from_start(self) -> str:
-        """The texts of faults that held in the first message and have not ended, "" if there are none."""
+        """Texts of conditions, other than info, active since the first message; "" if none."""
         held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
         return ", ".join(dict.fromkeys(held))
 
@@ -239,7 +238,7 @@ class Vehicle:
             burst.topics.add(topic)
 
     def _open(self, address: Address) -> ChangeDetector | None:
-        """Return a detector for a new stream, None if it has no events or a better stream is in use."""
+        """Return a detector for a new stream; None if it has no events, or a preferred stream is in use."""
         self.topics.add(address.topic)
         topic, instance = address.topic, address.instance or 0
         if topic == detectors.EKF_SELECTOR:
@@ -255,7 +254,7 @@ class Vehicle:
                 is_sought = topic == POSITIONS[-1] != current.topic and detectors.EKF_SELECTOR not in self.topics
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
-            if current != address:  # open unused streams anew, and end the conditions
+            if current != address:  # reopen unused streams, and end conditions of the old one
                 self._preferred[group], kinds = address, kinds_of(BY_TOPIC[topic].name)
                 self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
                 self._end(address, lambda kind, _: kind in kinds)
@@ -274,7 +273,7 @@ class Vehicle:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
-        """Yield this EKF if its estimates equal the vehicle's and those in use do not; where no selector names one."""
+        """Without a selector: yield this EKF if its estimate equals the vehicle's and that of the primary does not."""
         vehicle = _read_sample(None if self._position is None else self._position.last)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
@@ -282,7 +281,7 @@ class Vehicle:
             yield detectors.selected(instance, None)
 
     def _use_ekf(self, instance: int) -> None:
-        """Use the flags of another EKF: those of both that are set begin conditions anew."""
+        """Switch the primary EKF; flags set in the old and new primary begin new conditions."""
         old, self._ekf = self._ekf, instance
         if old == instance:
             return
@@ -294,7 +293,7 @@ class Vehicle:
                 self.emit(found, _EKF, self.time)
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
-        """End the conditions whose kind and flag are over, as a better stream is in use."""
+        """End conditions selected by kind and flag, as a preferred stream is in use."""
         self._on_ground = {key: each for key, each in self._on_ground.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
@@ -302,7 +301,7 @@ class Vehicle:
             self.emit(ended, new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:
-        """Reset the state, and report the reboot once, even if late messages from before it follow."""
+        """Reset the state; report the reboot once, even if delayed messages from before it follow."""
         for detector in filter(None, self._detectors.values()):
             detector.reset()
         self.conditions = {key: each for key, each in self.conditions.items() if KINDS[key[0]].kept_on_reboot}
@@ -311,7 +310,7 @@ class Vehicle:
         self._on_ground.clear()
         last, self._rebooted = self._rebooted, time
         if time - last >= PAUSE and ("duplicate", "") not in self.conditions:
-            text = f"rebooted: time since boot {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
+            text = f"reboot: time since boot is {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
             self.emit(Finding("reboot", "once", text, numbers={"before": before / 1e6}), "", time)
 
     def _report(self, event: Event) -> None:
@@ -323,8 +322,8 @@ class Vehicle:
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
     def _is_flapping(self, event: Event) -> bool:
-        """Return True if there are too many of such events to report each; `settle` reports the last one."""
-        keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in combinations
+        """Return True if such events are too frequent to report each; `settle` then reports the last one."""
+        keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in any combination
         limits = [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
         for key, limit in [(keys[1], MAX_SINGLE)] if event.change == "once" else limits:
             events = self._changes.setdefault(key, deque(maxlen=limit))
@@ -338,7 +337,7 @@ class Vehicle:
 
 @dataclass(slots=True)
 class _Burst:
-    """Losses, rejections or dropouts in close succession, reported once."""
+    """Losses, rejections or dropouts in close succession, reported as one event."""
 
     begin: float
     end: float

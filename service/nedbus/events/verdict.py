@@ -1,4 +1,4 @@
-"""Verdict on a vehicle: whether it is usable, since when, for how long, and why, in one or two sentences."""
+"""Verdict on a vehicle in one or two sentences: usable or not, since when, for how long, and why."""
 
 import math
 import textwrap
@@ -13,17 +13,16 @@ from .rules import POSITIONS
 from .story import TOGETHER, Story, stories_of
 from .times import Times
 
-_WIDTH: Final = 97  # columns of a verdict beside a short name of the vehicle; it has at most three lines
+_WIDTH: Final = 97  # columns next to a short vehicle name; a verdict has at most three lines
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """The verdict on a vehicle.
 
-    `text`: for people; it names the clock of its times, and may quote texts of the vehicle, so escape it.
-    `usable`: False if the vehicle could not do its task because of the fault, True if it could in spite of it; None if
-    the data does not have the validity of a position.
-    `begin`, `end`: the events that began and ended the worst fault, None if it held in the first or last message.
+    `text`: human-readable; names the clock of its times, and may quote text from the vehicle: escape it.
+    `usable`: False if the fault kept the vehicle from its task, True if not; None if the data has no position validity.
+    `begin`, `end`: events that began and ended the worst fault, None if it was active in the first or last message.
     `cause`: its evidence in order of time. `stories`: all faults in order of time.
     """
 
@@ -48,25 +47,25 @@ def verdict_of(
 ) -> Verdict:
     """Return the verdict on a vehicle.
 
-    `events`: those of this vehicle and of ALL, in order of time; others are left out. `held`: conditions that are
-    active after the last event. `topics`: the topics that it publishes. `unknown`: flags that its position does not
-    provide. `end`: now, or the end of the file, by the account's clock [s]. `at`: the moment in question, None for all.
+    `events`: events in order of time; only those of this vehicle and of ALL are used. `held`: conditions active after
+    the last event. `topics`: published topics. `unknown`: flags that its position does not provide.
+    `end`: now, or the end of the file, on the event log's clock [s]. `at`: the time in question, None for all.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
     stories = stories_of(events, held, topics=topics, at=at)
     known = None if set(POSITIONS).isdisjoint(topics) or "xy_valid" in unknown else True
     if not stories:
-        length = "the history of the services" if times.is_live else f"{end:.0f} s"
-        return Verdict(f"no faults in {length}{'' if known else '; the data has no validity of a position'}", known)
+        length = "the services' history" if times.is_live else f"{end:.0f} s"
+        return Verdict(f"no faults in {length}{'' if known else '; the data has no position validity'}", known)
     ranked = sorted(stories, key=lambda story: rank(story.spans[0], story.until, is_now=times.is_live and at is None))
     worst = ranked[0]
     is_then = at is None or worst.since <= at <= (at if worst.until is None else worst.until)
     usable = False if worst.is_bad and is_then else known
     of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
     head = "position valid throughout, but " if usable else "not usable: " * of_estimate
-    head = head if is_then else "no fault then; the nearest: "
-    # What preceded the fault, and texts of PX4 until a second after it, of a bad fault that held in the first message
-    # until its end; without those that PX4 had said before all faults.
+    head = head if is_then else "no fault at that time; nearest: "
+    # Evidence: events before the fault, and PX4's texts until a second after its start, or all of them for a bad fault
+    # that was active in the first message; without texts that also appeared before all faults.
     said = [event for event in events if event.kind == "text"]
     earlier = {each.text for each in said if each.time < stories[0].since - WINDOW}
     late = TOGETHER if worst.begin else math.inf if worst.is_bad else -WINDOW
@@ -74,10 +73,10 @@ def verdict_of(
     found = [each for each in near if each.text not in earlier] + [e for e in worst.before if e.kind != "text"]
     cause = tuple(sorted(found, key=lambda each: each.time))
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
-    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # the rest for others
+    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # the rest is for others
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
     largest = {each.spans[0].kind: each for each in reversed(ranked)}
-    also = ""  # the worst other fault of each kind, those near in time first
+    also = ""  # the worst other fault of each kind, nearest in time first
     for each in sorted(largest.values(), key=lambda each: abs(each.since - worst.since)):
         if each.begin is None or each.begin in (worst.begin, *cause):
             continue
@@ -89,7 +88,7 @@ def verdict_of(
 
 
 def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[str]:
-    """Return sentences with the evidence of a fault that fits into `room` characters, and with what is missing."""
+    """Return sentences with as much evidence as fits into `room` characters, and with the missing topics."""
     missing = [f"Not in the data: {', '.join(story.lacking)}"] * bool(story.lacking and (story.is_bad or not cause))
     said = [
         (each.numbers.get("level", 0.0), abs(each.time - story.since), each) for each in cause if each.kind == "text"
@@ -110,7 +109,7 @@ def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[
 
 
 def _count(story: Story, stories: Iterable[Story]) -> str:
-    """Return the number of faults of the kind of a story, "" if it is the only one."""
+    """Return " (one of N)" if there are several faults of this kind, else ""."""
     number = sum(each.spans[0].kind == story.spans[0].kind for each in stories)
     return f" (one of {number})" if number > 1 else ""
 

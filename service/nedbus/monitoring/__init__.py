@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
-from .http_server import HttpServer, Page, leads_here
+from .http_server import HttpServer, Page, is_local_host_header
 from .observer import Observer, Snapshot
 from .pages import service_pages, why_not_ready
 

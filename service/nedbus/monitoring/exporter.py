@@ -1,4 +1,4 @@
-"""Exporter of metrics that subscribes like any reader, for networks without a nedbus service to scrape.
+"""Metrics exporter that subscribes to streams, for networks without a nedbus service to scrape.
 
 Needs the extra `metrics`.
 """
@@ -27,13 +27,13 @@ from .metrics import MeasuredStream, build_info, make_metrics, metrics_page, str
 from .observer import Observer, Snapshot
 from .pages import vehicles_page
 
-_POLL_INTERVAL: Final = 0.5  # s between polls of all vehicles
-_MAX_ROUTERS: Final = 16  # routers exported; any peer may claim to be one
-_SERVICES_INTERVAL: Final = 5.0  # s between queries of services, while messages from MAVLink arrive
+_POLL_INTERVAL: Final = 0.5  # s
+_MAX_ROUTERS: Final = 16  # a peer may claim to be a router
+_SERVICES_INTERVAL: Final = 5.0  # s between queries of services while MAVLink sources publish
 
 
 class Exporter(Observer):
-    """Observer that serves metrics about its streams and vehicles; `pages`: the HTTP pages by path."""
+    """Observer that exports metrics of its streams and vehicles; `pages`: HTTP pages by path."""
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         super().__init__(bus, selection)
@@ -53,14 +53,14 @@ class Exporter(Observer):
         }
         self._routers: list[RouterState] = []
         self.log_streams: Mapping[str, LogStreamStatus] = {}
-        """The ULog streams of vehicles with MAVLink, by vehicle."""
-        self._session: Session | None = None  # for the queries of routers
+        """Status of ULog streams, by vehicle."""
+        self._session: Session | None = None  # for queries
         self._sources: dict[Address, str] = {}
 
     def run(self, stop: threading.Event) -> None:
-        """Run until `stop` is set; raise the error that stopped the reader early."""
+        """Run until `stop` is set; raise the error that ended the reader early."""
         with ThreadPoolExecutor(2, thread_name_prefix="nedbus-export") as pool:
-            tasks = pool.submit(self._read), pool.submit(self._ask_peers, stop)
+            tasks = pool.submit(self._read), pool.submit(self._query_peers, stop)
             for task in tasks:
                 task.add_done_callback(lambda _: stop.set())
             try:
@@ -69,21 +69,21 @@ class Exporter(Observer):
             finally:
                 stop.set()
                 if self._session is not None:
-                    self._session.close()  # aborts a query that a router does not answer
+                    self._session.close()  # aborts a query without a reply
                 self.subscription.close()
             for task in tasks:
                 task.result()
 
     def poll(self) -> Snapshot:
-        """Poll all vehicles; `run` calls it twice a second."""
+        """Poll all vehicles; called by `run` twice a second."""
         snapshot = super().poll()
-        for address in [*self._sources]:  # a copy: another thread adds streams
+        for address in [*self._sources]:  # copied: another thread adds streams
             if address not in snapshot.healths:
                 del self._sources[address]
         return snapshot
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample; `run` calls it with each that is read."""
+        """Add a sample; called by `run` for each one read."""
         super().add(sample)
         self._sources[sample.address] = sample.source or ""
 
@@ -100,7 +100,7 @@ class Exporter(Observer):
             "nedbus_messages_invalid": [((), counts.invalid)],
             "nedbus_queue_messages": [((), self.subscription.waiting)],
             "nedbus_limit_reached": [
-                (("vehicles",), self.account.refused), (("streams",), self.monitor.evicted),
+                (("vehicles",), self.event_log.refused), (("streams",), self.monitor.evicted),
                 (("keys",), counts.forgotten),
             ],
             "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
@@ -109,19 +109,19 @@ class Exporter(Observer):
             ],
         })  # fmt: skip
         yield from stream_metrics(streams, messages="nedbus_messages_received")
-        yield from vehicle_metrics(self.account, streams)
+        yield from vehicle_metrics(self.event_log, streams)
 
     def _read(self) -> None:
         for sample in self.subscription.rows():
             self.add(sample)
 
-    def _ask_peers(self, stop: threading.Event) -> None:
-        # A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
+    def _query_peers(self, stop: threading.Event) -> None:
+        # A separate session: large replies (183 kB from a router with 1,000 sessions) would delay messages.
         due = 0.0
         while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, due - time.monotonic()))):
             if time.monotonic() >= due:
                 states: list[RouterState] = []
-                with suppress(NedbusError):  # the router is full or the link is down: export no counts
+                with suppress(NedbusError):  # the router is full, or the link is down
                     self._session = self._session or self._bus.open_session(timeout=TIMINGS.routers_session)
                     if not stop.is_set():
                         states = query_routers(self._session, timeout=TIMINGS.routers_timeout)
@@ -142,4 +142,4 @@ class Exporter(Observer):
         if not self._bus.connected:
             return Page.verdict(self._faults(), "")
         host, now = socket.gethostname(), clock.steady()
-        return vehicles_page(report_of(self.account, "export", host, now, within=0.0, to_utc=clock.to_utc()))
+        return vehicles_page(report_of(self.event_log, "export", host, now, within=0.0, to_utc=clock.to_utc()))

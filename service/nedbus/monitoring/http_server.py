@@ -21,9 +21,9 @@ from nedbus.timings import TIMINGS
 
 _log = logging.getLogger(__name__)
 
-_MAX_REQUESTS: Final = 16  # concurrent requests
+_MAX_REQUESTS: Final = 16  # concurrent
 _ACCEPT_PAUSE: Final = 0.2  # s
-_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # Prometheus and probes may use any host name
+_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # scrapers and probes may use any host name
 
 
 class Page(NamedTuple):
@@ -45,23 +45,23 @@ class Page(NamedTuple):
 
     @classmethod
     def verdict(cls, faults: list[str], good: str) -> Page:
-        """Return status 503 with one fault per line, or `good` if there are no faults."""
+        """Return status 503 with one fault per line, or 200 with `good` if there are none."""
         return cls.text("\n".join(faults), status=503) if faults else cls.text(good)
 
 
 class HttpServer(ThreadingHTTPServer):
     """Serve pages by path on HOST:PORT, in up to 16 background threads, until closed.
 
-    Protects against DNS rebinding, where a web page in a browser on this network points its own host name at this
+    Protects against DNS rebinding, where a web page in a browser on this network points its own host name to this
     server to read the responses. Pages are served only under host names that such a page cannot control: IP addresses,
     localhost, this host's own names and, unless bound to loopback, names without a dot, as in Docker. Unless bound to
     loopback, metrics, health, readiness and vehicle states are served under any name.
 
-    Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
+    Raises ConfigError for an invalid HOST:PORT, ListenError if it cannot listen there.
     """
 
     daemon_threads = True
-    request_queue_size = 2 * _MAX_REQUESTS  # Python's default of 5 makes the sixth concurrent client wait 1 s
+    request_queue_size = 2 * _MAX_REQUESTS  # with Python's default of 5, the sixth concurrent client waits 1 s
 
     def __init__(self, where: str, pages: Mapping[str, Callable[[], Page]]) -> None:
         try:
@@ -80,13 +80,13 @@ class HttpServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, args=(0.2,), name="nedbus-http", daemon=True).start()
 
     def close(self) -> None:
-        """Stop listening, without waiting for queued clients."""
+        """Stop listening; do not wait for queued clients."""
         self._free.release(_MAX_REQUESTS)
         self.shutdown()
         self.server_close()
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Accept a client; without a file for it, pause, as it would be tried again at once."""
+        """Accept a client; pause if that fails, as without free file descriptors, to avoid a busy loop."""
         try:
             return super().get_request()
         except OSError:
@@ -94,21 +94,21 @@ class HttpServer(ThreadingHTTPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Handle a client in its own thread; wait up to 5 s for a free one, then disconnect the client."""
+        """Handle a client in a thread; disconnect the client if none is free within 5 s."""
         if self._free.acquire(timeout=TIMINGS.http_client):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Handle a client, then release its thread."""
+        """Handle a client, and release its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Log a client that disconnected."""
+        """Log a disconnected client."""
         _log.debug("an HTTP client disconnected", exc_info=True)
 
 
@@ -118,7 +118,7 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def handle(self) -> None:
-        """Handle one request; stop receiving after the timeout, in case the client sends it byte by byte."""
+        """Handle one request; stop receiving after the timeout, even from a client that sends byte by byte."""
         self.connection.settimeout(TIMINGS.http_client)
         deadline = threading.Timer(TIMINGS.http_client, self._stop_receiving)
         deadline.start()
@@ -148,21 +148,21 @@ class _Handler(BaseHTTPRequestHandler):
         if path not in pages:
             return Page.text(f"available pages: {', '.join(pages)}", status=200 if path == "/" else 404)
         host = self.headers.get("Host") or "localhost"  # every browser sends Host
-        if (is_local or path not in _ANY_NAME) and not leads_here(host, local=is_local):
+        if (is_local or path not in _ANY_NAME) and not is_local_host_header(host, local=is_local):
             return Page.text(f"{path} is only served under an IP address or a name of this host", status=403)
         try:
             return pages[path]()
         except Exception:  # noqa: BLE001 - one page must not break the server
             _log.exception("%s failed", path, extra=about("internal_error"))
-            return Page.text("unexpected error, see the log", status=500)
+            return Page.text("unexpected error: see the log", status=500)
 
     def _stop_receiving(self) -> None:
         with suppress(OSError):  # the client has disconnected
             self.connection.shutdown(socket.SHUT_RD)
 
 
-def leads_here(host: str, *, local: bool) -> bool:
-    """Return whether a Host header is a name that a foreign web page cannot point at this host."""
+def is_local_host_header(host: str, *, local: bool) -> bool:
+    """Return whether a Host header has a name that a foreign web page cannot point to this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")
     with suppress(ValueError):

@@ -19,12 +19,12 @@ from prometheus_client.registry import Collector
 from nedbus import clock
 from nedbus.client import Health, Histogram, SourceStatus
 from nedbus.daemon import STATES, TOO_MANY, Daemon, SourceMeasures
-from nedbus.events import SEVERITIES, Account
+from nedbus.events import SEVERITIES, EventLog
 
 from .http_server import Page
 
 MAX_STREAMS: Final = 1000
-"""Streams exported individually, positions first; the rest are summed under vehicle and topic "other"."""
+"""Streams exported individually, positions first; the rest are summed as vehicle and topic "other"."""
 
 _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
@@ -33,38 +33,38 @@ _LOG_STREAM: Final = ("vehicle", "source")
 
 METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     # Services
-    "nedbus_start_time_seconds": (_GAUGE, (), "Start time of the service, seconds since the Unix epoch"),
+    "nedbus_start_time_seconds": (_GAUGE, (), "Start time of the service, as Unix time"),
     "nedbus_sessions": (
-        _GAUGE, ("role",), "Zenoh sessions open at the embedded router, or routers a client is connected to",
+        _GAUGE, ("role",), "Open Zenoh sessions of the embedded router, or routers that the client is connected to",
     ),
     "nedbus_sessions_max": (_GAUGE, ("role",), "Session limit of the embedded router"),
     "nedbus_vehicle_refused": (
-        _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, 0 if they pass",
+        _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, else 0",
     ),
     "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
-    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages left out, or streams or keys forgotten, beyond a limit"),
+    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages ignored, or streams or keys dropped, because of a limit"),
     # Exporters
-    "nedbus_connected": (_GAUGE, (), "1 while connected to a router"),
+    "nedbus_connected": (_GAUGE, (), "1 while connected to a router, else 0"),
     "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
     "nedbus_messages_invalid": (_COUNTER, (), "Payloads discarded because they are not valid messages"),
     "nedbus_queue_messages": (_GAUGE, (), "Messages queued in the exporter"),
-    "nedbus_router_sessions": (_GAUGE, ("router",), "Zenoh sessions open at a router, by router id"),
+    "nedbus_router_sessions": (_GAUGE, ("router",), "Open Zenoh sessions of a router, by router id"),
     "nedbus_router_sessions_max": (_GAUGE, ("router",), "Session limit of a router, by router id"),
     "nedbus_messages_received": (_COUNTER, _STREAM, "Valid messages received and read"),
     # Streams
     "nedbus_messages_lost": (_COUNTER, _STREAM, "Messages lost in transit and not recovered"),
-    "nedbus_time_gaps": (_COUNTER, _STREAM, "Gaps in PX4 timestamps, longer than three usual intervals"),
-    "nedbus_messages_out_of_order": (_COUNTER, _STREAM, "Messages with a timestamp before the previous message's"),
+    "nedbus_time_gaps": (_COUNTER, _STREAM, "Gaps in PX4 timestamps longer than three usual intervals"),
+    "nedbus_messages_out_of_order": (_COUNTER, _STREAM, "Messages with a timestamp before the previous one's"),
     "nedbus_reboots": (_COUNTER, _STREAM, "Reboots detected from PX4 timestamps"),
     "nedbus_resets": (_COUNTER, (*_STREAM, "quantity"), "Estimator resets, by quantity"),
     "nedbus_stream_age_seconds": (_GAUGE, _STREAM, "Seconds since the last message"),
-    "nedbus_stream_rate_hertz": (_GAUGE, _STREAM, "Messages per second over the last full second"),
-    "nedbus_stream_usual_rate_hertz": (_GAUGE, _STREAM, "Usual message rate of the stream so far"),
+    "nedbus_stream_rate_hertz": (_GAUGE, _STREAM, "Message rate over the last full second"),
+    "nedbus_stream_usual_rate_hertz": (_GAUGE, _STREAM, "Usual message rate of the stream"),
     "nedbus_stream_jitter_seconds": (
-        _GAUGE, _STREAM, "Standard deviation of the intervals between messages over the last second",
+        _GAUGE, _STREAM, "Standard deviation of message intervals over the last second",
     ),
     "nedbus_stream_flag_ratio": (
-        _GAUGE, (*_STREAM, "flag"), "Fraction of the last second's messages that have the flag set",
+        _GAUGE, (*_STREAM, "flag"), "Fraction of messages with the flag set over the last second",
     ),
     "nedbus_latency_seconds": (
         _HISTOGRAM, _STREAM, "Latency from the publisher to this host; assumes synchronized clocks",
@@ -74,7 +74,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_vehicle_state": (_GAUGE, ("vehicle", "state"), "1 for the current state of a vehicle, 0 for the others"),
     "nedbus_vehicle_condition": (
         _GAUGE, ("vehicle", "condition"),
-        "1 for each condition of severity bad or watch that holds or occurred in the last minute",
+        "1 for each bad or watch condition that is active or occurred in the last minute",
     ),
     "nedbus_vehicle_events": (_COUNTER, ("vehicle", "severity"), "Events of a vehicle, by severity"),
     # Sources
@@ -91,20 +91,20 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_log_stream_active": (
         _GAUGE, _LOG_STREAM, "1 while a vehicle's messages come from its ULog stream, 0 while converted from MAVLink",
     ),
-    "nedbus_log_stream_bytes": (_COUNTER, _LOG_STREAM, "Bytes received of a vehicle's ULog stream"),
-    "nedbus_log_stream_gaps": (_COUNTER, _LOG_STREAM, "Interruptions of a vehicle's ULog stream"),
-    "nedbus_log_stream_lost": (_COUNTER, _LOG_STREAM, "LOGGING_DATA messages lost of a vehicle's ULog stream"),
+    "nedbus_log_stream_bytes": (_COUNTER, _LOG_STREAM, "Bytes received from a vehicle's ULog stream"),
+    "nedbus_log_stream_gaps": (_COUNTER, _LOG_STREAM, "Sequence gaps in a vehicle's ULog stream"),
+    "nedbus_log_stream_lost": (_COUNTER, _LOG_STREAM, "Lost LOGGING_DATA messages of a vehicle's ULog stream"),
     "nedbus_log_stream_messages_lost": (
-        _COUNTER, (*_LOG_STREAM, "bound"), "Bounds, least and most, of the ULog messages lost in these gaps",
+        _COUNTER, (*_LOG_STREAM, "bound"), "Lower and upper bound of the number of ULog messages lost in gaps",
     ),
     "nedbus_log_stream_undecodable": (_COUNTER, _LOG_STREAM, "ULog messages without a usable definition"),
-    "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of the ULog stream's messages on arrival"),
+    "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of ULog messages on arrival"),
     "nedbus_log_stream_header_seconds": (
-        _GAUGE, _LOG_STREAM, "Duration of the last header; the vehicle's own log has a gap of this length",
+        _GAUGE, _LOG_STREAM, "Transfer time of the last ULog header; the vehicle's own log has a gap of this length",
     ),
     "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
 }  # fmt: skip
-"""The type, labels and help text of each metric, by name."""
+"""Type, labels and help text of each metric, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class MeasuredStream:
 
 
 def metrics_page(metrics: Iterable[core.Metric]) -> Page:
-    """Return these metrics and those of this process in Prometheus's text format."""
+    """Return these metrics and those of this process in the Prometheus text format."""
 
     class Metrics(Collector):
         def collect(self) -> Iterator[core.Metric]:
@@ -138,7 +138,7 @@ def build_info(version: str) -> core.Metric:
 
 
 def make_metrics(series: Mapping[str, Iterable[tuple[Any, ...]]]) -> Iterator[core.Metric]:
-    """Yield the named metrics; each row has the label values, then a value or a histogram's buckets and sum."""
+    """Yield the named metrics; a row has label values, then a value, or the buckets and sum of a histogram."""
     for name, rows in series.items():
         kind, labels, text = METRICS[name]
         metric = kind(name, text, labels=labels)
@@ -170,7 +170,7 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
         "nedbus_time_gaps": count("gaps"),
         "nedbus_messages_out_of_order": count("out_of_order"),
         "nedbus_reboots": count("reboots"),
-        # Streams without a nominal rate are silent by nature: an age would trigger alerts.
+        # Without a nominal rate a stream may be silent for long: an age would trigger alerts.
         "nedbus_stream_age_seconds": measure("age", [stream for stream in active if stream.health.nominal]),
         "nedbus_stream_rate_hertz": measure("rate"),
         "nedbus_stream_usual_rate_hertz": measure("usual_rate"),
@@ -188,11 +188,11 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
     })  # fmt: skip
 
 
-def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
-    """Yield the vehicle metrics; a vehicle without an active stream has event counts but no state."""
-    now, vehicles = clock.steady(), list(account.vehicles)
+def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
+    """Yield the vehicle metrics; a vehicle without an active stream has event counts, but no state."""
+    now, vehicles = clock.steady(), list(event_log.vehicles)
     active = {stream.labels[0] for stream in streams if stream.active}
-    states = {name: account.state(name, now) for name in active if name in vehicles or account.is_full}
+    states = {name: event_log.state(name, now) for name in active if name in vehicles or event_log.is_full}
     kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
     yield from make_metrics({
         "nedbus_vehicle_state": [
@@ -201,7 +201,7 @@ def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iter
         ],
         "nedbus_vehicle_condition": [((name, kind), 1) for name in kinds for kind in kinds[name]],
         "nedbus_vehicle_events": [
-            ((name, severity), account.counts[name, severity]) for name in vehicles for severity in SEVERITIES
+            ((name, severity), event_log.counts[name, severity]) for name in vehicles for severity in SEVERITIES
         ],
     })  # fmt: skip
 
@@ -209,7 +209,7 @@ def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iter
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     """Yield all metrics of a service."""
     seen, sources = Counter[str](), dict[str, SourceMeasures]()
-    for measures in daemon.measures:  # numbered where two have the same text: time series must be unique
+    for measures in daemon.measures:  # numbered if texts are equal: time series must be unique
         text = measures.status.source
         seen[text] += 1
         sources[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures
@@ -226,12 +226,12 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
         for each in measures.status.streams
     ]
     yield from stream_metrics(streams, messages="nedbus_messages_published")
-    account = daemon.update_events(list(sources.values()))
-    yield from vehicle_metrics(account, streams)
+    event_log = daemon.update_events(list(sources.values()))
+    yield from vehicle_metrics(event_log, streams)
     of = {label: measures.status for label, measures in sources.items()}
     addresses = sum(each.status.rejections.get(TOO_MANY, 0) for each in sources.values())
     yield from make_metrics({
-        "nedbus_limit_reached": [(("vehicles",), account.refused), (("addresses",), addresses)],
+        "nedbus_limit_reached": [(("vehicles",), event_log.refused), (("addresses",), addresses)],
         "nedbus_source_rejected": [((label,), status.rejected) for label, status in of.items()],
         "nedbus_messages_rejected": [
             ((label, rule), count) for label, status in of.items() for rule, count in status.rejections.items()

@@ -1,4 +1,4 @@
-"""Reader that tracks the health of the selected streams and the events of their vehicles."""
+"""Observer of the health of selected streams and of their vehicles' events."""
 
 import threading
 from collections import Counter
@@ -8,24 +8,24 @@ from typing import Any, Final
 
 from nedbus import clock
 from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
-from nedbus.events import RECENT, Account
+from nedbus.events import RECENT, EventLog
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Selection
 
-_MAX_WAITING: Final = 200  # queued messages that do not yet count as falling behind, at any rate
-_MAX_LAG: Final = 1.0  # s worth of queued messages that do not yet count as falling behind
-_MAX_PAUSE: Final = 2.5  # s between two polls; after a longer pause this process itself was stalled
-_SETTLING_TIME: Final = 3.0  # s after a reconnect until delayed messages have arrived
+_MAX_WAITING: Final = 200  # queued messages above which the reader is behind
+_MAX_LAG: Final = 1.0  # s of queued messages at the usual rate, if that is more
+_MAX_PAUSE: Final = 2.5  # s between polls; after a longer pause, this process was stalled
+_SETTLING_TIME: Final = 3.0  # s after a reconnect; then delayed messages have arrived
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
-    `time`: by the steady clock [s], as the times of `rejected`.
-    `healths`: without streams that are forgotten, as their vehicles are, or were silent for an hour.
-    `alive`: the number of publishers of each address, None if unknown.
-    `link`, `behind`: the fault of the link and of this reader, "" if there is none.
+    `time`: time on the steady clock [s], as in `rejected`.
+    `healths`: health by stream, without streams of forgotten vehicles and those silent for an hour.
+    `alive`: number of publishers by address, None if unknown.
+    `link`, `behind`: fault of the router link and of this reader, "" if none.
     """
 
     time: float
@@ -37,38 +37,38 @@ class Snapshot:
 
 
 class Observer:
-    """Subscribe to a selection and keep an `account` of the events and states of its vehicles, by the steady clock.
+    """Subscribe to a selection and keep an `event_log` of its vehicles on the steady clock.
 
-    The thread that reads `subscription` passes each sample to `add`. `poll` and `measure` may be called in any thread;
-    call `poll` about twice a second.
+    The thread that reads `subscription` passes each sample to `add`. Any thread may call `poll`, about twice a second,
+    and `measure`.
     """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
-        self.account = Account()
+        self.event_log = EventLog()
         self.subscription = bus.subscribe_to(selection, mode="every")
         self._bus, self._selection = bus, selection
         self.monitor = Monitor()
         self._rejections = bus.rejections()
-        self._looked: float | None = None
+        self._last_poll: float | None = None
         self._disconnected = 0.0  # time of the last poll without a link
-        self._lock = threading.Lock()  # while a sample is added, its stream is briefly missing from the monitor
+        self._lock = threading.Lock()  # a stream is briefly missing from the monitor while it is updated
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample just read; a retained one is ignored, as its stream may have ended long ago."""
+        """Add a sample just read; ignore a retained one, as its stream may have ended long ago."""
         with self._lock:
             counts = self.monitor.add(sample)
         if counts:
             missing, now = sample.provenance.missing, clock.steady()
-            self.account.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
+            self.event_log.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
 
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
-        """Return the current health and latencies of each stream."""
+        """Return the current health and latencies by stream."""
         with self._lock:
             healths = self.monitor.snapshot()
             return {address: (health, self.monitor.latencies(address)) for address, health in healths.items()}
 
     def poll(self) -> Snapshot:
-        """Poll streams, rejections and the link, and record changes in the account."""
+        """Poll streams, rejections and the link, and record changes in the event log."""
         now, connected = clock.steady(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
         with self._lock:
@@ -76,30 +76,30 @@ class Observer:
         taken = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
-            self.account.reject(report.address, report.reason, now)
+            self.event_log.reject(report.address, report.reason, now)
         alive = self._bus.publishers(timeout=0.2)
         self._disconnected = self._disconnected if connected else now
         settled = now - self._disconnected > _SETTLING_TIME
         states = {
             main: stream_state(healths[main], publishers=alive[main]).name if settled else "unknown"
-            for main in [vehicle.main for vehicle in list(self.account.vehicles.values())]
+            for main in [vehicle.main for vehicle in list(self.event_log.vehicles.values())]
             if main is not None and (main in healths or not settled)
         }
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"
-        paused, self._looked = self._looked is not None and now - self._looked > _MAX_PAUSE, now
+        paused, self._last_poll = self._last_poll is not None and now - self._last_poll > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
-        self.account.update(
+        self.event_log.update(
             now, states, link=link, dropped=dropped, is_behind=is_behind, present={each.vehicle for each in alive}
         )
         if settled:
             silent = [(each.age or 0.0, address) for address, each in healths.items() if not alive[address]]
             for age, address in silent:
-                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.account.vehicles):
+                if age > TIMINGS.forgotten or (age > RECENT and address.vehicle not in self.event_log.vehicles):
                     del healths[address]
                     with self._lock:
                         self.monitor.forget(address)
         behind = ""
-        if self.account.overload is not None:
-            behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"
+        if self.event_log.overload is not None:
+            behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped"
         return Snapshot(now, healths, alive, rejected, link, behind)

@@ -6,12 +6,12 @@ from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
-from nedbus.events import AccountReport, Expectation, by_vehicle, faults_of, since_text
+from nedbus.events import AccountReport, Expectation, by_vehicle, faults_of, format_since
 from nedbus.extras import import_optional
 
 from .http_server import Page
 
-_MAX_BUSY: Final = 20.0  # s that a source may spend on one message
+_MAX_BUSY: Final = 20.0  # s per message and source
 
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
@@ -26,16 +26,16 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
 
 
 def vehicles_page(report: AccountReport) -> Page:
-    """Return the state of each vehicle, or status 503 with the faults if there are any."""
+    """Return the state of each vehicle, or status 503 with the faults."""
     faults = faults_of([report], Expectation(well=True))
     vehicles = ((name, report.vehicles[name]) for name in by_vehicle([report]))
-    lines = [f"{name} {vehicle.text}{since_text(vehicle.since, report.now)}" for name, vehicle in vehicles]
-    good = "\n".join(map(_one_line, lines)) or "no vehicle is known"
+    lines = [f"{name} {vehicle.text}{format_since(vehicle.since, report.now)}" for name, vehicle in vehicles]
+    good = "\n".join(map(_one_line, lines)) or "no vehicles"
     return Page.verdict(list(map(_one_line, faults)), good)
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
-    """Return the reasons why a service is not ready: no router, a refused vehicle, or a silent source."""
+    """Return why a service is not ready: no router, a refused vehicle, or a silent source; [] if it is ready."""
     if not daemon.ready.is_set():
         return [f"the service is starting: {' or '.join(daemon.endpoints)}"]
     reasons = []
@@ -43,7 +43,7 @@ def why_not_ready(daemon: Daemon) -> list[str]:
         reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
     reasons += _refusals(daemon)
     for source in daemon.sources:
-        silent = source.state == "waiting" and not source.addresses  # a replay waiting for a reader has addresses
+        silent = source.state == "waiting" and not source.addresses  # a replay that waits for a reader has addresses
         if silent or source.state in {"starting", "retrying", "failed"}:
             what = "nothing arrives" if silent else source.state
             reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
@@ -51,13 +51,13 @@ def why_not_ready(daemon: Daemon) -> list[str]:
 
 
 def _one_line(text: str) -> str:
-    return "".join(each if each.isprintable() else " " for each in text)  # a reason may quote a peer's text
+    return "".join(each if each.isprintable() else " " for each in text)  # texts may quote a peer
 
 
 def _health(daemon: Daemon) -> Page:
     reasons, busy = _refusals(daemon), daemon.busy
     if busy >= _MAX_BUSY:
-        reasons.append(f"a source has been blocked on one message for {busy:.0f} s")
+        reasons.append(f"a source has been blocked by one message for {busy:.0f} s")
     return Page.verdict(reasons, "ok")
 
 

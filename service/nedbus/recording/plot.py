@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
-from nedbus.events import KINDS, SEVERITIES, Event, Severity, Times, spans_of, to_clock, unit_of
+from nedbus.events import KINDS, SEVERITIES, Event, Severity, Times, format_utc, spans_of, unit_of
 from nedbus.whole_file import whole_file
 from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
@@ -149,7 +149,7 @@ def _label_times(axes: Any, streams: Sequence[_Stream], start: float, times: Tim
     low, high = (limit + shift for limit in axes.get_xlim())
     step = next((step for step in _STEPS if high - low < _TICKS * step), _STEPS[-1])
     ticks = np.arange(np.ceil(low / step), high / step) * step
-    texts = [to_clock(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
+    texts = [format_utc(tick).removesuffix(".0") if has_utc else f"{tick:.7g}" for tick in ticks]
     axes.set_xticks(ticks - shift, texts)
     return f"time [{unit_of('vehicle' if has_utc else 'boot')}]"
 

@@ -31,7 +31,7 @@ class UlogReader:
     ) -> None:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
-        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.Texts()
+        self._parser, self._texts = ulog.UlogParser(verify=True), ulog.LogMessageBuilder()
         self._damages = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, ulog.LoggedStream | None] = {}
@@ -46,7 +46,7 @@ class UlogReader:
     @property
     def warnings(self) -> list[str]:
         """Damage found and parts skipped so far."""
-        warnings = self._warnings + [reason for stream in self.streams.values() for reason in stream.unfit.values()]
+        warnings = self._warnings + [reason for stream in self.streams.values() for reason in stream.omitted.values()]
         if self._damages > _MAX_NAMED:
             warnings.append(f"damaged: {self._damages - _MAX_NAMED} further locations")
         if self._parser.undecodable:

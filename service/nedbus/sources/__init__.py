@@ -1,7 +1,7 @@
-"""Sources of messages: `parse_source` reads a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
+"""Sources of messages: `parse_source` parses a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
 
-from .account import KEPT_OF_FILE, FileAccount, Flights, follow, read_account
 from .conversion import convert
+from .file_events import MAX_FILE_EVENTS, FileEvents, Flights, follow, read_file_events
 from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
-from .mavlink.link import Link, Senders, open_link, parse_link, why_ignored
-from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage
+from .mavlink.link import DuplicateIds, Link, ignore_reason, open_link, parse_link
+from .source import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics

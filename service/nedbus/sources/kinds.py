@@ -1,4 +1,4 @@
-"""Table of source kinds, and parser for sources: `KIND:TARGET?OPTION=VALUE&...`, or a TOML table."""
+"""Table of source kinds, and parser of sources: `KIND:TARGET?OPTION=VALUE&...`, or a TOML table."""
 
 import re
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from .source import LiveSource, ReplaySource, Source
 class SourceKind:
     """One kind of source: its options, its target, and its function or class, which is imported on first use.
 
-    `target`: name of the part after the colon; None without one, in brackets if it is optional.
+    `target`: name of the part after the colon, in brackets if it is optional; None if there is none.
     `extra`: the extra of nedbus that it requires.
     """
 
@@ -34,7 +34,7 @@ class SourceKind:
     extra: str = ""
 
     def accepts(self, target: str) -> bool:
-        """Return whether this target is allowed; "" stands for none."""
+        """Return whether this target is allowed; "" means no target."""
         return self.target is not None if target else self.target is None or self.target.startswith("[")
 
 
@@ -114,7 +114,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
 
 
 def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
-    """Return the source that replays a file, as `ulog:flight.ulg?vehicle=7`; raise ConfigError for another suffix."""
+    """Return the source text of a file, such as `ulog:flight.ulg?vehicle=7`; raise ConfigError for other suffixes."""
     name = format_of(path)
     return _join(name, SOURCE_KINDS[name], str(path), {key: value for key, value in options.items() if value})
 

@@ -17,7 +17,7 @@ _INPUT: Final = "mcap-input"  # `sample.source` of messages to a vehicle
 
 
 def open_mcap(path: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:
-    """Check the file; raise SourceError if it is not an MCAP file or has none of the requested topics."""
+    """Check a recording; raise SourceError if it is not an MCAP file or has none of the requested topics."""
     topics = options.chosen_topics
     with RecordingReader(path, vehicle=default_vehicle) as reader:
         reader.check()
@@ -74,7 +74,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
-    """Yield messages in order of log time, as writers batch them by stream; flush when it falls by over _MAX_GAP."""
+    """Sort messages by log time, as writers batch them by stream; flush when it goes back by over _MAX_GAP."""
     waiting: list[tuple[int, int, RecordedMessage]] = []
     newest = 0
     for number, recorded in messages:

@@ -31,7 +31,7 @@ def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _parse_topics(text: object) -> object:
-    """Parse `TOPIC,TOPIC`; the name of a message stands for all of its topics."""
+    """Parse `TOPIC,TOPIC`; a message name selects all of its topics."""
     if not isinstance(text, str):
         return text
     names = tuple(part.strip() for part in text.split(","))
@@ -55,7 +55,7 @@ Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
 
 class Options(BaseModel):
-    """Options of every kind of source."""
+    """Options shared by all kinds of source."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -65,7 +65,7 @@ class Options(BaseModel):
 
     @property
     def chosen_topics(self) -> Collection[str] | None:
-        """The topics to deliver, by default those that nedbus has a file for; None means all."""
+        """The topics to deliver, by default those that nedbus defines; None means all."""
         if ANY in self.topics:
             return None
         return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS
@@ -77,7 +77,7 @@ class Options(BaseModel):
 
 
 class ReplayOptions(Options):
-    """Options of every replay."""
+    """Options shared by all replays."""
 
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
     speed: Annotated[
@@ -87,7 +87,7 @@ class ReplayOptions(Options):
 
 
 class RecordedOptions(ReplayOptions):
-    """Options of `ulog:` and `mcap:`."""
+    """Options of `ulog:`, `mcap:` and `tlog:`."""
 
     loop: bool = Field(False, description="1 to restart at the end, or 0")
 
@@ -95,7 +95,7 @@ class RecordedOptions(ReplayOptions):
 class SimulatorOptions(ReplayOptions):
     """Options of `sim:`."""
 
-    seed: int = Field(0, description="an integer; the same seed gives the same flight")
+    seed: int = Field(0, description="an integer; the same seed produces the same flight")
     duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
         None, description="seconds, 0.01 to 1e8 (default: endless)"
     )
@@ -141,11 +141,11 @@ class MavlinkOptions(Options):
         BeforeValidator(lambda text: frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text),
     ] = Field(
         frozenset(),
-        description="1 to request the ULog stream of each PX4 on the link, armed to start it in the air as well, take"
+        description="1 to request the ULog stream of each PX4 on the link, armed to start it in flight as well, take"
         " to end the stream of another client, or armed,take",
     )
     save: Annotated[str, AfterValidator(_check_save)] = Field(
-        "", description="a folder in which each ULog stream is saved as a .ulg file; it needs log="
+        "", description="a folder in which each ULog stream is saved as a .ulg file; requires log="
     )
 
     @property

@@ -1,12 +1,10 @@
-"""A simulated flight, its estimates and the other messages of its vehicle, as functions of the time since the start.
+"""Simulated flight: the estimates and other messages of a vehicle as functions of the time since the start.
 
-The vehicle takes off and flies figures of eight at 20 m.
+The vehicle takes off and flies figures of eight at 20 m; each lap of 120 s has typical events of a real flight:
 
-Every lap of 120 s has the events of a real flight:
-
-    t = 15 s         the heading is aligned: a heading reset
-    t = 60 to 75 s   no GPS: dead reckoning, growing error, xy invalid after 10 s; at its end resets of xy and vxy
-    t = 90 s         a reset of z
+    t = 15 s         heading alignment: a heading reset
+    t = 60 to 75 s   GPS outage: dead reckoning, xy invalid after 10 s; resets of xy and vxy at the end
+    t = 90 s         z reset
 """
 
 import math
@@ -51,7 +49,7 @@ _Gps: Final = MESSAGES["SensorGps"].model
 _ARMED: Final = _BOOT - 1_000_000  # us since boot
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
-_ENDURANCE: Final = 1200.0  # s until the battery is replaced by a full one, with a fifth of its charge left
+_ENDURANCE: Final = 1200.0  # s until the battery is replaced by a full one, at a fifth of its charge
 _BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: start of 2026
 
 Vector = tuple[float, ...]  # north, east, down
@@ -106,7 +104,7 @@ class _State(NamedTuple):
 
 
 class Estimator:
-    """An estimate of the truth whose error wanders, drifts without GPS, and is reset.
+    """Estimator whose error wanders, drifts without GPS, and is reset.
 
     `noise`: size of the position error [m]; `aided`: position aiding never fails, and there are no resets.
     """
@@ -258,7 +256,7 @@ def land_detected(time: float, truth: Truth) -> dict[str, object]:
 
 
 def home(time: float, truth: Truth) -> dict[str, object]:
-    """Return the place of take-off, with global coordinates once the origin is known."""
+    """Return the home position, with global coordinates once the origin is known."""
     known = time >= _ORIGIN_SET
     latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
     return {
@@ -303,11 +301,11 @@ def gps(time: float, truth: Truth) -> dict[str, object]:
     }  # fmt: skip
 
 
-Fields = Callable[[float, Truth], dict[str, object]]  # of a message, given time since start and truth
+Fields = Callable[[float, Truth], dict[str, object]]  # of a message, from time since start and truth
 
 
 def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
-    """Start a flight, endless unless its options set a duration; raise SourceError without any requested topic."""
+    """Start a flight, endless unless its options set a duration; raise SourceError if it has no requested topic."""
     vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
     ticks = None if options.duration is None else round(options.duration / _TICK)
     streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)

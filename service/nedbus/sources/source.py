@@ -20,8 +20,8 @@ class SourceMessage:
     `lost`: number of messages lost between the vehicle and the source, just before this one.
     `rebooted`: True for the first message after the vehicle rebooted.
     `error`: the reason if it cannot be decoded; `fields` is empty then.
-    `definition`: its message definition; None for the default of its topic.
-    `source`: what readers see in `sample.source`, if it differs from the kind of the source.
+    `definition`: message definition; None for the default of the topic.
+    `source`: value of `sample.source`, if it differs from the kind of the source.
     `dropout`: seconds for which the vehicle's logger recorded nothing, just before this one.
     """
 
@@ -38,7 +38,7 @@ class SourceMessage:
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """Input that a live source could not turn into a message; each `where` (key, link or address) is logged once."""
+    """Input that a live source could not convert; each `where` (key, link or address) is logged once."""
 
     where: str
     reason: str
@@ -47,28 +47,28 @@ class Rejection:
 
 
 @dataclass(frozen=True, slots=True)
-class Absence:
+class UnavailableTopics:
     """Topics that vehicles announce but a live source does not deliver; yielded on change.
 
-    `not_carried`: names of messages without a definition, or not selected.
+    `unsupported`: names of messages that have no definition, or are not selected.
     `silent`: announced addresses without messages, while other topics of the same vehicle arrive.
     """
 
-    not_carried: tuple[str, ...] = ()
+    unsupported: tuple[str, ...] = ()
     silent: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
 class ReplayRun:
-    """One run of a replay; what is known at the start, and more while the messages are iterated.
+    """One run of a replay; its attributes are updated while the messages are iterated.
 
     `messages`: in order of `due`; can be iterated once.
-    `addresses`: every address in the messages so far, with its definition, or None for the default of its topic.
+    `addresses`: those of the messages so far, each with its definition, or None for the default of its topic.
     `total`: number of messages, or of bytes if there is a `position`; None if endless.
-    `summary`: a description for the log; `warnings`: damage, and skipped parts.
-    `damage`: a description of messages lost to damage; with it, the run ends as failed.
-    `position`: bytes of the file that were read; None if progress is counted in messages.
-    `boot_utc`: Unix time of the vehicle's boot, as the file has it besides its messages [us]; 0 if it has none.
+    `summary`: description for the log; `warnings`: damage and skipped parts.
+    `damage`: description of messages lost to damage, which make the run fail; None without damage.
+    `position`: bytes read so far; None if progress is counted in messages.
+    `boot_utc`: Unix time of the vehicle's boot from the metadata of the file [us]; 0 if unknown.
     """
 
     messages: Iterator[SourceMessage]
@@ -87,14 +87,14 @@ class ReplayRun:
 
 @dataclass(frozen=True, slots=True)
 class ReplaySource:
-    """A source that can be replayed, once or repeatedly; `open` raises SourceError if it has no message to read."""
+    """A source that can be replayed repeatedly; `open` raises SourceError if it has no readable message."""
 
     options: RecordedOptions | SimulatorOptions
     open: Callable[[], ReplayRun]
 
     @property
     def finite(self) -> bool:
-        """True if it ends by itself."""
+        """True if the replay has an end."""
         options = self.options
         return options.duration is not None if isinstance(options, SimulatorOptions) else not options.loop
 
@@ -103,7 +103,9 @@ class ReplaySource:
 class LiveSource(Protocol):
     """A source that receives from vehicles; its addresses become known as messages arrive."""
 
-    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | LogStreamStatus | None]:
+    def listen(
+        self, router: Session | None
+    ) -> Iterator[SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None]:
         """Yield events until the iterator is closed; yield None at least twice a second while idle.
 
         `router`: the service's own session if it is a router; borrowed, so do not close it.

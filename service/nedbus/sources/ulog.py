@@ -1,4 +1,4 @@
-"""Replay a PX4 .ulg log while reading it: all instances of its topics in the log's own order, paced by timestamps."""
+"""Replay a PX4 .ulg log while reading it: all topic instances in logged order, paced by timestamps."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -7,25 +7,25 @@ from pathlib import Path
 from typing import Final, cast
 
 from nedbus.recording import UlogReader
-from nedbus.ulog import SPOKEN, LoggedStream
+from nedbus.ulog import LOG_MESSAGE, LoggedStream
 from nedbus_msgs import ALL, DEFAULT, Address
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceMessage
 
-_AHEAD: Final = 1000  # messages read when a log is opened: their addresses are known from the start
+_LOOKAHEAD: Final = 1000  # messages read when a log is opened, for the initial list of addresses
 _MAX_STEP: Final = 1_000_000  # us; a longer step must be confirmed by the next message
 _MAX_GAP: Final = 60_000_000  # us; a longer step is skipped
-_MAX_BEHIND: Final = 1000  # messages in a row that are older than that; then the clock goes back
+_MAX_BEHIND: Final = 1000  # consecutive messages that are older by more than that, after which the clock is set back
 
 
 def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:
-    """Read the beginning; raise SourceError if it is not a ULog file or has none of the requested topics."""
+    """Read the start of a log; raise SourceError if it is not a ULog file or has none of the requested topics."""
     path = Path(file).expanduser()
     reader = UlogReader(path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=default_vehicle)
     run = ReplayRun(iter(()), {}, None, "", position=0)
     messages = _read(reader, run, path, options)
-    ahead = list(islice(messages, _AHEAD))
+    ahead = list(islice(messages, _LOOKAHEAD))
     run.messages = (message for part in (ahead, messages) for message in part)
     run.total, run.boot_utc = path.stat().st_size, reader.boot_utc
     streams = list(reader.streams.values())
@@ -55,7 +55,7 @@ def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptio
 
 
 class _Clock:
-    """A clock that follows the timestamps of a log from the start of logging, and does not wait for outliers."""
+    """Replay clock: follows the timestamps of a log from the start of logging, and ignores outliers."""
 
     def __init__(self) -> None:
         self.gaps = 0  # steps that were skipped as too long
@@ -71,7 +71,7 @@ class _Clock:
             fields = stream.decode(payload)
             time = cast("int", fields["timestamp"])
             self._now = self._now or reader.start
-            if time < newest.get(stream, 0) and stream.subscription is not SPOKEN:  # PX4 queues its texts
+            if time < newest.get(stream, 0) and stream.subscription is not LOG_MESSAGE:  # PX4 queues log messages
                 self.unordered[stream.address] += 1
             newest[stream] = time
             if held is not None:
@@ -114,7 +114,7 @@ def _warnings_of(reader: UlogReader) -> list[str]:
 
 
 def _is_newer(stream: LoggedStream) -> bool:
-    """Return whether a log may be newer than this version: it has all fields of the newest known layout."""
+    """Return whether the log may be newer than nedbus: it has all fields of the newest known layout."""
     newest = [layout for layout in stream.definition.layouts.values() if layout.name != ALL][-1]
     return newest.types.keys() <= set(stream.names)
 

@@ -1,4 +1,4 @@
-"""Layouts of logged messages, resolved from the formats of a log within limits."""
+"""Layouts of logged messages, resolved from the format definitions of a log within size limits."""
 
 import re
 import struct
@@ -14,21 +14,21 @@ BASIC_TYPES: Final[Mapping[str, FieldType]] = {
         for c, px4 in {"float": "float32", "double": "float64", "bool": "bool", "char": "char"}.items()
     },
 }
-"""The types that ULog defines, by their names in C."""
+"""ULog's basic types, by their C names."""
 FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
-"""One field of a format."""
+"""One field of a format definition."""
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
 _MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
-_MAX_ALL_FIELDS: Final = 8192  # of all messages, also of those refused: 45 us each; a real log has 1,500
-_MAX_FIELDS: Final = 1000  # of one message, nested ones and padding included; a real one has 100
-_MAX_SIZE: Final = 65_533  # bytes of one message: the size of a record is a uint16, and two bytes are the message id
+_MAX_ALL_FIELDS: Final = 8192  # of all messages, including rejected ones: 45 us each; a real log has 1,500
+_MAX_FIELDS: Final = 1000  # of one message, including nested fields and padding; a real one has 100
+_MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
 _BOOLS: Final = (False, True, *range(2, 256))  # a byte other than 0 and 1 is left for the model to reject
 
 
 class PayloadField(NamedTuple):
-    """One field of a message; `offset`: in its payload."""
+    """One field of a message; `offset`: position in the payload [bytes]."""
 
     name: str
     kind: FieldType
@@ -36,24 +36,24 @@ class PayloadField(NamedTuple):
 
 
 class PayloadLayout:
-    """The fields of a logged message; `size`: bytes without the padding at its end, which PX4 does not log."""
+    """The fields of a logged message; `size`: bytes without trailing padding, which PX4 does not log."""
 
     def __init__(self, fields: tuple[PayloadField, ...], size: int, padding: int) -> None:
         self.fields, self.size, self.padding = fields, size, padding
         self._bools = [name for name, kind, _ in fields if kind.base == "bool"]
         self._texts = [name for name, kind, _ in fields if kind.is_text]
-        self._places: list[tuple[str, int | slice]] = []  # of each field in the unpacked values
-        form, end, count = "<", 0, 0
+        self._indices: list[tuple[str, int | slice]] = []  # of each field among the unpacked values
+        code, end, count = "<", 0, 0
         for name, kind, offset in fields:
-            self._places.append((name, slice(count, count + kind.values) if kind.is_array else count))
-            form += f"{offset - end}x{_form(kind)}"
+            self._indices.append((name, slice(count, count + kind.values) if kind.is_array else count))
+            code += f"{offset - end}x{_struct_format(kind)}"
             end, count = offset + kind.values * kind.size, count + kind.values
-        self._unpack = struct.Struct(form).unpack_from
+        self._unpack = struct.Struct(code).unpack_from
 
     def decode(self, payload: bytes) -> dict[str, Any]:
-        """Return the fields of a payload of at least `size` bytes: int, float, bool, str, or tuples of numbers."""
+        """Decode a payload of at least `size` bytes; values are int, float, bool, str, or tuples of numbers."""
         values = self._unpack(payload)
-        fields: dict[str, Any] = {name: values[place] for name, place in self._places}
+        fields: dict[str, Any] = {name: values[index] for name, index in self._indices}
         for name in self._bools:
             value = fields[name]
             fields[name] = _BOOLS[value] if isinstance(value, int) else tuple(map(_BOOLS.__getitem__, value))
@@ -63,9 +63,9 @@ class PayloadLayout:
 
     @property
     def dtype(self) -> Any:
-        """The argument of `numpy.dtype` for the type of a payload; a bool is a uint8."""
+        """Argument for `numpy.dtype` that describes a payload; a bool is a uint8."""
         types = [
-            f"S{kind.size}" if kind.is_text else (f"<{_form(kind)}"[-1], kind.length or ())
+            f"S{kind.size}" if kind.is_text else (f"<{_struct_format(kind)}"[-1], kind.length or ())
             for _, kind, _ in self.fields
         ]
         names, _, offsets = zip(*self.fields, strict=True)
@@ -73,7 +73,7 @@ class PayloadLayout:
 
 
 class Formats:
-    """The formats of a log, and the layouts resolved from them; a format may be recursive, or expand to gigabytes."""
+    """The format definitions of a log and their layouts; a hostile one may be recursive, or expand to gigabytes."""
 
     def __init__(self) -> None:
         self._texts: dict[str, str] = {}
@@ -82,13 +82,13 @@ class Formats:
         self._left = _MAX_ALL_FIELDS
 
     def add(self, name: str, text: str) -> None:
-        """Store the format of a message; raise ValueError if it contradicts an earlier one, or there are too many."""
+        """Store a format definition; raise ValueError if it contradicts an earlier one, or there are too many."""
         if self._texts.get(name, text) != text:
-            raise ValueError(f"a second format of {name} with other fields")
+            raise ValueError(f"{name} is defined twice, with different fields")
         if name not in self._texts:
             self._free -= len(name) + len(text)
             if self._free < 0:
-                raise ValueError(f"the formats have more than {_MAX_FORMATS} characters")
+                raise ValueError(f"the format definitions have more than {_MAX_FORMATS} characters")
             self._texts[name] = text
 
     def layout(self, name: str) -> PayloadLayout:
@@ -113,22 +113,22 @@ class Formats:
             if not field.rpartition(".")[2].startswith("_padding"):
                 flat = re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_") if "." in field else field
                 if flat in fields:
-                    raise ValueError(f"two fields are called {flat}, including those of nested messages")
+                    raise ValueError(f"two fields are called {flat} after flattening nested messages")
                 array = "char" if c_type == "char" else base.base
                 fields[flat] = PayloadField(flat, field_type(f"{array}[{length}]") if length else base, start)
             size = size if field.startswith("_padding") else offset
         return PayloadLayout(tuple(fields.values()), size, offset - size)
 
     def _expand(self, name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, str, int | None]]:
-        """Yield name, basic type and length of each field one by one, so that the caller can stop at its limits."""
+        """Yield name, basic type and length of each field one by one, which lets the caller stop at its limits."""
         if level > _MAX_NESTING:
-            raise ValueError(f"its messages are nested more than {_MAX_NESTING} levels deep")
+            raise ValueError(f"it nests messages more than {_MAX_NESTING} levels deep")
         if not self._texts.get(name):
-            raise ValueError(f"there is no format, or one without fields, of {name}")
+            raise ValueError(f"the format of {name} is missing, or has no fields")
         for found in FIELD.finditer(self._texts[name]):
             kind, field, length = found[1], prefix + found[3], int(found[2]) if found[2] else None
             if length == 0:
-                raise ValueError(f"the array {field} has no elements")
+                raise ValueError(f"the array {field} has length 0")
             if kind in BASIC_TYPES:
                 yield field, kind, length
                 continue
@@ -136,6 +136,6 @@ class Formats:
                 yield from self._expand(kind, f"{field}." if length is None else f"{field}[{index}].", level + 1)
 
 
-def _form(kind: FieldType) -> str:
-    """Return the struct format of a field; any byte is read where a bool should be."""
+def _struct_format(kind: FieldType) -> str:
+    """Return the struct format of a field; a bool is read as a uint8, which may have any value."""
     return kind.form.replace("?", "B")

@@ -1,4 +1,4 @@
-"""Incremental parser of a ULog: bytes in, records out."""
+"""Incremental ULog parser: bytes in, records out."""
 
 import re
 import struct
@@ -25,40 +25,40 @@ from .records import (  # fmt: skip
 _START: Final = 16  # bytes before the first record
 _HEADER: Final = 3  # bytes of a record: size and type
 _DATA_HEADER: Final = 5  # bytes: size, type and message id
-_MAX_PADDING: Final = 8  # bytes that a message may have beyond its size; PX4 aligns to 8
+_MAX_PADDING: Final = 8  # bytes of trailing padding in a message; PX4 aligns to 8
 _MAX_SUBSCRIPTIONS: Final = 1000  # at a time; a real log has 170
-_MAX_SKIPPED: Final = 16  # records of unknown content in a row
-_WINDOW: Final = 2**16  # bytes: after damage of this length, records are found
-_SAMPLE: Final = 2**12  # bytes of a window that are searched in longer damage
-_MIN_DISTANCE: Final = 64  # bytes between two candidates, on average, beyond which no more are judged
+_MAX_SKIPPED: Final = 16  # consecutive records of unknown content
+_WINDOW: Final = 2**16  # bytes; damage of up to twice this length is searched completely
+_SAMPLE: Final = 2**12  # bytes searched of each further window
+_MIN_DISTANCE: Final = 64  # bytes per candidate, on average; denser data is searched only in part
 _VALUE: Final = rb"[\x05-\xff](?:u?int|float|double|bool|char)"
 _CANDIDATE = re.compile(rb"(?s)D|S/s\x13 |A...[A-Za-z]|F[A-Za-z]\w|[IP]%b|[MQ].%b|[CL][0-7]" % (_VALUE, _VALUE))
-"""The type of a record, and as much of its content as rules out most other bytes."""
-_CONTEXT: Final = 16  # bytes that a candidate can have
+"""The type of a record, and enough of its content to rule out most other bytes."""
+_CONTEXT: Final = 16  # maximum bytes of a candidate
 
 
-class _Judgement(Enum):
-    SOUND = auto()  # a record whose content fits its type and size
-    OPAQUE = auto()  # a record of unknown type, message id or content, or none: only what follows can tell
-    NONE = auto()
-    PARTIAL = auto()  # bytes are missing
+class _Validity(Enum):
+    VALID = auto()  # a record whose content matches its type and size
+    UNKNOWN = auto()  # unknown type, message id or content: validity depends on the following bytes
+    INVALID = auto()
+    INCOMPLETE = auto()  # more bytes are needed
 
 
-class _Seen(NamedTuple):
-    """A position of the buffer; `record`: None for data."""
+class _Inspection(NamedTuple):
+    """Result for one position of the buffer; `stop`: end of the record; `record`: None for data."""
 
-    judgement: _Judgement
+    validity: _Validity
     stop: int
     record: Record | None = None
 
 
 class UlogParser:
-    """Parse a ULog in pieces of any size; the memory is that of one piece, its definitions, and 256 KiB.
+    """Parses a ULog in chunks of any size; memory is limited to one chunk, the definitions, and 256 KiB.
 
-    `verify`: for a file, which has no checksums: messages are returned only if the next record follows them, and after
-    damage the next records are searched. Without, lengths are trusted, as those of a transport with checksums.
-    `subscriptions`: those whose data can be decoded, by message id.
-    `undecodable`: number of messages without a subscription that fits them.
+    `verify`: for files, which have no checksums: return a message only if a valid record follows it, and resynchronise
+    after damage. Otherwise trust the lengths, as for a transport with checksums.
+    `subscriptions`: those with a decodable format, by message id.
+    `undecodable`: number of data messages without a matching subscription.
     """
 
     def __init__(self, *, verify: bool) -> None:
@@ -67,7 +67,7 @@ class UlogParser:
         self._formats = Formats()
         self.subscriptions: dict[int, Subscription] = {}
         self._known: dict[bytes, tuple[Subscription, int, int]] = {}
-        """By the first five bytes of a record: its subscription, its length, and the length without padding."""
+        """By the first five bytes of a data message: its subscription, its length, and the length without padding."""
         self._buffer = b""
         self._offset = 0  # of the buffer in the log
         self._boundaries: list[int] | None = None  # offsets of appended data; None before the first record
@@ -75,16 +75,16 @@ class UlogParser:
         self._records: list[Record] = []
 
     def feed(self, data: bytes) -> list[Record]:
-        """Return the records that these bytes complete; raise UlogError if it is no ULog, or one of a newer version."""
+        """Return the records that these bytes complete; raise UlogError if the data is not a readable ULog."""
         self._buffer += data
         return self._parse(is_end=False)
 
     def gap(self) -> None:
-        """Discard a partial record because bytes are missing; the next byte begins a record."""
+        """Discard a partial record after a loss of bytes; the next byte must begin a record."""
         self._drop(len(self._buffer))
 
     def close(self) -> list[Record]:
-        """Return the records at the end of the log; raise UlogError if it is no ULog."""
+        """Return the remaining records at the end of the log; raise UlogError if it is not a ULog."""
         return self._parse(is_end=True)
 
     def _parse(self, *, is_end: bool) -> list[Record]:
@@ -109,7 +109,7 @@ class UlogParser:
             header = read_header(self._buffer[:_START])
             self._records.append(header)
             if header.version > 1:
-                self._records.append(Damage(f"unknown version {header.version} of the format"))
+                self._records.append(Damage(f"unknown version {header.version} of the ULog format"))
             offsets = read_flags(self._buffer[content:stop]) if kind == b"B" else ()
             self._boundaries = sorted(offset for offset in offsets if offset >= stop)
             self._drop(min(stop, len(self._buffer)))
@@ -124,16 +124,16 @@ class UlogParser:
         while after is not None and after < len(self._buffer):
             at = after
             if self._damage is None:
-                at = self._take_data(at)
-                after = self._take_record(at, is_end=is_end)
+                at = self._consume_data(at)
+                after = self._consume_record(at, is_end=is_end)
             else:
                 after = self._search(at, is_end=is_end)
         self._drop(at if after is None else after)
         if is_end:
             self._end_damage()
 
-    def _take_data(self, at: int) -> int:
-        """Take messages up to the last one in a row, whose successor needs a closer look; return its position."""
+    def _consume_data(self, at: int) -> int:
+        """Consume consecutive data messages but the last, whose successor needs inspection; return its position."""
         buffer, known, records = self._buffer, self._known, self._records
         make = tuple.__new__  # half the time of calling a NamedTuple
         found = known.get(buffer[at : at + _DATA_HEADER])
@@ -147,100 +147,100 @@ class UlogParser:
                 at = stop
         return at
 
-    def _take_record(self, at: int, *, is_end: bool) -> int | None:
-        """Take a record; return the position after it, None if bytes are missing."""
-        seen = self._look(at)
-        if seen.judgement is _Judgement.PARTIAL and not (is_end and self._verify):
+    def _consume_record(self, at: int, *, is_end: bool) -> int | None:
+        """Consume a record; return the position after it, None if more bytes are needed."""
+        inspected = self._inspect(at)
+        if inspected.validity is _Validity.INCOMPLETE and not (is_end and self._verify):
             return self._truncate(at) if is_end else None
-        if not self._verify or (seen.judgement is _Judgement.SOUND and seen.record is not None):
-            return self._emit(at, seen)
-        if seen.judgement is _Judgement.SOUND:
-            following = self._look(seen.stop).judgement
-            if following is _Judgement.SOUND:
-                return self._emit(at, seen)
-            if following is _Judgement.PARTIAL and not is_end:
+        if not self._verify or (inspected.validity is _Validity.VALID and inspected.record is not None):
+            return self._emit(at, inspected)
+        if inspected.validity is _Validity.VALID:
+            following = self._inspect(inspected.stop).validity
+            if following is _Validity.VALID:
+                return self._emit(at, inspected)
+            if following is _Validity.INCOMPLETE and not is_end:
                 return None
-        return self._settle(at, is_end=is_end)
+        return self._accept_unknown(at, is_end=is_end)
 
-    def _settle(self, at: int, *, is_end: bool) -> int | None:
-        """Take records of unknown content if their lengths lead to the next chain of records; else begin a search."""
+    def _accept_unknown(self, at: int, *, is_end: bool) -> int | None:
+        """Accept records of unknown content if their lengths lead to the next valid chain; otherwise start a search."""
         start, found = self._find(at + 1, at + 1 + 2 * _WINDOW, is_end=is_end)
-        if found is _Judgement.PARTIAL:
+        if found is _Validity.INCOMPLETE:
             return None
-        passed: list[tuple[int, _Seen]] = []
-        place, seen = at, self._look(at)
-        while place < start and seen.judgement in (_Judgement.SOUND, _Judgement.OPAQUE):
-            passed.append((place, seen))
-            place, seen = seen.stop, self._look(seen.stop)
-        if place == start if found is _Judgement.SOUND else is_end and self._is_tail(place):
+        passed: list[tuple[int, _Inspection]] = []
+        place, inspected = at, self._inspect(at)
+        while place < start and inspected.validity in (_Validity.VALID, _Validity.UNKNOWN):
+            passed.append((place, inspected))
+            place, inspected = inspected.stop, self._inspect(inspected.stop)
+        if place == start if found is _Validity.VALID else is_end and self._is_tail(place):
             for each in passed:
                 self._emit(*each)
-            return start if found is _Judgement.SOUND else self._truncate(place)
+            return start if found is _Validity.VALID else self._truncate(place)
         self._damage = self._offset + at
         return at + 1
 
     def _search(self, at: int, *, is_end: bool) -> int | None:
-        """Return the start of the next chain of records, or the end of a window without one."""
-        begun = (self._damage or 0) - self._offset  # may be before the buffer
+        """Return the start of the next valid chain of records, or the end of a window without one."""
+        begun = (self._damage or 0) - self._offset  # negative if before the buffer
         number = (at - begun - 1) // _WINDOW
         window = begun + 1 + number * _WINDOW
         start, found = self._find(at, window + (_WINDOW if number < 2 else _SAMPLE), is_end=is_end)
-        if found is _Judgement.SOUND:
+        if found is _Validity.VALID:
             self._end_damage()
             return start
-        return None if found is _Judgement.PARTIAL else min(window + _WINDOW, len(self._buffer))
+        return None if found is _Validity.INCOMPLETE else min(window + _WINDOW, len(self._buffer))
 
     def _end_damage(self) -> None:
         if self._damage is not None:
-            self._records.append(Damage(f"no record begins at byte {self._damage}"))
+            self._records.append(Damage(f"no valid record at byte {self._damage}"))
             self._damage = None
 
-    def _find(self, start: int, stop: int, *, is_end: bool) -> tuple[int, _Judgement]:
-        """Return the first position in a range where a chain of records begins; PARTIAL: more bytes will tell."""
+    def _find(self, start: int, stop: int, *, is_end: bool) -> tuple[int, _Validity]:
+        """Return the first position in a range where a valid chain of records begins, or may begin (INCOMPLETE)."""
         limit = 1 + max(0, stop - start) // _MIN_DISTANCE
         for found in islice(_CANDIDATE.finditer(self._buffer, start + 2, stop + _CONTEXT), limit):
             at = found.start() - 2
-            judgement = self._judge_chain(at, is_end=is_end) if at < stop else _Judgement.NONE
-            if judgement is not _Judgement.NONE:
-                return at, judgement
+            validity = self._validate_chain(at, is_end=is_end) if at < stop else _Validity.INVALID
+            if validity is not _Validity.INVALID:
+                return at, validity
         is_whole = is_end or len(self._buffer) >= stop + _CONTEXT
-        return min(stop, len(self._buffer)), _Judgement.NONE if is_whole else _Judgement.PARTIAL
+        return min(stop, len(self._buffer)), _Validity.INVALID if is_whole else _Validity.INCOMPLETE
 
-    def _judge_chain(self, at: int, *, is_end: bool) -> _Judgement:
-        """Judge whether a sound record begins here, and leads to another one; a sync needs no other."""
-        seen = self._look(at)
-        if seen.judgement is _Judgement.PARTIAL and not is_end:
-            return _Judgement.PARTIAL
-        if seen.judgement is not _Judgement.SOUND or isinstance(seen.record, Sync):
-            return _Judgement.SOUND if isinstance(seen.record, Sync) else _Judgement.NONE
+    def _validate_chain(self, at: int, *, is_end: bool) -> _Validity:
+        """Check that a valid record begins here and leads to another one; a sync message needs no other."""
+        inspected = self._inspect(at)
+        if inspected.validity is _Validity.INCOMPLETE and not is_end:
+            return _Validity.INCOMPLETE
+        if inspected.validity is not _Validity.VALID or isinstance(inspected.record, Sync):
+            return _Validity.VALID if isinstance(inspected.record, Sync) else _Validity.INVALID
         for _ in range(_MAX_SKIPPED):
-            place, seen = seen.stop, self._look(seen.stop)
-            if seen.judgement is _Judgement.PARTIAL and is_end:
-                return _Judgement.SOUND if self._is_tail(place) else _Judgement.NONE
-            if seen.judgement is not _Judgement.OPAQUE:
-                return seen.judgement
-        return _Judgement.NONE
+            place, inspected = inspected.stop, self._inspect(inspected.stop)
+            if inspected.validity is _Validity.INCOMPLETE and is_end:
+                return _Validity.VALID if self._is_tail(place) else _Validity.INVALID
+            if inspected.validity is not _Validity.UNKNOWN:
+                return inspected.validity
+        return _Validity.INVALID
 
-    def _look(self, at: int) -> _Seen:
+    def _inspect(self, at: int) -> _Inspection:
         buffer = self._buffer
         known = self._known.get(buffer[at : at + _DATA_HEADER])
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
         stop = content + int.from_bytes(buffer[at : at + 2], "little")
-        if kind and not b"!" <= kind <= b"~":  # a type is a printable character, one of a later version, too
-            return _Seen(_Judgement.NONE, stop)
+        if kind and not b"!" <= kind <= b"~":  # record types are printable characters, in later versions too
+            return _Inspection(_Validity.INVALID, stop)
         if stop > len(buffer) or not kind:
-            return _Seen(_Judgement.PARTIAL, stop)
-        if known is not None:  # a sync in the message replaces bytes that were cut out
-            return _Seen(_Judgement.OPAQUE if self._verify and SYNC in buffer[at:stop] else _Judgement.SOUND, stop)
+            return _Inspection(_Validity.INCOMPLETE, stop)
+        if known is not None:  # a sync message inside it means that bytes are missing
+            return _Inspection(_Validity.UNKNOWN if self._verify and SYNC in buffer[at:stop] else _Validity.VALID, stop)
         try:
             record = READERS[kind[0]](buffer[content:stop])
         except (ValueError, LookupError, struct.error):
-            return _Seen(_Judgement.OPAQUE, stop)
-        is_sound = EXACT_SIZES.get(kind[0], stop - content) == stop - content
-        return _Seen(_Judgement.SOUND if is_sound else _Judgement.OPAQUE, stop, record)
+            return _Inspection(_Validity.UNKNOWN, stop)
+        is_valid = EXACT_SIZES.get(kind[0], stop - content) == stop - content
+        return _Inspection(_Validity.VALID if is_valid else _Validity.UNKNOWN, stop, record)
 
     def _is_tail(self, at: int) -> bool:
-        """Return whether the log may end here, within a record or behind one."""
+        """Return whether the log may end here, inside or after a record."""
         head = self._buffer[at : at + _DATA_HEADER]
         if len(head) < _HEADER or head[2] == ord("D"):
             return not head or any(known.startswith(head) for known in self._known)
@@ -252,32 +252,32 @@ class UlogParser:
             self._records.append(Damage("the file ends inside a message", is_end=True))
         return end
 
-    def _emit(self, at: int, seen: _Seen) -> int:
-        """Use a record; return the position after it."""
+    def _emit(self, at: int, inspected: _Inspection) -> int:
+        """Add a record to the result; return the position after it."""
         kind, reason = self._buffer[at + 2], ""
-        if seen.record is not None:
+        if inspected.record is not None:
             try:
-                self._records.extend(self._apply(seen.record))
+                self._records.extend(self._apply(inspected.record))
             except ValueError as exc:
                 reason = str(exc)
-        elif seen.judgement is _Judgement.SOUND:
+        elif inspected.validity is _Validity.VALID:
             subscription, _, used = self._known[self._buffer[at : at + _DATA_HEADER]]
             self._records.append(Data(subscription, self._buffer[at + _DATA_HEADER : at + used]))
         elif kind == ord("D"):
             self.undecodable += 1
-        elif kind in READERS or seen.judgement is _Judgement.NONE:
+        elif kind in READERS or inspected.validity is _Validity.INVALID:
             reason = f"the record at byte {self._offset + at} is damaged"
         if reason:
             self._records.append(Damage(reason))
-        return seen.stop
+        return inspected.stop
 
     def _apply(self, record: Record) -> list[Record]:
-        """Store a definition, and return it if it is new; raise ValueError if it cannot be used."""
+        """Store a definition; return it if it is new; raise ValueError if it is unusable."""
         if isinstance(record, Subscription):
             old = self.subscriptions.get(record.message_id)
             if old is not None:
                 if (old.multi_id, old.name) != (record.multi_id, record.name):
-                    raise ValueError(f"the message id of {old.name} is also that of {record.name}, which is ignored")
+                    raise ValueError(f"{record.name} is ignored: its message id belongs to {old.name}")
                 return []
             try:
                 if len(self.subscriptions) == _MAX_SUBSCRIPTIONS:

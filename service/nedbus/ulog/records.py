@@ -1,4 +1,4 @@
-"""The records of a ULog, named by its specification, their readers, and the streams of logged messages."""
+"""ULog records, named as in the specification, their readers, and the streams of logged messages."""
 
 import re
 import struct
@@ -17,29 +17,29 @@ _NAME = re.compile(r"[A-Za-z][\w/-]{0,254}", re.ASCII)
 _KEY = re.compile(rb"(\w+)(\[\d{1,5}\])? (\S[^\0]*)")
 
 Value = int | float | bool | str | bytes
-"""Value of an information or a parameter; an array of numbers, or a value of an unknown type, is bytes."""
+"""Value of an information message or parameter; arrays of numbers and values of unknown types are bytes."""
 
 
 class UlogError(ValueError):
-    """Raised when bytes are not a ULog, or one that a parser must refuse."""
+    """Raised for data that is not a ULog, or a ULog with unknown incompatible flags."""
 
 
 class Header(NamedTuple):
-    """The start of a log; `timestamp`: when logging began [us]."""
+    """File header; `timestamp`: start of logging [us]."""
 
     version: int
     timestamp: int
 
 
 class Format(NamedTuple):
-    """The fields of a message, as text: `uint64_t timestamp;float[3] xyz;`."""
+    """Format definition; `fields`: `uint64_t timestamp;float[3] xyz;`."""
 
     name: str
     fields: str
 
 
 class Information(NamedTuple):
-    """A fact, or the default of a parameter; `continued`: it belongs to the preceding value of its key."""
+    """Information, multi information or default parameter; `continued`: continues the previous value of this key."""
 
     key: str
     value: Value
@@ -47,14 +47,14 @@ class Information(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """A parameter; after the first subscription, its new value."""
+    """Parameter; after the first subscription, a changed one."""
 
     key: str
     value: Value
 
 
 class Subscription(NamedTuple):
-    """One instance of a topic, with flat names of fields: `esc[0].rpm` of the log is `esc_0_rpm`."""
+    """Subscription to one instance of a topic; nested fields are flattened, `esc[0].rpm` to `esc_0_rpm`."""
 
     message_id: int
     multi_id: int
@@ -69,14 +69,14 @@ class Unsubscription(NamedTuple):
 
 
 class Data(NamedTuple):
-    """One message; `payload` has exactly the size of the subscription."""
+    """Logged data message; `payload` has exactly the size of the layout."""
 
     subscription: Subscription
     payload: bytes
 
 
 class LoggedText(NamedTuple):
-    """A text that PX4 printed; `level`: 0 (emergency) to 7 (debug); `tag`: its source, if it has one."""
+    """Logged string; `level`: 0 (emergency) to 7 (debug); `tag`: source of a tagged string."""
 
     level: int
     timestamp: int
@@ -85,17 +85,17 @@ class LoggedText(NamedTuple):
 
 
 class Sync(NamedTuple):
-    """A mark in the log, twice a second."""
+    """Synchronization message, logged twice a second."""
 
 
 class Dropout(NamedTuple):
-    """A time in which the logger lost messages; `duration`: in ms."""
+    """Period in which the logger lost messages; `duration`: in ms."""
 
     duration: int
 
 
 class Damage(NamedTuple):
-    """Bytes that are not used; `is_end`: the log ends inside a record, as after a loss of power."""
+    """Unusable bytes; `is_end`: the log ends inside a record, as after a power loss."""
 
     reason: str
     is_end: bool = False
@@ -120,9 +120,9 @@ _UNRESOLVED: Final = PayloadLayout((), 0, 0)
 
 
 def read_header(data: bytes) -> Header:
-    """Read the 16 bytes before the first record; raise UlogError if they are not those of a ULog."""
+    """Parse the 16-byte file header; raise UlogError if it is not that of a ULog."""
     if len(data) < 16 or not data.startswith(b"ULog\x01\x12\x35"):
-        raise UlogError("it does not begin with the magic bytes of a ULog")
+        raise UlogError("it does not begin with ULog's magic bytes")
     return Header(data[7], int.from_bytes(data[8:16], "little"))
 
 
@@ -130,7 +130,7 @@ def read_flags(content: bytes) -> tuple[int, ...]:
     """Return the offsets of appended data; raise UlogError for an unknown incompatible flag, as the format requires."""
     incompatible, *offsets = struct.unpack_from("<8xQ3Q", content.ljust(40, b"\0"))
     if incompatible & ~1:
-        raise UlogError(f"it has unknown incompatible flags ({incompatible:#x}): read it with a newer version")
+        raise UlogError(f"it has unknown incompatible flags ({incompatible:#x}): update nedbus")
     return tuple(offsets) if incompatible else ()
 
 
@@ -152,7 +152,7 @@ def _key_and_value(content: bytes) -> tuple[str, Value]:
 
 
 def _text(content: bytes, tag: int | None = None) -> LoggedText:
-    """Read a text whose level is followed by its timestamp."""
+    """Parse a logged string: level, timestamp, text."""
     level, timestamp = struct.unpack_from("<BQ", content)
     if not 0x30 <= level <= 0x37 or len(content) > _MAX_TEXT:
         raise ValueError
@@ -186,20 +186,19 @@ READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
     ord("R"): lambda content: Unsubscription(struct.unpack_from("<H", content)[0]),
     ord("S"): _sync,
 }
-"""Reader of each type of record apart from data; raises ValueError, LookupError or struct.error.
+"""Reader of each record type except data; raises ValueError, LookupError or struct.error.
 
 A subscription is returned without its layout.
 """
 EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC)}
-"""Sizes of records that are recognized by their size; longer ones are read, too."""
+"""Sizes of records of fixed size; a longer one is read, but not considered valid."""
 
 
 class LoggedStream:
-    """The messages of one subscription: their address, their definition, and the decoding of their payloads.
+    """Address, message definition and decoder of one subscription.
 
-    The definition is that of nedbus, or one of the log's format.
-    A topic without a file in nedbus has its plain address for the first instance, and the number for others: a stream
-    of data does not announce whether another instance will follow.
+    The definition is nedbus's own, or else made from the log's format. For a topic without a definition in nedbus, the
+    first instance has no instance number: a stream does not announce whether others will follow.
 
     Raises ValueError for a format that cannot be a message, AddressError for an invalid vehicle or topic.
     """
@@ -215,25 +214,25 @@ class LoggedStream:
         has_number = TOPICS[topic].instances if topic in TOPICS else subscription.multi_id > 0
         self.address = Address(vehicle, topic, subscription.multi_id if has_number else None)
         self.converted: dict[str, FieldType] = {}
-        """Fields that the message has with another type, such as an int32 of PX4 1.9 that is a uint8: that type."""
+        """Target type of each field whose logged type differs, such as an int32 of PX4 1.9 that is now a uint8."""
         for name, kind, _ in layout.fields:
             known = self.definition.known_types.get(name, {kind})
             if kind not in known:
                 self.converted[name] = self.definition.types.get(name) or next(iter(known))
-        self.unfit: dict[str, str] = {}
-        """By the name of a field, where it was left out for the first time because its value does not fit."""
+        self.omitted: dict[str, str] = {}
+        """Warnings for fields left out because a value does not fit the target type, by field name."""
 
     def decode(self, payload: bytes) -> dict[str, Any]:
-        """Return the fields of a message, without those whose value does not fit their type."""
+        """Decode a message; leave out fields whose value does not fit their target type."""
         fields = self.subscription.layout.decode(payload)
         for name, kind in self.converted.items():
             value = fields.pop(name)
             fitted = kind.fit(value)
             if fitted is not None:
                 fields[name] = fitted
-            elif name not in self.unfit:
+            elif name not in self.omitted:
                 topic = self.subscription.name
-                self.unfit[name] = f"{topic}: left out {name} where it is not a {kind}, such as {value!r:.60}"
+                self.omitted[name] = f"{topic}: {name} left out where its value is not a {kind}, such as {value!r:.60}"
         return fields
 
 

@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from nedbus.events import (
-    Account,
     Condition,
     Event,
+    EventLog,
     Span,
     Story,
     Times,
     Verdict,
+    format_utc,
     spans_of,
     stories_of,
     story_of,
-    to_clock,
     unit_of,
     verdict_of,
 )
@@ -27,13 +27,13 @@ _URL_RESOLUTION: Final = 0.1  # s; times in the URL are rounded to this
 
 
 class EventTimeline:
-    """The events of an account, and earlier events (`before`); derived values are cached until the next event.
+    """The events of an event log, and earlier events (`before`); derived values are cached until the next event.
 
     `clock_offset`: added to event times to get the time on the axes [s]; `unit`: the name of the axes' clock.
     """
 
-    def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
-        self.account = account
+    def __init__(self, event_log: EventLog, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
+        self.event_log = event_log
         self.times = times or Times(is_live=True)
         self.clock_offset, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
         self._before = before
@@ -59,14 +59,14 @@ class EventTimeline:
     def set_clock(self, vehicle: str, boot: float, time: float) -> None:
         """Set the clock of a recording's time axes, given a message received at `time`, `boot` seconds after boot."""
         utc = self.times.utc_of_boot(vehicle, boot)
-        if utc is not None or len(self.account.vehicles) < 2:  # vehicles boot at different times
+        if utc is not None or len(self.event_log.vehicles) < 2:  # vehicles boot at different times
             self.clock_offset = (boot if utc is None else utc) - time
             self.unit = unit_of("boot" if utc is None else "vehicle")
 
     def format_time(self, seconds: float) -> str:
         """Format an event time on the clock of the axes."""
         seconds += self.clock_offset
-        return to_clock(seconds) if self.unit == "UTC" else f"{seconds:.1f}"
+        return format_utc(seconds) if self.unit == "UTC" else f"{seconds:.1f}"
 
     def format_clock(self, seconds: float) -> str:
         """Format an event time with the name of its clock; for a recording, add the seconds since its start."""
@@ -114,17 +114,17 @@ class EventTimeline:
 
     def _evidence(self, vehicle: str) -> tuple[list[str], list[Condition]]:
         """Return a vehicle's topics, and its conditions that began before the first event or are still active."""
-        state = self.account.vehicles.get(vehicle)
+        state = self.event_log.vehicles.get(vehicle)
         return ([], []) if state is None else ([*state.topics], [*state.initial, *state.conditions.values()])
 
     def _refresh(self) -> None:
-        if self._reported == self.account.reported:
+        if self._reported == self.event_log.reported:
             return
-        events, self._reported = self.account.events_since(0)
+        events, self._reported = self.event_log.events_since(0)
         self._events = sorted([*self._before, *events], key=lambda event: event.time)
         self._find_stories_cached.cache_clear()
         self._verdicts.clear()
-        vehicles = dict(self.account.vehicles)
+        vehicles = dict(self.event_log.vehicles)
         self._by_vehicle = {name: [] for name in vehicles}
         for event in self._events:
             self._by_vehicle.setdefault(event.vehicle, []).append(event)

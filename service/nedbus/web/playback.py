@@ -13,10 +13,10 @@ from bokeh.models.widgets import Select, Slider, Toggle
 
 from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
-from nedbus.events import Account, Times, state_at
+from nedbus.events import EventLog, Times, state_at
 from nedbus.log_event import about
 from nedbus.monitoring import Snapshot
-from nedbus.sources import KEPT_OF_FILE, Flights, follow
+from nedbus.sources import MAX_FILE_EVENTS, Flights, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .event_timeline import EventTimeline
@@ -44,7 +44,7 @@ class Recording:
     def __init__(self, *paths: Path) -> None:
         self.name = ", ".join(path.name for path in paths)
         self.overview = Fleet(long=_OVERVIEW)
-        self.timeline = EventTimeline(Account(KEPT_OF_FILE), times=Times())
+        self.timeline = EventTimeline(EventLog(MAX_FILE_EVENTS), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
@@ -58,10 +58,10 @@ class Recording:
         return self.dues[-1] if self.dues else 0.0
 
     def _read(self) -> None:
-        flights, account = self._flights, self.timeline.account
+        flights, event_log = self._flights, self.timeline.event_log
         try:
             self.timeline.times = flights.times
-            for message, reason, payload in follow(flights.messages(), account, ended=flights.ended):
+            for message, reason, payload in follow(flights.messages(), event_log, ended=flights.ended):
                 address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
                 entry: bytes | str | int = stamp if reason is None else reason
                 if payload is not None and (is_position(address) or address.topic in _STATUS_TOPICS):

@@ -29,7 +29,7 @@ from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError
 from nedbus.events import ALL, Times
 from nedbus.log_event import about
-from nedbus.monitoring import Exporter, Page, Snapshot, leads_here
+from nedbus.monitoring import Exporter, Page, Snapshot, is_local_host_header
 from nedbus.settings import is_loopback
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection
@@ -50,9 +50,7 @@ _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
 _MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, including expiring ones
 _MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
 _PING: Final = 15.0  # s between WebSocket pings; without a pong before the next one, the connection is closed
-_UNUSED_LIFETIME: Final = (
-    15_000  # ms that a page is kept without a connection, for example while its browser is suspended
-)
+_UNUSED_LIFETIME: Final = 15_000  # ms that a page is kept without a connection, e.g. from a suspended browser
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +112,7 @@ class LiveFleet(Exporter):
             for event in report.events
             if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
         ]
-        self.timeline = EventTimeline(self.account, before=remembered)
+        self.timeline = EventTimeline(self.event_log, before=remembered)
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample to the metrics and to the fleet."""
@@ -123,11 +121,11 @@ class LiveFleet(Exporter):
 
     def poll(self) -> Snapshot:
         """Poll all vehicles; update the fleet and the clock of the timeline."""
-        snapshot, account = super().poll(), self.account
+        snapshot, event_log = super().poll(), self.event_log
         ahead = round(clock.to_utc(), 1)  # rounded: each change redraws the time axes
         self.timeline.clock_offset, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
-        vehicles = {*account.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
-        states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in vehicles}
+        vehicles = {*event_log.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
+        states = {vehicle: event_log.state(vehicle, snapshot.time) for vehicle in vehicles}
         self.fleet.update(snapshot, states, self.log_streams)
         return snapshot
 
@@ -244,7 +242,7 @@ def _check_host(handler: RequestHandler, options: PageOptions) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
     origin = headers.get("Origin", f"//{host}").partition("//")[2]  # "Origin: null" has no host
-    is_own = host in options.origins or leads_here(host, local=is_loopback(options.host))
+    is_own = host in options.origins or is_local_host_header(host, local=is_loopback(options.host))
     if not is_own or origin not in (host, *options.origins):
         name = (origin if is_own else host)[:100]
         raise HTTPError(403, reason=f"host name {name} is not allowed: add it with --origin")

@@ -10,7 +10,7 @@ from typing import Final
 
 import jinja2
 
-from nedbus.client import to_age
+from nedbus.client import format_duration
 
 from .fleet import MAX_STREAMS
 from .stream import is_position
@@ -58,7 +58,7 @@ class Style:
 def panels() -> jinja2.Template:
     """Return the template of `panels.html`; its context has a style, a timeline and its `format_time`."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters.update(age=to_age, degrees=math.degrees)
+    environment.filters.update(age=format_duration, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)
     environment.globals.update(MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, hypot=math.hypot)
     return environment.from_string(re.sub(r"(?<=[>}])\n\s*(?=[<{])", "", read_asset("panels.html")))

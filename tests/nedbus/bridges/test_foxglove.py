@@ -93,7 +93,7 @@ def connected(url: str) -> Iterator[Client]:
 def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """Channels appear and disappear with their vehicles; their data is the message in CDR, with its definition."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
+    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/estimator_local_position/1"
     sent = message(5, x=0.25, vxy_max=float("inf"))
@@ -118,7 +118,7 @@ def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpo
 def test_message_without_rate_reaches_the_first_subscriber(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """A home position is sent once and creates its channel, so it is kept for the first subscriber."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
+    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/home_position"
     with connected(url) as client, bus.publisher("home_position", vehicle="7") as publisher:

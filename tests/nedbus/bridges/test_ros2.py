@@ -38,10 +38,10 @@ from tests.flights.local_position import LAYOUTS, ROS2_TYPE, decode_cdr, downgra
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
-from tests.peers.listening import Listener
+from tests.peers.live_source import Listener
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
-from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 PEER = str(Path(__file__).with_name("ros2_peer.py"))
 KEY = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
@@ -87,9 +87,11 @@ def plain_session(endpoint: str) -> AbstractContextManager[Session]:
     return closing(open_client((endpoint,), timeout=DEADLINE))
 
 
-def tokens(raw: Session, kind: str) -> list[str]:
+def tokens(zenoh_session: Session, kind: str) -> list[str]:
     """Return the ROS 2 liveliness tokens of a kind in domain 0: NN of nodes, MP of publishers."""
-    return [str(reply.ok.key_expr) for reply in raw.liveliness().get(f"@ros2_lv/0/*/*/*/{kind}/**") if reply.ok]
+    return [
+        str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get(f"@ros2_lv/0/*/*/*/{kind}/**") if reply.ok
+    ]
 
 
 @pytest.fixture
@@ -126,7 +128,7 @@ def test_message_of_a_ros2_node_is_received(run_nedbus: Start, peer: Peer, endpo
 
 @pytest.mark.parametrize("layout", ["1.14", "1.16"])
 def test_ros2_node_receives_messages_and_lists_topics(
-    run_bridge: RunBridge, peer: Peer, raw: Session, bus: nedbus.Bus, layout: str
+    run_bridge: RunBridge, peer: Peer, zenoh_session: Session, bus: nedbus.Bus, layout: str
 ) -> None:
     """Messages of the bridge arrive at a ROS 2 node field by field, and the node lists their topics."""
     messages = flight()
@@ -135,10 +137,10 @@ def test_ros2_node_receives_messages_and_lists_topics(
     bus.publisher("estimator_local_position", vehicle="7", instance=1)
     topic = f"/px4_7/fmu/out/{VLP}"
     node = peer("listen", layout, topic=topic, rows=expected, domain_id=3)
-    wait_for_reader(raw, f"3{topic}/{dds_type(ROS2_TYPE)}/{type_hash(layout)}")
+    wait_for_matching(zenoh_session, f"3{topic}/{dds_type(ROS2_TYPE)}/{type_hash(layout)}")
     run_bridge(layout=layout, domain=3)
-    wait_for(lambda: len(list(raw.liveliness().get("@ros2_lv/3/*/*/*/MP/**"))) == 2, what="the bridge")
-    wait_for_reader(raw, f"nedbus/7/{VLP}")
+    wait_for(lambda: len(list(zenoh_session.liveliness().get("@ros2_lv/3/*/*/*/MP/**"))) == 2, what="the bridge")
+    wait_for_matching(zenoh_session, f"nedbus/7/{VLP}")
     for each in messages:
         publisher.publish(each)
     assert node.wait() == 0, node.err
@@ -148,13 +150,13 @@ def test_ros2_node_receives_messages_and_lists_topics(
     assert ["/px4_7/fmu/out/estimator_local_position_1", [ROS2_TYPE]] in listed
 
 
-def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, raw: Session) -> None:
+def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """Key, payload, attachment and liveliness tokens have the format of PX4's Zenoh module."""
     publisher = bus.publisher(VLP, vehicle="1")
     run_bridge()
-    subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(100))
-    wait_for(lambda: tokens(raw, "MP"), what="the publisher's token")
-    wait_for_reader(raw, f"nedbus/1/{VLP}")
+    subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(100))
+    wait_for(lambda: tokens(zenoh_session, "MP"), what="the publisher's token")
+    wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")
     for timestamp in (1, 2):
         publisher.publish(message(timestamp))
     one, two = (subscriber.handler.recv() for _ in range(2))
@@ -162,16 +164,16 @@ def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, raw: 
     first, second = (Attachment.parse(sample.attachment.to_bytes()) for sample in (one, two) if sample.attachment)
     assert (first.sequence, second.sequence, first.gid == second.gid) == (1, 2, True)
     assert second.time > first.time > 1_700_000_000_000_000_000
-    (token,) = tokens(raw, "MP")
+    (token,) = tokens(zenoh_session, "MP")
     assert first.gid == gid_of_token(token), "the gid that `ros2 topic info -v` shows"
-    assert len(tokens(raw, "NN")) == 1
+    assert len(tokens(zenoh_session, "NN")) == 1
 
 
 @pytest.mark.logs
 @pytest.mark.skipif(not TWELVE_MESSAGES.exists(), reason=f"no PX4 log at {TWELVE_MESSAGES}")
 @pytest.mark.parametrize("release", ["1.13", "1.15", "main"])
 def test_messages_have_the_layout_of_the_release(
-    run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture, release: str
+    run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture, release: str
 ) -> None:
     """Key, type hash and CDR fields of every topic in a real log are those of the selected release.
 
@@ -183,14 +185,14 @@ def test_messages_have_the_layout_of_the_release(
     for publisher, each in zip(publishers, messages.values(), strict=True):
         publisher.publish(each)
     wait_for(lambda: len(bus.latest(ANY)) == len(messages), what="the last values")
-    subscriber = raw.declare_subscriber("0/fmu/out/**", zenoh.handlers.FifoChannel(1000))
+    subscriber = zenoh_session.declare_subscriber("0/fmu/out/**", zenoh.handlers.FifoChannel(1000))
     run_bridge(layout=release)
     missing = {each for each in messages if BY_TOPIC[each.topic].layout_of_release(release) is None}
-    wait_for(lambda: len(tokens(raw, "MP")) == len(messages) - len(missing), what="the bridge")
+    wait_for(lambda: len(tokens(zenoh_session, "MP")) == len(messages) - len(missing), what="the bridge")
     received = {str(subscriber.handler.recv().key_expr).split("/")[3] for _ in range(2)}
     assert received == {"home_position", "log_message"}
     for publisher, each in zip(publishers, messages.values(), strict=True):
-        wait_for_reader(raw, publisher.key)
+        wait_for_matching(zenoh_session, publisher.key)
         publisher.publish(each)
     for _ in range(len(messages) - len(missing)):
         sample = subscriber.handler.recv()
@@ -210,12 +212,12 @@ def test_messages_have_the_layout_of_the_release(
 
 
 def test_first_home_position_of_a_new_vehicle_is_bridged(
-    run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+    run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A home position sent before the bridge knows its address is published; unselected addresses are not logged."""
-    subscriber = raw.declare_subscriber("0/**", zenoh.handlers.FifoChannel(1000))
+    subscriber = zenoh_session.declare_subscriber("0/**", zenoh.handlers.FifoChannel(1000))
     run_bridge(selection=Selection(ANY, "1"))
-    wait_for_reader(raw, "nedbus/1/home_position")
+    wait_for_matching(zenoh_session, "nedbus/1/home_position")
     wheel = define("Wheel", [("timestamp", field_type("uint64"))])
     other = bus._publishers.publisher(Address("2", "wheel_encoders"), wheel)
     other.publish({"timestamp": 1})
@@ -226,16 +228,16 @@ def test_first_home_position_of_a_new_vehicle_is_bridged(
 
 
 def test_retained_message_is_not_bridged(
-    run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+    run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A message from before the bridge started is held back; every later one is published."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     wait_for(bus.latest, what="the last value")
-    subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1000))
+    subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1000))
     run_bridge()
     wait_for(lambda: "->" in caplog.text and "1 old message held back" in caplog.text, what="the topic and the report")
-    wait_for_reader(raw, f"nedbus/1/{VLP}")
+    wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")
     for timestamp in range(2, 402):
         publisher.publish(message(timestamp))
     received = [subscriber.handler.recv() for _ in range(400)]
@@ -244,33 +246,38 @@ def test_retained_message_is_not_bridged(
 
 
 def test_late_messages_of_a_returning_vehicle_are_held_back(
-    run_bridge: RunBridge, raw: Session, timings: Timings, caplog: pytest.LogCaptureFixture
+    run_bridge: RunBridge, zenoh_session: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
     """After a router restart a vehicle may be gone for a moment; messages recovered afterwards are held back."""
     timings.lateness = 0.2
     address = Address("1", VLP)
-    subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
+    subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
 
     def put(timestamp: int, sent: dt.datetime) -> None:
-        stamp = zenoh.Timestamp(sent, bytes(raw.new_timestamp().get_id()))
-        raw.put(address.key(), encode(message(timestamp)), timestamp=stamp)
+        stamp = zenoh.Timestamp(sent, bytes(zenoh_session.new_timestamp().get_id()))
+        zenoh_session.put(address.key(), encode(message(timestamp)), timestamp=stamp)
 
-    token = raw.liveliness().declare_token(address.alive_key("1a"))
+    token = zenoh_session.liveliness().declare_token(address.alive_key("1a"))
     run_bridge()
     wait_for(lambda: caplog.text.count("-> /fmu/out/") == 1, what="the bridge")
-    first = raw.new_timestamp().get_time()
+    first = zenoh_session.new_timestamp().get_time()
     put(1, first)
     assert subscriber.handler.recv().payload
     token.undeclare()
     wait_for(lambda: "is no longer on the bus" in caplog.text, what="the vehicle to go")
-    token = raw.liveliness().declare_token(address.alive_key("1a"))
+    token = zenoh_session.liveliness().declare_token(address.alive_key("1a"))
     wait_for(lambda: caplog.text.count("-> /fmu/out/") == 2, what="the vehicle to be back")
     late = first + dt.timedelta(milliseconds=1)
-    wait_for(lambda: raw.new_timestamp().get_time() - late > dt.timedelta(seconds=0.2), what="the timestamp to be late")
+    wait_for(
+        lambda: zenoh_session.new_timestamp().get_time() - late > dt.timedelta(seconds=0.2),
+        what="the timestamp to be late",
+    )
     put(2, late)
     wait_for(lambda: "1 old message held back, up to" in caplog.text, what="the report")
     current = count(3)
-    with repeating(lambda: put(next(current), raw.new_timestamp().get_time())):  # on a busy host some are late
+    with repeating(
+        lambda: put(next(current), zenoh_session.new_timestamp().get_time())
+    ):  # on a busy host some are late
         assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] != 2
     token.undeclare()
 
@@ -335,14 +342,14 @@ def test_gid_matches_rmw_zenoh(type_hash: str, gid: str) -> None:
 def test_topic_of_another_node_is_not_published_twice(
     run_bridge: RunBridge,
     bus: nedbus.Bus,
-    raw: Session,
+    zenoh_session: Session,
     timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A topic that PX4 publishes itself is not published, except as a translation to another layout."""
     timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
-    token = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
+    token = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
     refused, published = f"is not published: node px4_0001 already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
     run_bridge(layout="1.14")
@@ -352,16 +359,16 @@ def test_topic_of_another_node_is_not_published_twice(
     wait_for(lambda: published in caplog.text, what="the translation")
     token.undeclare()
     wait_for(lambda: caplog.text.count(published) == 2, what="the topic to be taken over")
-    back = raw.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
+    back = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     wait_for(lambda: caplog.text.count(refused) == 2, what="the topic to be released")
     back.undeclare()
 
 
-def test_topics_follow_their_vehicles(run_bridge: RunBridge, bus: nedbus.Bus, raw: Session) -> None:
+def test_topics_follow_their_vehicles(run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """ROS 2 lists the topics of a vehicle only while it is published."""
 
     def topics() -> set[str]:
-        return {token.split("/")[9] for token in tokens(raw, "MP")}
+        return {token.split("/")[9] for token in tokens(zenoh_session, "MP")}
 
     run_bridge(selection=Selection(ANY, vehicle="alpha-1"), namespaces={"alpha-1": "fleet/a"})
     publisher = bus.publisher(VLP, vehicle="alpha-1")
@@ -384,22 +391,22 @@ def test_bridge_loop_is_ignored(
             publisher.publish(message(next(timestamps)))
             return "ignored to avoid a loop" in caplog.text
 
-        listener.turn_until(is_rejected, what="the rejection")
+        listener.step_until(is_rejected, what="the rejection")
         assert (listener.messages, listener.rejections) == ([], [])
 
 
 def test_command_bridges_one_instance_for_humble(
-    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session
 ) -> None:
     """`nedbus ros2` bridges a single instance, in another domain, with the keys of Humble, and reports a conflict."""
     publishers = [bus.publisher("estimator_local_position", vehicle="a-b", instance=number) for number in (0, 1)]
     bus.publisher("estimator_local_position", vehicle="a_b", instance=0)
     key = f"3/a_b/fmu/out/estimator_local_position_0/{dds_type(ROS2_TYPE)}/TypeHashNotSupported"
-    subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
+    subscriber = zenoh_session.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
     options = ("--humble", "--layout", "1.14", "--domain", "3", "-t", "estimator_local_position", "-i", "0")
     bridge = run_nedbus("ros2", "-c", endpoint, *options)
     wait_for(lambda: "set --namespace" in bridge.err, what="the conflict")
-    wait_for_reader(raw, "nedbus/a_b/estimator_local_position/0")
+    wait_for_matching(zenoh_session, "nedbus/a_b/estimator_local_position/0")
     for publisher in publishers:
         publisher.publish(message(7))
     assert len(subscriber.handler.recv().payload) == 188

@@ -1,1 +1,1 @@
-"""Commands of the command line."""
+"""Tests of the command line."""

@@ -1,4 +1,4 @@
-"""Notifications to systemd: a real datagram socket in its place, and real services; and its units."""
+"""Notifications to systemd, received by a datagram socket of the test, and the shipped units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.timings import Timings
 from nedbus.transport import open_router
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, changing_timings, repeating, wait_for
@@ -32,7 +32,7 @@ Datagram = dict[str, str]
 
 
 class Systemd:
-    """A socket that takes datagrams, in the place of systemd."""
+    """A fake systemd: the datagram socket of NOTIFY_SOCKET."""
 
     def __init__(self, address: str) -> None:
         self.address = address
@@ -44,19 +44,19 @@ class Systemd:
         """Return the fields of the next datagram."""
         return dict(line.split("=", 1) for line in self.socket.recv(65_536).decode().split("\n"))
 
-    def receive_until(self, wanted: Callable[[Datagram], object]) -> list[Datagram]:
-        """Return all datagrams up to one that is wanted."""
+    def receive_until(self, is_last: Callable[[Datagram], object]) -> list[Datagram]:
+        """Return all datagrams up to the first one for which `is_last` is true."""
         received: list[Datagram] = []
         end = time.monotonic() + DEADLINE
-        while not received or not wanted(received[-1]):
-            assert time.monotonic() < end, f"waited in vain; there came {received}"
+        while not received or not is_last(received[-1]):
+            assert time.monotonic() < end, f"waited {DEADLINE} s in vain; received {received}"
             received.append(self.receive())
         return received
 
 
 @pytest.fixture
 def systemd(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Systemd]:
-    """Listen at a path, or at an abstract address."""
+    """Listen on a path or an abstract address."""
     systemd = Systemd(getattr(request, "param", str(tmp_path / "notify")))
     with systemd.socket:
         yield systemd
@@ -70,7 +70,7 @@ def is_ready(datagram: Datagram) -> bool:
 def notified(
     systemd: Systemd, *sources: str, connect: str | None = None, watchdog: str | None = None, patience: float = DEADLINE
 ) -> Iterator[tuple[Daemon, Notifier]]:
-    """Run a daemon in a thread, and tell systemd of it: a router, unless it is to connect."""
+    """Run a daemon in a thread with notifications to systemd: a router, or with `connect` a client."""
     listen, routers = (None, (connect,)) if connect else ((free_endpoint(),), None)
     daemon = Daemon(load_settings(source=sources or ("sim:",), listen=listen, connect=routers), version="0")
     environment = {"NOTIFY_SOCKET": systemd.address} | ({"WATCHDOG_USEC": watchdog} if watchdog else {})
@@ -87,17 +87,14 @@ def notified(
 
 
 @pytest.fixture
-def often(timings: Timings) -> None:
-    """Let the text of the status be sent five times a second, in this process."""
+def frequent_status(timings: Timings) -> None:
+    """Send the status text five times a second in this process."""
     timings.systemd_status = 0.2
 
 
 @pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
-def test_ready_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
-    """READY comes once, when the router accepts connections, with a status; after SIGTERM comes STOPPING.
-
-    In between a process that works says so, again and again.
-    """
+def test_ready_is_sent_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
+    """READY is sent once, when the router accepts connections; then WATCHDOG repeatedly; after SIGTERM STOPPING."""
     endpoint = free_endpoint()
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "200000"}
     process = run_nedbus("serve", "--source", "sim:", "--listen", endpoint, **environment)
@@ -112,17 +109,17 @@ def test_ready_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
     assert process.wait() == 0, process.err
 
 
-def test_end_by_itself_is_said(run_nedbus: Start, systemd: Systemd) -> None:
-    """A service that ends when its sources do says so, too."""
+def test_stopping_is_sent_when_sources_end(run_nedbus: Start, systemd: Systemd) -> None:
+    """A service with --until-done sends STOPPING when its sources have ended."""
     arguments = ("--source", "sim:?duration=0.1", "--until-done", "--listen", free_endpoint())
     process = run_nedbus("serve", *arguments, NOTIFY_SOCKET=systemd.address)
     systemd.receive_until(lambda datagram: datagram.get("STOPPING") == "1")
     assert process.wait() == 0, process.err
 
 
-@pytest.mark.usefixtures("often")
-def test_status_of_silent_source(systemd: Systemd) -> None:
-    """A source that nobody speaks to does not delay READY; the status names it, and what the others publish."""
+@pytest.mark.usefixtures("frequent_status")
+def test_silent_source_does_not_delay_ready(systemd: Systemd) -> None:
+    """A silent source does not delay READY; the status text names it."""
     link = f"mavlink:udpin:127.0.0.1:{free_port()}"
     with notified(systemd, "sim:", link):
         received = systemd.receive_until(lambda datagram: "nothing arrives" in datagram.get("STATUS", ""))
@@ -135,27 +132,27 @@ def test_status_of_silent_source(systemd: Systemd) -> None:
 
 
 def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
-    """Return whether this is a status with what is published, and with what is wrong, or without."""
+    """Return whether this is a status text with counts, and with a rejected configuration or without."""
     return "messages/s" in datagram["STATUS"] and ("configuration rejected" in datagram["STATUS"]) == is_wrong
 
 
-def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> None:
-    """SIGHUP is answered with RELOADING and the time, then READY.
+def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_path: Path) -> None:
+    """SIGHUP sends RELOADING with the time, then READY.
 
-    What is wrong with the new file stays in the status until another one works.
+    The status text keeps the error of a rejected file until a reload succeeds.
     """
     file = tmp_path / "nedbus.toml"
     text = f'listen = "{free_endpoint()}"\nsource = ["sim:"]\n'
     file.write_text(text)
-    often = Timings(systemd_status=0.2)
-    process = start_hasty(start, often, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
+    frequent = Timings(systemd_status=0.2)
+    process = start_with_timings(start, frequent, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
     systemd.receive_until(is_ready)
     for content, is_wrong in ((text, False), ("source = [", True), (text, False)):
         file.write_text(content)
-        asked = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+        signalled = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
         process.signal(signal.SIGHUP)
         reloading = systemd.receive_until(lambda datagram: datagram.get("RELOADING") == "1")[-1]
-        assert int(reloading["MONOTONIC_USEC"]) >= asked
+        assert int(reloading["MONOTONIC_USEC"]) >= signalled
         ready = systemd.receive_until(is_ready)[-1]["STATUS"]
         assert ("configuration rejected" in ready) == is_wrong
         systemd.receive_until(partial(has_counts, is_wrong=is_wrong))
@@ -164,9 +161,9 @@ def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> N
     assert process.wait() == 0, process.err
 
 
-@pytest.mark.usefixtures("often")
+@pytest.mark.usefixtures("frequent_status")
 def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
-    """While the main thread does not work, nobody says that it does; the status goes on."""
+    """While the main thread hangs, no WATCHDOG is sent, but the status text is."""
     with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
         stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # later by ten times the limit
@@ -176,7 +173,7 @@ def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
 
 
 def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event, threading.Event]:
-    """Let sources block in a method of their output; return what is set once one does, and what lets all go on."""
+    """Block sources in a method of their output; return an event set when one blocks, and one that releases all."""
     entered, opened = threading.Event(), threading.Event()
     original = getattr(SourceOutput, method)
 
@@ -197,9 +194,9 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
 def test_no_watchdog_while_a_source_is_stuck(
     systemd: Systemd, monkeypatch: pytest.MonkeyPatch, timings: Timings, source: str, method: str
 ) -> None:
-    """While the loop of a source does not go round there is no ping, though all other threads work; then there is."""
+    """While the loop of a source is blocked, no WATCHDOG is sent, although all other threads work."""
     limit = 0.1  # s
-    timings.source_tick = limit / 2  # how often that one goes round
+    timings.source_tick = limit / 2  # period of the loop of a source
     entered, opened = block(monkeypatch, method)
     with notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier), repeating(notifier.tick):
         systemd.receive_until(is_ready)
@@ -210,14 +207,14 @@ def test_no_watchdog_while_a_source_is_stuck(
         wait_for(lambda: daemon.busy > 5 * limit, what="several limits")
         with notifier.reloading():
             stuck = systemd.receive_until(lambda datagram: "RELOADING" in datagram)
-        # One may have been on its way at the first reload.
+        # One may already have been sent at the first reload.
         assert sum("WATCHDOG" in datagram for datagram in stuck) <= 1
         opened.set()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
-def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A replay as fast as its readers take it waits for them, for as long as it takes: that is not stuck."""
+def test_watchdog_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+    """WATCHDOG is sent while a replay at speed=max waits for slow readers: it is not stuck."""
     entered, opened = block(monkeypatch, "publish")
     with (
         notified(systemd, "sim:?speed=max&duration=3600", watchdog="20000") as (daemon, notifier),
@@ -236,21 +233,21 @@ def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypat
     [
         ("20000000", None, 10.0),
         pytest.param("20000000", str(os.getpid()), 10.0, id="own"),
-        ("20000000", "1", None),  # it is another process that systemd watches
+        ("20000000", "1", None),  # systemd watches another process
         ("0", None, None),
         ("soon", None, None),
         ("", None, None),
     ],
 )
-def test_watchdog_interval(limit: str, process: str | None, interval: float | None) -> None:
-    """The interval is half of what systemd waits, when it is this process that it waits for."""
+def test_watchdog_interval_is_half_the_limit(limit: str, process: str | None, interval: float | None) -> None:
+    """The interval is half of WATCHDOG_USEC if systemd watches this process, and otherwise None."""
     environment = {"WATCHDOG_USEC": limit} | ({} if process is None else {"WATCHDOG_PID": process})
     assert watchdog_interval(environment) == interval
 
 
-@pytest.mark.usefixtures("often")
+@pytest.mark.usefixtures("frequent_status")
 def test_client_waits_for_its_router(systemd: Systemd) -> None:
-    """A client is not ready before its router is there, and says for whom it waits."""
+    """A client sends READY when its router answers; before that the status text names the endpoint."""
     endpoint = free_endpoint()
     with notified(systemd, connect=endpoint):
         assert systemd.receive() == {"STATUS": f"waiting for a router at {endpoint}"}
@@ -260,15 +257,15 @@ def test_client_waits_for_its_router(systemd: Systemd) -> None:
         systemd.receive_until(lambda datagram: "no router answers" in datagram.get("STATUS", ""))
 
 
-def test_client_is_started_without_its_router(systemd: Systemd) -> None:
-    """A client whose router does not answer for long counts as started: neither it nor the boot is held up."""
+def test_client_without_router_is_ready_after_a_timeout(systemd: Systemd) -> None:
+    """A client whose router does not answer sends READY after a timeout, to not delay the boot."""
     with notified(systemd, connect=free_endpoint(), patience=0.1):
         assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waiting for a router at tcp/")
 
 
 @pytest.mark.parametrize("address", [{}, {"NOTIFY_SOCKET": "vsock:2:1234"}], ids=["none", "another kind"])
-def test_nothing_without_notify_socket(address: dict[str, str]) -> None:
-    """Where systemd does not ask, or with an address of another kind, there is no thread, and nothing to do."""
+def test_notifier_is_inactive_without_notify_socket(address: dict[str, str]) -> None:
+    """Without NOTIFY_SOCKET, or with an unsupported address, no thread is started and nothing is sent."""
     daemon = Daemon(load_settings(source=("sim:",)), version="0")
     with Notifier(daemon, environment={"WATCHDOG_USEC": "1"} | address) as notifier:
         notifier.tick()
@@ -277,18 +274,18 @@ def test_nothing_without_notify_socket(address: dict[str, str]) -> None:
         notifier.stopping()
 
 
-def test_systemd_that_does_not_listen(systemd: Systemd) -> None:
-    """A notification that cannot be sent now is sent later; nothing waits for it."""
-    taken = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))  # until it is full
-    for _ in range(taken):
+def test_notify_returns_false_if_queue_is_full(systemd: Systemd) -> None:
+    """A notification that systemd cannot accept now returns False and does not block."""
+    accepted = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))  # until the queue is full
+    for _ in range(accepted):
         systemd.receive()
     assert notify(systemd.address, READY=1)
     Path(systemd.address).unlink()
     assert not notify(systemd.address, READY=1)
 
 
-def test_ready_is_repeated_until_it_is_taken(systemd: Systemd) -> None:
-    """A READY that finds no room is sent again: systemd would wait for it in vain."""
+def test_ready_is_repeated_until_accepted(systemd: Systemd) -> None:
+    """A READY that systemd's full queue did not accept is sent again."""
     filled = sum(1 for _ in iter(lambda: notify(systemd.address, FILLED=1), False))
     with notified(systemd) as (daemon, _):
         wait_for(daemon.ready.is_set, what="the router")
@@ -296,17 +293,17 @@ def test_ready_is_repeated_until_it_is_taken(systemd: Systemd) -> None:
         systemd.receive_until(is_ready)
 
 
-# The units as shipped, judged by systemd's own tools; tests/compose/test_systemd.py starts them
+# The shipped units, checked by systemd-analyze; tests/compose/test_systemd.py starts them
 
 UNITS = Path(__file__).parents[3] / "packaging" / "systemd"
 EXECUTABLE = "/opt/nedbus/bin/nedbus"
-EXPOSURE = 2.0  # of 10: what systemd calls OK
+EXPOSURE = 2.0  # of 10; systemd's limit for "OK"
 with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing")
 
 
 @pytest.fixture(params=["nedbus.service", "nedbus@.service", "nedbus-reader@.service"])
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """Copy a unit, with a program that is here in place of the one that gets installed."""
+    """Copy a unit, with an existing program instead of the installed nedbus."""
     copy = tmp_path / str(request.param)
     text = (UNITS / copy.name).read_text()
     assert EXECUTABLE in text
@@ -322,27 +319,27 @@ def analyze(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.process
 @with_systemd
 def test_unit_is_valid_and_hardened(unit: Path) -> None:
-    """Nothing in it is unknown to systemd, or ignored; its exposure is below what the documentation says."""
+    """Every directive of the unit is known to systemd, and the exposure is below the documented limit."""
     done = analyze("verify", unit)
-    about_it = [line for line in done.stderr.splitlines() if "nedbus" in line]
-    assert (done.returncode, about_it) == (0, []), done.stderr
+    warnings = [line for line in done.stderr.splitlines() if "nedbus" in line]
+    assert (done.returncode, warnings) == (0, []), done.stderr
     done = analyze("security", "--offline=true", f"--threshold={EXPOSURE * 10:.0f}", unit)
     assert done.returncode == 0, done.stdout + done.stderr
     assert float(done.stdout.split("Overall exposure level for")[1].split(":")[1].split()[0]) < EXPOSURE
 
 
-def test_units_differ_in_their_file_only() -> None:
-    """The template is the unit, for another file."""
+def test_template_unit_differs_only_in_its_file() -> None:
+    """The template unit equals the plain one except for the settings file and the description."""
     plain, template = ((UNITS / name).read_text().split("\n", 1)[1] for name in ("nedbus.service", "nedbus@.service"))
-    description = "Description=PX4 local position over Zenoh"
-    assert template == plain.replace("/nedbus.toml", "/%i.toml").replace(description, f"{description} (%i)")
+    assert template == plain.replace("/nedbus.toml", "/%i.toml").replace("(nedbus)", "(nedbus %i)")
 
 
 @pytest.mark.process
-def test_unit_of_readers_takes_options_as_a_shell_does(tmp_path: Path) -> None:
-    """OPTIONS of its file may compute the name of a recording; the rest is as hardened as the service."""
+def test_reader_unit_expands_options_like_a_shell(tmp_path: Path) -> None:
+    """OPTIONS may compute the name of a recording; the hardening is that of nedbus.service."""
     text = (UNITS / "nedbus-reader@.service").read_text()
-    assert text.partition("# Who: ")[2] == (UNITS / "nedbus.service").read_text().partition("# Who: ")[2]
+    hardening = text.partition("\nUser=")[2]
+    assert hardening == (UNITS / "nedbus.service").read_text().partition("\nUser=")[2]
     [command] = re.findall(r"^ExecStart=/bin/sh -c '(.*)'$", text, re.MULTILINE)
     script = command.replace(EXECUTABLE, "echo nedbus").replace("exec echo", "echo").replace("%i", "record")
     options = {"OPTIONS": "--output $(printf 7).mcap -t '*'"}

@@ -31,8 +31,8 @@ from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import Link, wait_for_demand
 from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.ports import free_endpoint
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
 
 BOTH: list[Mode] = ["latest", "every"]
@@ -158,16 +158,16 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
 
 
 def test_more_vehicles_appear_between_calls_than_are_kept(
-    endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
+    endpoint: str, bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After an overflow all tokens are listed again: the list is complete and has no vehicles that left."""
     monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 20)
-    gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
+    gone = zenoh_session.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
     gone.undeclare()
     for number in range(12):
-        raw.liveliness().declare_token(f"nedbus/gone-{number}/@alive/1a/{VLP}").undeclare()
-    tokens = [raw.liveliness().declare_token(f"nedbus/{number}/@alive/1a/{VLP}") for number in range(12)]
+        zenoh_session.liveliness().declare_token(f"nedbus/gone-{number}/@alive/1a/{VLP}").undeclare()
+    tokens = [zenoh_session.liveliness().declare_token(f"nedbus/{number}/@alive/1a/{VLP}") for number in range(12)]
     with nedbus.connect(endpoint) as other:
         wait_for(partial(has_vehicles, other, len(tokens)), what="all to be there")
     wait_for(partial(has_vehicles, bus, len(tokens)), what="all of them")
@@ -225,32 +225,34 @@ def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
             assert len(asking.latest()) == 300
 
 
-def answers(raw: Session, key: str) -> int:
+def answers(zenoh_session: Session, key: str) -> int:
     """Count the replies to a plain get."""
-    return sum(reply.ok is not None for reply in raw.get(key))
+    return sum(reply.ok is not None for reply in zenoh_session.get(key))
 
 
-def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
+def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
     """All publishers of a key reply to a plain get, also if two processes publish the same vehicle."""
     with nedbus.connect(endpoint) as other:
         for each, topic in ((bus, VLP), (other, "external_ins_local_position")):
             publish(each.publisher(topic, vehicle="1"), 1)
         for topic in (VLP, "external_ins_local_position"):
-            wait_for(partial(answers, raw, f"nedbus/1/{topic}"), what=topic)
+            wait_for(partial(answers, zenoh_session, f"nedbus/1/{topic}"), what=topic)
 
 
-def test_error_in_an_answer_is_only_its_own(bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_in_an_answer_is_only_its_own(
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The query thread survives an exception in one reply."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
-    wait_for(partial(answers, raw, publisher.key), what="an answer")
+    wait_for(partial(answers, zenoh_session, publisher.key), what="an answer")
     with monkeypatch.context() as patched:
         patched.setattr(nedbus.Publisher, "last", property(lambda _: 1 / 0), raising=False)
-        assert answers(raw, publisher.key) == 0
-    assert answers(raw, publisher.key) == 1
+        assert answers(zenoh_session, publisher.key) == 0
+    assert answers(zenoh_session, publisher.key) == 1
 
 
-def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, raw: Session) -> None:
+def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """A stored message with a later time, from an earlier run of the vehicle, does not replace the live one."""
     later = zenoh.Timestamp(dt.datetime.now(dt.UTC) + dt.timedelta(hours=1), b"\x07")
     stored = {f"nedbus/{vehicle}/{VLP}": encode(message(99)) for vehicle in "12"}
@@ -259,17 +261,17 @@ def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus,
     def found() -> list[tuple[str, int, bool]]:
         return [(sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()]
 
-    with answering(raw, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
         wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="the live one and the stored one")
 
 
-def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) -> None:
+def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session: Session) -> None:
     """`latest` reads a layout described by its publisher, like `subscribe`."""
     types = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
     layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
     explained = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
     last = reply_with({f"nedbus/1/{VLP}": msgpack.packb([9, 5, True, 2.5])})
-    with answering(raw, SCHEMA, explained), answering(raw, f"nedbus/1/{VLP}", last):
+    with answer_queries(zenoh_session, SCHEMA, explained), answer_queries(zenoh_session, f"nedbus/1/{VLP}", last):
         wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
 
 
@@ -278,34 +280,38 @@ def services_of(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
     return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
 
 
-def test_hostile_answers_reach_no_script(client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
+def test_hostile_answers_reach_no_script(
+    client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
+) -> None:
     """A status that is not JSON, or nested endlessly, is ignored, with one log line for all of them."""
     junk = {"evil": b"[" * 100_000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
-    with answering(raw, "nedbus/@service/*/status", services_of(junk)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
 
 
 def test_status_that_grows_when_it_is_read_fills_no_memory(
-    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """JSON may take 30 times its length in memory: of 480 kB, everything beyond 4 MiB is ignored and logged."""
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
-    with answering(raw, "nedbus/@service/*/status", services_of(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
     assert "ignored 18 replies that are too large" in caplog.messages
 
 
-def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) -> None:
+def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, zenoh_session: Session) -> None:
     """The id of a status is that of its key, unknown fields are ignored, and invalid values and rows are dropped."""
     sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
     told = {"service": "lie", "host": "here", "now": 10**400, "version": [1], "sources": sources, "shape": {"of": "it"}}
-    with answering(raw, "nedbus/@service/*/status", services_of({"a": json.dumps(told).encode(), "b": b"[5]"})):
+    with answer_queries(
+        zenoh_session, "nedbus/@service/*/status", services_of({"a": json.dumps(told).encode(), "b": b"[5]"})
+    ):
         [status] = client.services()
     assert status == nedbus.health.ServiceStatus(
         service="a", host="here", sources=(nedbus.health.SourceStatus(source="sim:", state="new", addresses=("1/x",)),)
@@ -313,13 +319,13 @@ def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) 
 
 
 def test_answers_that_are_too_many_are_left_out(
-    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The bytes kept of one query are bounded, and the number of ignored replies is logged."""
     monkeypatch.setattr("nedbus.transport.queries.MAX_QUERY_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
-    with answering(raw, "nedbus/@service/*/status", services_of(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
     assert "nedbus/@service/*/status: dropped 40 replies beyond the limits of a query" in caplog.messages
 

@@ -23,9 +23,9 @@ from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receive
 from nedbus.transport import Session, open_router
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
-from tests.peers.answering import answering
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries
 from tests.waits import DEADLINE, wait_for
 
 from .test_bus import BOTH
@@ -310,12 +310,12 @@ def test_collecting_garbage_never_closes() -> None:
     assert closed != [threading.current_thread()]
 
 
-def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
+def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, zenoh_session: Session) -> None:
     """A Ctrl-C ends the wait for a queryable that never replies."""
     kept: list[zenoh.Query] = []
     code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
-    with answering(raw, "nedbus/**", kept.append):
-        process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+    with answer_queries(zenoh_session, "nedbus/**", kept.append):
+        process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
         wait_for(lambda: kept, what="the question")
         process.signal(signal.SIGINT)
         assert process.wait() == -signal.SIGINT, process.err
@@ -359,7 +359,7 @@ for ask in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
         print(exc)
 sys.exit(7)
 """
-    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False, fresh=True)
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False, fresh=True)
     assert process.wait() == 7, process.err
     assert process.out.count("start processes with multiprocessing.get_context('spawn')") == 5
     assert "Traceback" not in process.err

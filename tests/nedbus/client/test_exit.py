@@ -70,7 +70,7 @@ def flood(endpoint: str, bus: nedbus.Bus) -> Iterator[str]:
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_script_without_close_is_gone(start: Start, flood: str, script: str, mode: str) -> None:
     """A bus that is never closed does not keep the process, whatever its queues hold; the same for asyncio."""
-    process = start("-c", SCRIPTS[script].replace("MODE", repr(mode)), NEDBUS_CONNECT=flood, measured=False)
+    process = start("-c", SCRIPTS[script].replace("MODE", repr(mode)), NEDBUS_CONNECT=flood, coverage=False)
     wait_for(lambda: "end" in process.out, what=f"the script to reach its end: {process.err}")
     ended = time.monotonic()
     assert process.wait() == CODES.get(script, 0), process.err
@@ -95,7 +95,7 @@ print("ready", flush=True)
 for sample in subscription:
     pass
 """
-    process = start("-c", code, NEDBUS_CONNECT=flood, measured=False)
+    process = start("-c", code, NEDBUS_CONNECT=flood, coverage=False)
     wait_for(lambda: "ready" in process.out, what=f"the script: {process.err}")
     process.signal(number)
     signalled = time.monotonic()
@@ -112,7 +112,7 @@ def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, ti
     code = f"import asyncio, nedbus; T = {timeout}; {how}"
     with socket.create_server(("127.0.0.1", 0)) as gone:
         gone.settimeout(DEADLINE)
-        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{gone.getsockname()[1]}", measured=False)
+        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{gone.getsockname()[1]}", coverage=False)
         gone.accept()[0].close()  # it has begun to wait
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
@@ -129,7 +129,7 @@ def interrupt():
 threading.Thread(target=interrupt).start()
 asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{gone.getsockname()[1]}", timeout=None).__aenter__())
 """
-    process = start("-c", code, measured=False)
+    process = start("-c", code, coverage=False)
     assert process.wait() == -signal.SIGINT, process.err
 
 
@@ -141,7 +141,7 @@ bus = nedbus.connect()
 bus.publisher("vehicle_local_position", vehicle="mine").publish({"timestamp": 1})
 time.sleep(600)
 """
-    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
     wait_for(lambda: "mine" in bus.vehicles(), what="the vehicle")
     process.kill()
     wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to go")
@@ -216,7 +216,7 @@ while True:
     time.sleep(0.002)
 """
     for _ in range(2):
-        start("-c", flood, NEDBUS_CONNECT=endpoint, measured=False)
+        start("-c", flood, NEDBUS_CONNECT=endpoint, coverage=False)
     for _ in range(6):
-        process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+        process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
         assert process.wait() == 0, process.err

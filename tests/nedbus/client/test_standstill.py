@@ -18,6 +18,6 @@ def test_process_never_stands_still_while_publishers_come_and_go(start: Start) -
     """
     options = ["--seconds", "15", "--restart", "6", "--busy", "0", "--limit", "5"]
     process = start(
-        "-m", "tests.stress", *options, "--port", str(free_port()), measured=False, PYTHONPATH=":".join(sys.path)
+        "-m", "tests.stress", *options, "--port", str(free_port()), coverage=False, PYTHONPATH=":".join(sys.path)
     )
     assert process.wait(110.0) == 0, process.out + process.err

@@ -19,7 +19,7 @@ import zenoh
 
 import nedbus
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.sources import SourceMessage
 from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition
@@ -116,7 +116,7 @@ def take(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[zenoh.Sample]
 
 def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
     """A message of a source never gets the time of this host as timestamp, unlike a message of a script."""
-    output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, Account())
+    output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, EventLog())
     output.publish_live(SourceMessage(0.0, Address("1", VLP), {"x": 1.0}))
     assert (output.published, output.rejected) == (0, 1)
 
@@ -186,7 +186,7 @@ def test_ended_replay_loops_or_retains_its_last_message(tmp_path: Path, serve: S
 
 
 def test_invalid_message_is_rejected_counted_and_reported(
-    tmp_path: Path, run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus
+    tmp_path: Path, run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus
 ) -> None:
     """An invalid message is not published, but reported with its reason on the rejection key, counted and logged."""
     writer = UlogWriter()
@@ -195,7 +195,7 @@ def test_invalid_message_is_rejected_counted_and_reported(
         broken = number in {3, 4}
         writer.add(VLP, message(number), z_valid=int(broken), z=math.nan if broken else 1.0)
     path = writer.write(tmp_path / "a.ulg")
-    listener = raw.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.RingChannel(10))
+    listener = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.RingChannel(10))
     service = run_nedbus("serve", "-c", endpoint, "-s", f"ulog:{path}?wait=1")
     with bus.subscribe(VLP, mode="every") as subscription:
         taken = [subscription.receive(DEADLINE).message.timestamp for _ in range(8)]
@@ -234,7 +234,7 @@ def test_signal_stops_the_service(tmp_path: Path, serve: Serve, number: signal.S
     """SIGTERM and SIGINT stop the service in any state of its sources, without a traceback or lost messages."""
     path = write_log(tmp_path / "a.ulg", range(0, 10_000_000, 10_000))
     sources = ("sim:", f"ulog:{path}?vehicle=2", f"ulog:{path}?vehicle=3&speed=max&loop=1", "ulog:/nowhere.ulg")
-    service, bus = serve(*(f"--source={source}" for source in sources), measured=False)
+    service, bus = serve(*(f"--source={source}" for source in sources), coverage=False)
     for index, state in enumerate(("running", "running", "running", "retrying")):
         wait_for(has_state(bus, state, index), what=sources[index])
     service.signal(number)
@@ -444,19 +444,20 @@ def test_router_accepts_a_zenohd_file(tmp_path: Path, run_nedbus: Start, command
     wait_for(lambda: f"joined {near}" in router.err, what="the link")
 
 
-def query_json(raw: Session, key: str) -> list[dict[str, Any]]:
+def query_json(zenoh_session: Session, key: str) -> list[dict[str, Any]]:
     """Return the JSON replies to a plain Zenoh query."""
-    return [json.loads(reply.ok.payload.to_bytes()) for reply in raw.get(key) if reply.ok]
+    return [json.loads(reply.ok.payload.to_bytes()) for reply in zenoh_session.get(key) if reply.ok]
 
 
-def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, raw: Session, endpoint: str) -> None:
+def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, zenoh_session: Session, endpoint: str) -> None:
     """A plain Zenoh client can query service status, schemas, and the last message of each key, with timestamp."""
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?topics=VehicleLocalPosition")
     status_key = "nedbus/@service/*/status"
     wait_for(
-        lambda: [s for each in query_json(raw, status_key) for s in each["sources"] if s["published"]], what="messages"
+        lambda: [s for each in query_json(zenoh_session, status_key) for s in each["sources"] if s["published"]],
+        what="messages",
     )
-    [status] = query_json(raw, status_key)
+    [status] = query_json(zenoh_session, status_key)
     assert {"service", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"} == set(status)
     assert (status["role"], status["endpoints"]) == ("client", [endpoint])
     [source] = status["sources"]
@@ -473,12 +474,12 @@ def test_plain_zenoh_can_query_status_and_messages(run_nedbus: Start, raw: Sessi
         *(f"estimator_local_position/{n}" for n in (0, 1)),
     )
     assert source["addresses"] == [f"1/{topic}" for topic in topics]
-    layouts = query_json(raw, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
+    layouts = query_json(zenoh_session, "nedbus/@schema/*/VehicleLocalPosition")[0]["layouts"]
     [current] = [layout for layout in layouts if layout["wire"] == 1]
     assert [field["name"] for field in current["fields"]] == list(VehicleLocalPosition.model_fields)
 
-    wait_for(lambda: len(list(raw.get("nedbus/**"))) == 5, what="five replies")
-    [reply] = raw.get("nedbus/1/estimator_local_position/1")
+    wait_for(lambda: len(list(zenoh_session.get("nedbus/**"))) == 5, what="five replies")
+    [reply] = zenoh_session.get("nedbus/1/estimator_local_position/1")
     assert reply.ok is not None
     assert str(reply.ok.encoding) == "application/msgpack;px4_msgs/VehicleLocalPosition;source=sim"
     assert reply.ok.timestamp is not None

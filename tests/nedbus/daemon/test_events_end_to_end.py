@@ -15,7 +15,7 @@ from nedbus.recording import RecordingWriter
 from nedbus_msgs import BY_TOPIC, Address, Provenance
 from nedbus_msgs.arrays import arrays_of
 from tests.flights.messages import VALID, VLP
-from tests.peers.browser import PATIENCE, browser, open_tabs
+from tests.peers.browser import PAGE_TIMEOUT, browser, open_tabs
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
@@ -95,7 +95,9 @@ def events_of(process: Process) -> list[tuple[str, str, str]]:
 
 
 def wait_for_event(process: Process, vehicle: str, kind: str, change: str) -> None:
-    wait_for(lambda: (vehicle, kind, change) in events_of(process), what=f"{vehicle} {kind} {change}", seconds=PATIENCE)
+    wait_for(
+        lambda: (vehicle, kind, change) in events_of(process), what=f"{vehicle} {kind} {change}", seconds=PAGE_TIMEOUT
+    )
 
 
 def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: int) -> None:
@@ -103,7 +105,7 @@ def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: i
     process.signal(signal.SIGSTOP)
     try:
         for _ in range(messages):
-            subscription.receive(timeout=PATIENCE)
+            subscription.receive(timeout=PAGE_TIMEOUT)
     finally:
         process.signal(signal.SIGCONT)
 
@@ -121,7 +123,7 @@ def test_each_event_is_reported_once_and_in_order(run_nedbus: Start, browser: Br
     events = run_nedbus("events", "--connect", endpoint, "--json")
     web = run_nedbus("web", "--connect", endpoint, "--http", f"127.0.0.1:{port}")
     wait_for(lambda: "open http" in web.err, what="the page")
-    with open_tabs(browser, may_complain=True) as make:
+    with open_tabs(browser, allow_console_errors=True) as make:
         page = make(width=1280, height=800)
         page.open(f"http://127.0.0.1:{port}")
         run_nedbus("serve", "--connect", endpoint, "-s", f"mcap:{tmp_path / 'fleet.mcap'}")
@@ -140,16 +142,16 @@ def test_each_event_is_reported_once_and_in_order(run_nedbus: Start, browser: Br
         router = run_nedbus("router", "--listen", endpoint)
         wait_for_event(events, *LINK_LOSS[1])
         with (
-            nedbus.connect(endpoint, timeout=PATIENCE) as bus,
+            nedbus.connect(endpoint, timeout=PAGE_TIMEOUT) as bus,
             bus.subscribe(vehicle="foxtrot", mode="every") as follow,
         ):
-            follow.receive(timeout=PATIENCE)
+            follow.receive(timeout=PAGE_TIMEOUT)
             freeze(events, follow, 4 * RATE)
             freeze(web, follow, 4 * RATE)
             wait_for_event(events, *OVERLOAD[1])
         assert events_of(events) == [*EXPECTED, *LINK_LOSS, *OVERLOAD]
         shown = [each for each in (*EXPECTED, *LINK_LOSS, *OVERLOAD) if each[2] != "end"]
-        wait_for(lambda: len(page.rows("vehicle")) >= len(shown), what="all events on the page", seconds=PATIENCE)
+        wait_for(lambda: len(page.rows("vehicle")) >= len(shown), what="all events on the page", seconds=PAGE_TIMEOUT)
         marks = sorted(page.rows("vehicle"), key=lambda mark: mark["time"])
         assert [mark["vehicle"] for mark in marks] == [vehicle for vehicle, *_ in shown]
     health = run_command("health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES))

@@ -17,8 +17,8 @@ from nedbus.client import LogStreamStatus
 from nedbus.recording import Flight
 from nedbus.timings import Timings
 from tests.peers.command_line import run_command
-from tests.peers.hasty import start_hasty
-from tests.peers.http_pages import Pages
+from tests.peers.custom_timings import start_with_timings
+from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
 from tests.peers.px4_log_stream import SHORT, START, STOP, Px4LogStream, read_recording
@@ -33,11 +33,11 @@ def log_stream(bus: nedbus.Bus) -> LogStreamStatus | None:
 @pytest.mark.process
 def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path: Path) -> None:
     """A subscriber receives the complete stream; `info`, /metrics and the saved log agree on the totals."""
-    link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), Pages(free_port())
+    link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), HttpClient(free_port())
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
     slow = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # for a busy host
-    service = start_hasty(start, slow, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
+    service = start_with_timings(start, slow, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
         bus.subscribe(vehicle="1", mode="every") as positions,

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VLP
@@ -23,7 +23,7 @@ class FakeOutput:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
         registry = SimpleNamespace(publisher=self._open)
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, Account()
+            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, EventLog()
         )
 
     def receive(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:

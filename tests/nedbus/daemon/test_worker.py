@@ -13,7 +13,7 @@ from nedbus.client import PublisherRegistry
 from nedbus.daemon import PlannedSource
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.health import SourceStatus
 from nedbus.sources import Rejection, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.sources.options import RecordedOptions
@@ -147,7 +147,7 @@ class Harness:
             ),
             cast("PublisherRegistry", self.registry),
             clock=cast("Clock", clock),
-            account=Account(),
+            event_log=EventLog(),
             retry=retry,
             on_end=self._count_end,
         )

@@ -1,4 +1,4 @@
-"""`nedbus doctor`: every wrong state is caused for real, and found; certificates and routers are real ones."""
+"""`nedbus doctor` finds faults of real routers, certificates, links and services."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from nedbus_msgs import dds_type, status_key
 from tests.flights.local_position import ROS2_TYPE, encode
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import write_log
-from tests.peers.certificates import files_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_settings, write_config
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Start
@@ -44,42 +44,44 @@ HOUR = 3600.0
 
 
 @pytest.fixture(autouse=True)
-def _listen_shortly(timings: Timings) -> None:
-    """Listen for a shorter time than a person would: `look` says how long."""
+def _short_observation(timings: Timings) -> None:
+    """Shorten the observation; `diagnose` sets its duration."""
     timings.min_listen, timings.tls_alert, timings.listen = 0.1, 0.1, 0.5
 
 
-def look(*endpoints: str, tls: Mapping[str, Path] | None = None, listen: float = 0.1, **options: Any) -> list[Finding]:
-    """Examine with these settings. `listen`: longer where something has to arrive; answers are there before."""
+def diagnose(
+    *endpoints: str, tls: Mapping[str, Path] | None = None, listen: float = 0.1, **options: Any
+) -> list[Finding]:
+    """Run the doctor with these settings; `listen`: duration of the observation [s], longer if messages must arrive."""
     settings = load_settings(None, connect=endpoints, **(tls or {}))
     TIMINGS.listen = listen
     return examine(settings, version=nedbus.__version__, **options)
 
 
-def found(findings: list[Finding], check: str, state: State, text: str) -> Finding:
-    """Return the finding of a check in this state whose words match; fail with all of them if there is none."""
+def find(findings: list[Finding], check: str, state: State, text: str) -> Finding:
+    """Return the finding of a check in this state that matches; fail with all findings if there is none."""
     for each in findings:
         if (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen}"):
             return each
-    pytest.fail(f"{check} {state} {text!r} is not in\n" + "\n".join(map(str, findings)))
+    pytest.fail(f"no finding {check} {state} {text!r} in\n" + "\n".join(map(str, findings)))
 
 
-def hear(endpoint: str, *texts: str) -> list[Finding]:
-    """Examine, each time for twice as long, until all of these are found: on a busy machine what arrives is late."""
+def diagnose_until(endpoint: str, *texts: str) -> list[Finding]:
+    """Run the doctor with doubled duration until all of these are found: on a busy machine messages arrive late."""
     findings, listen = list[Finding](), 0.5
     while not all(any(re.search(text, f"{each.subject}: {each.seen}") for each in findings) for text in texts):
         assert listen < DEADLINE, findings
-        findings, listen = look(endpoint, listen=listen), 2 * listen
+        findings, listen = diagnose(endpoint, listen=listen), 2 * listen
     return findings
 
 
-def is_well(findings: list[Finding]) -> bool:
+def has_no_faults(findings: list[Finding]) -> bool:
     return all(each.state != "wrong" for each in findings)
 
 
 @contextmanager
-def flying(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
-    """Publish these vehicles, or vehicle 1."""
+def publishing(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
+    """Publish positions of these vehicles, by default of vehicle 1."""
     publishers = [bus.publisher(VLP, vehicle=each) for each in vehicles or "1"]
 
     def publish() -> None:
@@ -93,8 +95,8 @@ def flying(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
 
 
 @contextmanager
-def reporting(session: Session, name: str = "imitation", *, offset: float = 0.0, **status: object) -> Iterator[None]:
-    """Answer as a service with this status does, whose clock is ahead by this many seconds."""
+def service_status(session: Session, name: str = "fake", *, offset: float = 0.0, **status: object) -> Iterator[None]:
+    """Reply to status queries with this status; the service's clock is `offset` seconds ahead."""
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
     server.answer_json(
@@ -108,32 +110,34 @@ def source(**fields: object) -> dict[str, object]:
     return {"source": "mavlink:x", "state": "running", "addresses": [], "stale": [], "rejected": 0, **fields}
 
 
-def test_nothing_listens(endpoint: str) -> None:
-    """A refused connection is told from a name without address; where another router answers it is a warning only."""
+def test_unreachable_endpoint_is_wrong_unless_another_router_answers(endpoint: str) -> None:
+    """A refused connection and an unresolved host name are wrong, and only a warning if another router answers."""
     refused = free_endpoint()
-    findings = look(refused, "tcp/no-such-host.invalid:7447", "tcp/a..b:7447")
-    assert "nedbus serve" in found(findings, "endpoint", "wrong", f"{refused}: connection refused").advice
-    found(findings, "endpoint", "wrong", "cannot resolve host name no-such-host")
-    found(findings, "endpoint", "wrong", r"cannot resolve host name a\.\.b")
-    findings = look(refused, endpoint)
-    found(findings, "endpoint", "warning", "connection refused")
-    found(findings, "endpoint", "ok", "a Zenoh router answers")
+    findings = diagnose(refused, "tcp/no-such-host.invalid:7447", "tcp/a..b:7447")
+    assert "nedbus serve" in find(findings, "endpoint", "wrong", f"{refused}: connection refused").advice
+    find(findings, "endpoint", "wrong", "cannot resolve host name no-such-host")
+    find(findings, "endpoint", "wrong", r"cannot resolve host name a\.\.b")
+    findings = diagnose(refused, endpoint)
+    find(findings, "endpoint", "warning", "connection refused")
+    find(findings, "endpoint", "ok", "a Zenoh router answers")
 
 
-def test_check_that_raises(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """An unexpected error of a check is its finding, with the error; it is not taken for a slow network."""
+def test_unexpected_error_in_check_is_a_finding(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An unexpected error in a check becomes a finding that names the error, not a timeout."""
 
     def fail(*_: object) -> list[Finding]:
-        raise ZeroDivisionError("by nothing")
+        raise ZeroDivisionError("by zero")
 
     monkeypatch.setattr("nedbus.doctor.examination.check_endpoint", fail)
-    failed = found(look(endpoint), "endpoint", "unknown", "check failed: unexpected ZeroDivisionError: by nothing")
+    failed = find(diagnose(endpoint), "endpoint", "unknown", "check failed: unexpected ZeroDivisionError: by zero")
     assert "a bug in nedbus" in failed.advice
     assert "Traceback" in caplog.text
 
 
-def test_what_is_no_router(timings: Timings) -> None:
-    """Another server is told from a router and from TLS; one that never answers does not hold up the doctor."""
+def test_server_that_is_not_a_router_is_wrong(timings: Timings) -> None:
+    """An HTTP server and a server that never answers are not Zenoh routers and do not speak TLS."""
     timings.doctor_open = timings.handshake = 0.2
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
@@ -141,109 +145,111 @@ def test_what_is_no_router(timings: Timings) -> None:
         http = f"127.0.0.1:{server.server_address[1]}"
         with socket.create_server(("127.0.0.1", 0)) as silent:
             mute = f"127.0.0.1:{silent.getsockname()[1]}"
-            findings = look(*(f"{protocol}/{where}" for protocol in ("tcp", "tls") for where in (http, mute)))
+            findings = diagnose(*(f"{protocol}/{where}" for protocol in ("tcp", "tls") for where in (http, mute)))
         server.shutdown()
         thread.join(DEADLINE)
     for protocol, reason in (("tcp", "cannot open a Zenoh session"), ("tls", "it does not speak TLS")):
         for where in (http, mute):
-            found(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
+            find(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
 
 
-def test_all_is_well(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
-    """A vehicle that flies is no reason to complain: nothing is wrong, and each check says so."""
-    with flying(bus), reporting(raw, sources=[source(addresses=[f"1/{VLP}"])]):
-        findings = look(endpoint, vehicle="1", listen=1.0)
-    assert is_well(findings), findings
+def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
+    """With a publishing vehicle nothing is wrong, and each check has an ok finding."""
+    with publishing(bus), service_status(zenoh_session, sources=[source(addresses=[f"1/{VLP}"])]):
+        findings = diagnose(endpoint, vehicle="1", listen=1.0)
+    assert has_no_faults(findings), findings
     for check in ("settings", "endpoint", "router", "read", "write", "service", "vehicle", "clock"):
         assert any(each.check == check and each.state == "ok" for each in findings), check
 
 
-def test_silent_vehicle(bus: nedbus.Bus, endpoint: str) -> None:
-    """A vehicle with a token that sends nothing is found, with the age of its last; one asked for must exist."""
+def test_silent_and_missing_vehicles_are_found(bus: nedbus.Bus, endpoint: str) -> None:
+    """A silent publisher is reported with the age of its last message; a requested vehicle must exist."""
     bus.publisher(VLP, vehicle="mute")
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
-    findings = look(endpoint)
-    found(findings, "vehicle", "warning", r"mute/.*silent for \d+ s: no message yet")
-    found(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ m?s old")
-    found(look(endpoint, vehicle="7"), "vehicle", "wrong", "7: not seen under nedbus/")
+    findings = diagnose(endpoint)
+    find(findings, "vehicle", "warning", r"mute/.*silent for \d+ s: no message yet")
+    find(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ m?s old")
+    find(diagnose(endpoint, vehicle="7"), "vehicle", "wrong", "7: not found under nedbus/")
 
 
-def test_two_publishers_of_one_address(bus: nedbus.Bus, endpoint: str) -> None:
-    """Their tokens are one token: they are told apart by who they are, at rest by the heartbeats of each."""
+def test_two_publishers_of_one_address_are_wrong(bus: nedbus.Bus, endpoint: str) -> None:
+    """Two publishers of one address share a token; the source info of messages or heartbeats distinguishes them."""
     with nedbus.connect(endpoint) as other:
-        with flying(bus), flying(other):
-            found(hear(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
+        with publishing(bus), publishing(other):
+            find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
         for each in (bus, other):
             each.publisher(VLP, vehicle="1").publish(message(1))
-        found(hear(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
+        find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
 
 
-def test_payload_that_is_no_message(raw: Session, endpoint: str) -> None:
-    """It is found, with the decoder's reason; another layout is named as such."""
+def test_undecodable_payload_is_wrong(zenoh_session: Session, endpoint: str) -> None:
+    """A payload that cannot be decoded is reported with the decoder's reason, such as an unknown layout."""
 
     def publish() -> None:
-        raw.put(f"nedbus/1/{VLP}", b"junk")
-        raw.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
+        zenoh_session.put(f"nedbus/1/{VLP}", b"junk")
+        zenoh_session.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
 
     with repeating(publish):
-        findings = hear(endpoint, "1/.*: cannot decode", "2/.*: cannot decode")
-    found(findings, "vehicle", "wrong", f"1/{VLP}: cannot decode a payload")
-    found(findings, "vehicle", "wrong", f"2/{VLP}: cannot decode a payload: .*layout 99")
+        findings = diagnose_until(endpoint, "1/.*: cannot decode", "2/.*: cannot decode")
+    find(findings, "vehicle", "wrong", f"1/{VLP}: cannot decode a payload")
+    find(findings, "vehicle", "wrong", f"2/{VLP}: cannot decode a payload: .*layout 99")
 
 
 @pytest.mark.parametrize(
     ("clocks", "text", "advice"),
     [
-        ({"ahead": HOUR}, "service ahead on elsewhere: .* 60 min ahead of this host's", "either of the two"),
+        ({"ahead": HOUR}, "service ahead on elsewhere: .* 60 min ahead of this host's", "either clock may be off"),
         ({"ahead": HOUR, "right": 0.0}, "service ahead", "set this one"),
         ({"first": -HOUR, "second": -HOUR}, "this host's clock is 60 min ahead of 2 others", "run NTP"),
     ],
-    ids=["of a service", "of one service", "of this host"],
+    ids=["service", "one of two services", "this host"],
 )
-def test_clock_that_is_off(raw: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str) -> None:
-    """Of two clocks nobody can tell which is right; of three the one that is alone is not, this host's perhaps."""
+def test_clock_offset_is_wrong(
+    zenoh_session: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str
+) -> None:
+    """With two clocks either may be off; with three the one that disagrees is off, which may be this host's."""
     with ExitStack() as services:
         for name, offset in clocks.items():
-            services.enter_context(reporting(raw, name, offset=offset))
-        assert advice in found(look(endpoint), "clock", "wrong", text).advice
+            services.enter_context(service_status(zenoh_session, name, offset=offset))
+        assert advice in find(diagnose(endpoint), "clock", "wrong", text).advice
 
 
-def test_publisher_whose_clock_is_off(raw: Session, endpoint: str) -> None:
-    """The timestamps of messages tell as well, without any service."""
+def test_clock_offset_of_publisher_is_wrong(zenoh_session: Session, endpoint: str) -> None:
+    """Message timestamps reveal the offset of a publisher's clock without a service."""
     payload = encode(message(1))
 
     def publish() -> None:
         later = dt.datetime.now(dt.UTC) + dt.timedelta(seconds=HOUR)
-        raw.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
+        zenoh_session.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
 
     with repeating(publish):
-        findings = hear(endpoint, "publisher of 1/")
-    found(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
+        findings = diagnose_until(endpoint, "publisher of 1/")
+    find(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
 
 
-def test_what_services_report(raw: Session, endpoint: str) -> None:
-    """Sources that fail, wait, lost their vehicle or reject messages are found, the worst of many, and a version is."""
+def test_service_status_gives_findings(zenoh_session: Session, endpoint: str) -> None:
+    """Failed, waiting and stale sources, rejections and another version are found; of many findings the worst ones."""
     sources = [
         source(state="failed", error="the disk is gone"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
         source(source="px4-zenoh:", state="waiting"),
     ]
-    with reporting(raw, version="99.1.0", sources=sources):
-        findings = look(endpoint)
-    found(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
-    found(findings, "source", "warning", "px4-zenoh:: waiting")
-    found(findings, "source", "warning", "no more messages of 9/x")
-    found(findings, "source", "warning", "7 messages rejected: xy_valid")
-    found(findings, "version", "warning", r"nedbus 99\.1\.0 there, ")
-    with reporting(raw, sources=[*sources, *50 * [source(state="waiting")]]):
-        findings = look(endpoint)
-    found(findings, "source", "warning", "more of the same kind")
-    found(findings, "source", "wrong", "the disk is gone")
+    with service_status(zenoh_session, version="99.1.0", sources=sources):
+        findings = diagnose(endpoint)
+    find(findings, "source", "wrong", "mavlink:x: failed: the disk is gone")
+    find(findings, "source", "warning", "px4-zenoh:: waiting")
+    find(findings, "source", "warning", "no more messages of 9/x")
+    find(findings, "source", "warning", "7 messages rejected: xy_valid")
+    find(findings, "version", "warning", r"the service runs nedbus 99\.1\.0")
+    with service_status(zenoh_session, sources=[*sources, *50 * [source(state="waiting")]]):
+        findings = diagnose(endpoint)
+    find(findings, "source", "warning", "more findings of this check")
+    find(findings, "source", "wrong", "the disk is gone")
 
 
 @contextmanager
-def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -> Iterator[None]:
-    """Answer as a service does that remembers these vehicles."""
+def service_report(session: Session, name: str, **vehicles: Mapping[str, object]) -> Iterator[None]:
+    """Reply to event queries with a report of these vehicles."""
     server = QueryServer(session)
     report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
     server.answer_json(status_key(name), lambda get: [json.dumps(report if get("events") else {}).encode()])
@@ -251,15 +257,15 @@ def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -
         yield
 
 
-def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None:
-    """A bad vehicle is an error, one to be watched a warning; one that is well, or was switched off, is no finding.
+def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, endpoint: str) -> None:
+    """A bad vehicle is wrong, one to watch a warning; a healthy vehicle, or one silent for an hour, has no finding.
 
-    Of two services that remember a vehicle the one counts that hears it. The peers answer as services do.
+    If two services report a vehicle, the one that receives its messages counts.
     """
     silent = {"severity": "bad", "text": "no position", "kinds": ["silent"]}
     with (
-        remembering(
-            raw,
+        service_report(
+            zenoh_session,
             "first",
             sick={"severity": "bad", "text": "failsafe", "since": 9990.0, "kinds": ["failsafe"]},
             doubtful={"severity": "watch", "text": "dead reckoning", "since": 9880.0, "kinds": ["dead_reckoning"]},
@@ -268,20 +274,20 @@ def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None
             gone={**silent, "since": 9999.0},
             moved={**silent, "since": 9999.0},
         ),
-        remembering(raw, "second", moved={"severity": "info", "text": "ok"}),
+        service_report(zenoh_session, "second", moved={"severity": "info", "text": "ok"}),
     ):
-        findings = look(endpoint)
-        of_one = look(endpoint, vehicle="doubtful")
-    wrong = found(findings, "vehicle", "wrong", r"sick: failsafe, since 02:46:30\.0 UTC \(10\.0 s\)")
+        findings = diagnose(endpoint)
+        of_one = diagnose(endpoint, vehicle="doubtful")
+    wrong = find(findings, "vehicle", "wrong", r"sick: failsafe, since 02:46:30\.0 UTC \(10\.0 s\)")
     assert wrong.advice.endswith("'nedbus why --vehicle sick'")
-    found(findings, "vehicle", "warning", "doubtful: dead reckoning, since .*2 min")
-    found(findings, "vehicle", "wrong", "gone: no position")
+    find(findings, "vehicle", "warning", "doubtful: dead reckoning, since .*2 min")
+    find(findings, "vehicle", "wrong", "gone: no position")
     assert not [each for each in findings if each.subject in ("well", "off", "moved")]
     assert {each.subject for each in of_one if "nedbus why" in each.advice} == {"doubtful"}
 
 
 @pytest.mark.parametrize(
-    "told",
+    "invalid",
     [
         {"vehicles": {"7; reboot": {"severity": "bad", "text": "evil"}}},
         {"vehicles": {"7": {"severity": "bad", "text": "evil", "since": math.nan}}},
@@ -292,56 +298,58 @@ def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None
     ],
     ids=["name", "nan", "inf", "now", "severity", "list"],
 )
-def test_account_that_makes_no_sense(raw: Session, endpoint: str, told: Mapping[str, object]) -> None:
-    """Nothing of it is said, and no check is lost; the peer answers in place of a service."""
-    server = QueryServer(raw)
-    report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **told}
+def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, invalid: Mapping[str, object]) -> None:
+    """An invalid event report from a peer has no findings and breaks no check."""
+    server = QueryServer(zenoh_session)
+    report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **invalid}
     server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
-    with closing(server), reporting(raw, sources=[source(state="failed", error="the disk is gone")]):
-        findings = look(endpoint)
-    found(findings, "source", "wrong", "the disk is gone")
+    with closing(server), service_status(zenoh_session, sources=[source(state="failed", error="the disk is gone")]):
+        findings = diagnose(endpoint)
+    find(findings, "source", "wrong", "the disk is gone")
     assert not [each for each in findings if "evil" in each.seen or "check failed" in each.seen]
 
 
-def test_vehicle_of_a_real_service_that_is_not_well(run_nedbus: Start, tmp_path: Path) -> None:
-    """Events of a vehicle that a service of another process remembers, from a log of this test's, are found."""
+def test_bad_vehicle_in_report_of_real_service_is_wrong(run_nedbus: Start, tmp_path: Path) -> None:
+    """A bad vehicle is found in the event report of a service in another process that replays a log."""
     endpoint = free_endpoint()
     log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
     run_nedbus("serve", "--listen", endpoint, "-s", f"ulog:{log}?vehicle=sick")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
         wait_for(lambda: bus.accounts() and bus.accounts()[0].vehicles, what="the vehicle")
-    found(look(endpoint), "vehicle", "wrong", "sick: xy not valid, since ")
+    find(diagnose(endpoint), "vehicle", "wrong", "sick: xy not valid, since ")
 
 
 @pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
-def test_status_that_makes_no_sense(raw: Session, endpoint: str, now: object) -> None:
-    """A peer may answer anything: what can be understood of it is said, and no other check is lost."""
+def test_invalid_service_status_breaks_no_check(zenoh_session: Session, endpoint: str, now: object) -> None:
+    """The valid parts of a peer's invalid status have findings, and no check fails."""
     states: list[object] = [[], {}, 7, None]
     strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
-    with reporting(raw, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]):
-        findings = look(endpoint)
-    found(findings, "source", "wrong", "mavlink:x: failed: unknown reason")
+    with service_status(
+        zenoh_session, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]
+    ):
+        findings = diagnose(endpoint)
+    find(findings, "source", "wrong", "mavlink:x: failed: unknown reason")
     assert not [each for each in findings if "check failed" in each.seen]
 
 
-def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
-    """Another prefix is found by its tokens or by its messages, a PX4's own keys by its tokens, unless bridged."""
+def test_other_prefixes_and_ros2_topics_are_warnings(zenoh_session: Session, endpoint: str) -> None:
+    """Other prefixes are found by tokens or messages, topics of ROS 2 or PX4 by their tokens unless bridged."""
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), NO_HASH)
-    token = raw.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
-    with nedbus.connect(endpoint, prefix="other/fleet") as other, flying(other):
+    token = zenoh_session.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
+    with nedbus.connect(endpoint, prefix="other/fleet") as other, publishing(other):
         payload = encode(message(1))
-        with repeating(lambda: raw.put(f"third/1/{VLP}", payload)):
-            findings = hear(endpoint, "other/fleet", "third")
-        found(findings, "prefix", "warning", "other/fleet: .*the prefix here is nedbus/")
-        found(findings, "prefix", "warning", "third: .*the prefix here is nedbus/")
-        found(findings, "ros2", "warning", f"publishes /fmu/out/{VLP}, but no service bridges it")
-        with reporting(raw, sources=[source(source="px4-zenoh:")]):
-            assert not [each for each in look(endpoint) if each.check == "ros2"]
+        with repeating(lambda: zenoh_session.put(f"third/1/{VLP}", payload)):
+            findings = diagnose_until(endpoint, "other/fleet", "third")
+        find(findings, "prefix", "warning", "other/fleet: .*the prefix here is nedbus/")
+        find(findings, "prefix", "warning", "third: .*the prefix here is nedbus/")
+        find(findings, "ros2", "warning", f"publishes /fmu/out/{VLP}, but no service bridges it")
+        with service_status(zenoh_session, sources=[source(source="px4-zenoh:")]):
+            assert not [each for each in diagnose(endpoint) if each.check == "ros2"]
     token.undeclare()
 
 
-def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
-    """The report of a service of another process: in words for people, in JSON for programs, exit code 1."""
+def test_failing_source_of_real_service_is_wrong(run_nedbus: Start) -> None:
+    """A failing source of a service in another process is reported as text and as JSON, with exit code 1."""
     endpoint = free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", "-s", "ulog:nowhere.ulg")
     wait_for(lambda: "no such file" in service.err, what="the source that fails")
@@ -350,16 +358,18 @@ def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
     words = " ".join(doctor.out.split())
     assert "wrong source ulog:nowhere.ulg: retrying: nowhere.ulg: no such file or directory" in words
     assert doctor.out.splitlines()[-1].endswith("1 wrong"), doctor.out
-    told = run_command("doctor", "-c", endpoint, "--json")
-    assert told.exit_code == 1
-    report = json.loads(told.out)
+    as_json = run_command("doctor", "-c", endpoint, "--json")
+    assert as_json.exit_code == 1
+    report = json.loads(as_json.out)
     assert report["state"] == report["findings"][-1]["state"] == "wrong"
     assert set(report["findings"][0]) == {"check", "subject", "state", "seen", "advice"}
 
 
-def test_exit_codes(bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: Start) -> None:
-    """0 when nothing is wrong, though it may warn; 2 for usage."""
-    with flying(bus), reporting(raw, sources=[source(state="waiting")]):
+def test_exit_code_is_0_with_warnings_and_2_for_usage_errors(
+    bus: nedbus.Bus, endpoint: str, zenoh_session: Session, run_nedbus: Start
+) -> None:
+    """The exit code is 0 if nothing is wrong, even with warnings, and 2 for usage errors."""
+    with publishing(bus), service_status(zenoh_session, sources=[source(state="waiting")]):
         doctor = run_command("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)
     assert (doctor.exit_code, doctor.out.splitlines()[-1].rpartition(", ")[2]) == (0, "1 warning"), doctor.out
     assert "set by NEDBUS_CONNECT" in " ".join(doctor.out.split())
@@ -370,16 +380,18 @@ def test_exit_codes(bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: St
     assert (process.wait(), process.err.count("\n")) == (2, 1), process.err
 
 
-def test_what_peers_send_is_harmless(raw: Session, endpoint: str) -> None:
-    """Nothing acts on a terminal, adds a line of its own, or fills the screen."""
+def test_text_from_peers_is_escaped_and_truncated(zenoh_session: Session, endpoint: str) -> None:
+    """Text from peers cannot control the terminal, add lines or flood the output."""
     evil = "\x1b[2J\nok all is well " + 1_000 * "x"
-    with reporting(raw, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil):
+    with service_status(
+        zenoh_session, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil
+    ):
         doctor = run_command("doctor", "-c", endpoint)
     assert doctor.exit_code == 1
     assert "\x1b" not in doctor.out
     assert not [line for line in doctor.out.splitlines() if line.startswith("ok all")]
     assert len(doctor.out) < 20_000
-    assert "more of the same kind" in doctor.out
+    assert "more findings of this check" in doctor.out
 
 
 Run = Callable[..., str]
@@ -387,7 +399,7 @@ Run = Callable[..., str]
 
 @pytest.fixture
 def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
-    """Run routers on the shipped configuration, with another certificate or other text in places."""
+    """Run routers with the shipped configuration; certificate and text may be replaced."""
     with ExitStack() as routers:
 
         def run(certificate: str = "router", **replaced: str) -> str:
@@ -399,58 +411,63 @@ def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
         yield run
 
 
-def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
-    """Whose, for which names, by whom, until when: of the router, of this client, of the authority."""
-    findings = look(run_router(), run_router("router-soon"), tls=files_of(pki, "reader"))
-    assert is_well(findings), findings
-    router = r"the router shows router for 127\.0\.0\.1, localhost, issued by nedbus CA, valid until 20\d\d-"
-    found(findings, "tls", "ok", router)
-    found(findings, "tls", "warning", r"the router shows router-soon.*\d+ days from now")
-    found(findings, "certificate", "ok", "this client is reader, issued by nedbus CA")
-    found(findings, "certificate", "ok", "the authority is nedbus CA")
+def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
+    """Subject, hosts, issuer and expiry of the certificates of router, client and authority are reported."""
+    findings = diagnose(run_router(), run_router("router-soon"), tls=tls_settings(pki, "reader"))
+    assert has_no_faults(findings), findings
+    router = r"the router presents router for 127\.0\.0\.1, localhost, issued by nedbus CA, valid until 20\d\d-"
+    find(findings, "tls", "ok", router)
+    find(findings, "tls", "warning", r"the router presents router-soon.*\d+ days left")
+    find(findings, "certificate", "ok", "this client is reader, issued by nedbus CA")
+    find(findings, "certificate", "ok", "the authority is nedbus CA")
 
 
 @pytest.mark.parametrize(
-    ("case", "told"),
+    ("case", "expected"),
     [
-        (("router-expired", "reader", "ca.crt"), {"tls": "the router shows router-expired .*has expired"}),
+        (("router-expired", "reader", "ca.crt"), {"tls": "the router presents router-expired .*has expired"}),
         (("router-elsewhere", "reader", "ca.crt"), {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"}),
         (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the authority in .*, but by nedbus CA"}),
         (("router", None, "ca.crt"), {"tls": "it requires a client certificate, and none is given"}),
         (
             ("router", "expired", "ca.crt"),
-            {"certificate": "is expired, .*has expired", "tls": "refuses: .*expired"},
+            {"certificate": "is expired, .*has expired", "tls": "refuses this client: .*expired"},
         ),
-        (("router", "foreign/reader", "ca.crt"), {"certificate": "not signed by .*tls_ca", "tls": "router refuses: "}),
+        (
+            ("router", "foreign/reader", "ca.crt"),
+            {"certificate": "not signed by .*tls_ca", "tls": "router refuses this client: "},
+        ),
     ],
 )
-def test_certificate_that_is_wrong(
-    run_router: Run, pki: Path, timings: Timings, case: tuple[str, str | None, str], told: dict[str, str]
+def test_invalid_certificate_is_wrong(
+    run_router: Run, pki: Path, timings: Timings, case: tuple[str, str | None, str], expected: dict[str, str]
 ) -> None:
-    """The reason is told, which Zenoh never does, and the router's certificate is shown though no session opens."""
+    """A finding has the reason, which Zenoh does not report, and the router's certificate although no session opens."""
     router, name, ca = case
-    if name != "reader":  # it is rejected, perhaps slowly
+    if name != "reader":  # the alert that rejects it may be slow
         timings.tls_alert = DEADLINE
-    findings = look(run_router(router), tls=files_of(pki, name, ca))
-    for check, text in told.items():
-        found(findings, check, "wrong", text)
-    assert any("the router shows" in each.seen for each in findings)
+    findings = diagnose(run_router(router), tls=tls_settings(pki, name, ca))
+    for check, text in expected.items():
+        find(findings, check, "wrong", text)
+    assert any("the router presents" in each.seen for each in findings)
 
 
-def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timings: Timings) -> None:
-    """TLS where there is none, none where there is, no authority at all, and a key of another certificate."""
+def test_wrong_protocol_and_wrong_tls_files_are_found(
+    run_router: Run, pki: Path, endpoint: str, timings: Timings
+) -> None:
+    """TLS to a TCP port, TCP to a TLS port, a missing authority, and a key of another certificate are wrong."""
     timings.doctor_open = 0.1
     secure = run_router()
-    findings = look(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
-    found(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
-    found(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
-    found(findings, "tls", "wrong", f"{secure}: .*no authority is given")
+    findings = diagnose(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
+    find(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
+    find(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
+    find(findings, "tls", "wrong", f"{secure}: .*no authority is given")
     for files, reason in (
-        ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
+        ({**tls_settings(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
         ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
         ({"tls_certificate": pki / "reader.crt"}, "not the CA to trust"),
     ):
-        found(look(secure, tls=files), "certificate", "wrong", reason)
+        find(diagnose(secure, tls=files), "certificate", "wrong", reason)
 
 
 @pytest.mark.parametrize(
@@ -470,35 +487,35 @@ def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, timi
         ("older", "1", "", "write", "unknown", "does not let this client read"),
         ("reader", None, "12", "vehicle", "wrong", f"2/{VLP}: reported as published by a service, but no message"),
         ("vehicle-1", None, "12", "read", "wrong", "no message arrives here"),
-        ("vehicle-1", "1", "12", "read", "warning", "no message arrives here.*for writing"),
+        ("vehicle-1", "1", "12", "read", "warning", "no message arrives here.*only permits writing"),
     ],
 )
-def test_what_may_be_read_and_written(
+def test_read_and_write_permissions_are_reported(
     run_router: Run, pki: Path, *, client: str, vehicle: str | None, published: str, check: str, state: State, text: str
 ) -> None:
-    """A vehicle's own certificate may write it, and not read; a reader's may not write, and finds what is dropped."""
-    older = {"@doctor": "@probe"} if client == "older" else {}  # rules that know nothing of probes
-    endpoint, own = run_router(**older), tls_of(pki, "vehicle-1")
+    """A vehicle's certificate may write it but not read; a reader's may not write, and reveals dropped messages."""
+    older = {"@doctor": "@probe"} if client == "older" else {}  # access rules without the probe key
+    endpoint, own = run_router(**older), client_tls(pki, "vehicle-1")
     with (
         nedbus.connect(endpoint, tls=own, timeout=DEADLINE) as bus,
         open_client([endpoint], tls=own, timeout=DEADLINE) as session,
-        flying(bus, *published or "2"),
-        reporting(session, sources=[source(addresses=[f"{each}/{VLP}" for each in published])]),
+        publishing(bus, *published or "2"),
+        service_status(session, sources=[source(addresses=[f"{each}/{VLP}" for each in published])]),
     ):
-        files = files_of(pki, "vehicle-1" if older else client)
-        findings = look(endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1)
+        files = tls_settings(pki, "vehicle-1" if older else client)
+        findings = diagnose(endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1)
     assert any(
         (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen} {each.advice}")
         for each in findings
     ), findings
     if published:
-        assert is_well(findings) == (state != "wrong"), findings
+        assert has_no_faults(findings) == (state != "wrong"), findings
 
 
-def test_certificates_without_the_package_that_reads_them(run_router: Run, pki: Path, start: Start) -> None:
-    """Names and dates are unknown then, and what to install is said; whether to trust it is told all the same."""
+def test_without_cryptography_certificates_are_verified_but_not_read(run_router: Run, pki: Path, start: Start) -> None:
+    """Without the package names and dates are unknown, and the advice names the extra; trust is still verified."""
     endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
-    settings = {name: str(path) for name, path in files_of(pki, "reader").items()}
+    settings = {name: str(path) for name, path in tls_settings(pki, "reader").items()}
     program = f"""
 import sys
 sys.modules["cryptography"] = None
@@ -523,8 +540,8 @@ for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}),
 
 
 @pytest.mark.filterwarnings("ignore:Parsed a serial number")
-def test_damaged_certificates_are_refused(pki: Path) -> None:
-    """The bytes come from anybody: cut off or changed anywhere, they are a ValueError or a certificate."""
+def test_damaged_certificate_raises_value_error_or_decodes(pki: Path) -> None:
+    """A certificate truncated or changed at any byte raises ValueError or decodes, and nothing else."""
     pem = (pki / "router.crt").read_text()
     assert Certificate.read(pki / "router.crt").hosts == ("127.0.0.1", "localhost")
     der = ssl.PEM_cert_to_DER_cert(pem)
@@ -536,8 +553,8 @@ def test_damaged_certificates_are_refused(pki: Path) -> None:
                 continue
 
 
-def listen_to(*packets: bytes, senders: int = 1) -> list[Finding]:
-    """Look at a link while these packets arrive on it, from each of the senders."""
+def check_link(*packets: bytes, senders: int = 1) -> list[Finding]:
+    """Run the doctor on a link while each of the senders sends these packets."""
     port = free_port()
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(senders)]
@@ -548,7 +565,7 @@ def listen_to(*packets: bytes, senders: int = 1) -> list[Finding]:
                     sender.sendto(packet, ("127.0.0.1", port))
 
         with repeating(send):
-            return look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{port}", listen=0.5)
+            return diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{port}", listen=0.5)
 
 
 def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes]:
@@ -556,49 +573,49 @@ def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes
     return [each.pack(encoder) for each in messages]  # type: ignore[attr-defined] # pymavlink has no types
 
 
-def test_what_comes_on_a_mavlink_link() -> None:
-    """Each state of a link has its finding, by system id: packets, messages, positions, the ULog stream, the port."""
+def test_traffic_on_mavlink_link_gives_findings() -> None:
+    """Packets, messages, positions, ULog stream, ignored senders and a port in use have findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
-    found(listen_to(), "mavlink", "wrong", "no packet within")
-    junk = listen_to(b"GET / HTTP/1.1")
-    found(junk, "mavlink", "wrong", r"packets from 127\.0\.0\.1:\d+, none of them MAVLink")
-    findings = listen_to(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position))
-    assert "requests it" in found(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
-    found(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
-    assert "?log=1" in found(findings, "mavlink", "ok", "system 7: a PX4, on a link that carries").advice
+    find(check_link(), "mavlink", "wrong", "no packet within")
+    junk = check_link(b"GET / HTTP/1.1")
+    find(junk, "mavlink", "wrong", r"packets from 127\.0\.0\.1:\d+, none of them MAVLink")
+    findings = check_link(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position))
+    assert "requests it" in find(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
+    find(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
+    assert "?log=1" in find(findings, "mavlink", "ok", "system 7: a PX4; the link carries").advice
     (backend,) = struct.unpack("<f", struct.pack("<i", 1))
     parameter = mavlink.MAVLink_param_value_message(b"SDLOG_BACKEND", backend, mavlink.MAV_PARAM_TYPE_INT32, 1, 0)
     data = mavlink.MAVLink_logging_data_message(255, 190, 7, 1, 0, [0] * 249)
-    findings = listen_to(*packets_of(7, heartbeat, parameter), *packets_of(8, heartbeat, data))
-    found(findings, "mavlink", "warning", "system 7: SDLOG_BACKEND is 1")
-    found(findings, "mavlink", "warning", "system 8: sends its ULog stream to system 255 component 190")
-    findings = listen_to(*packets_of(7, position, component=0), *packets_of(8, heartbeat, component=100))
-    found(findings, "mavlink", "wrong", "system 7 component 0: ignored: id 0 addresses all")
-    found(findings, "mavlink", "wrong", "system 8 component 100: ignored: not an autopilot")
+    findings = check_link(*packets_of(7, heartbeat, parameter), *packets_of(8, heartbeat, data))
+    find(findings, "mavlink", "warning", "system 7: SDLOG_BACKEND is 1")
+    find(findings, "mavlink", "warning", "system 8: sends its ULog stream to system 255 component 190")
+    findings = check_link(*packets_of(7, position, component=0), *packets_of(8, heartbeat, component=100))
+    find(findings, "mavlink", "wrong", "system 7 component 0: ignored: id 0 addresses all")
+    find(findings, "mavlink", "wrong", "system 8 component 100: ignored: not an autopilot")
     assert not any(each.state == "ok" for each in findings if each.check == "mavlink")
-    findings = listen_to(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)
-    found(findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7")
+    findings = check_link(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)
+    find(findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7")
     assert not any("component 100" in each.subject for each in findings)
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
-        findings = look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")
-    found(findings, "mavlink", "warning", r"address already in use")
+        findings = diagnose(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")
+    find(findings, "mavlink", "warning", r"address already in use")
 
 
-def test_settings_that_are_in_force(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The origin of the router's setting, the other settings and their origins, and what the sources lack."""
+def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Findings name the origin of each setting and the mistakes in the sources."""
     Path("nedbus.toml").write_text('prefix = "fleet"\nsource = ["ulog:gone.ulg", "sim:?nonsense=1"]\n')
     monkeypatch.setenv("NEDBUS_VEHICLE", "7")
     findings = examine(load_settings(), version="0")
-    found(findings, "settings", "ok", "connect: tcp/127.0.0.1:7447, the default")
-    found(findings, "settings", "ok", "prefix by nedbus.toml, vehicle by NEDBUS_VEHICLE")
-    found(findings, "settings", "wrong", "gone.ulg: no such file")
-    found(findings, "settings", "wrong", "there is no option 'nonsense'")
+    find(findings, "settings", "ok", "connect: tcp/127.0.0.1:7447, the default")
+    find(findings, "settings", "ok", "prefix by nedbus.toml, vehicle by NEDBUS_VEHICLE")
+    find(findings, "settings", "wrong", "gone.ulg: no such file")
+    find(findings, "settings", "wrong", "there is no option 'nonsense'")
 
 
-def test_extra_that_is_missing(start: Start) -> None:
-    """A source whose package is not installed is found before the service says so; so is --mavlink."""
+def test_missing_extra_is_found(start: Start) -> None:
+    """A package missing for a source or for --mavlink is reported with the extra to install."""
     program = """
 import sys
 sys.modules["pymavlink"] = None

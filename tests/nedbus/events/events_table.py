@@ -1,11 +1,11 @@
-"""Tell what happened in PX4 logs by first differences of single topics, with pyulog and NumPy, and nothing of nedbus.
+"""Independent table of events in PX4 logs: first differences of single topics, with pyulog and NumPy, without nedbus.
 
-    python -m tests.nedbus.events.events_table FOLDER...    # writes tests/data/events.json anew, of all logs there
+    python -m tests.nedbus.events.events_table FOLDER...    # rewrites tests/data/events.json from all logs there
 
-It was written from PX4's definitions of the messages, by somebody who had not seen `nedbus.events`. Each row is a
-difference between two messages of a topic that follow each other (instance 0); the first message gives none. Down is
-positive. A reset has the deltas that the message tells, or where the two samples contradict them, the step from one to
-the other without the motion by velocity; it has none of a position whose origin changed with it.
+It was written from PX4's message definitions by an author who had not seen `nedbus.events`. Each row is a difference
+between two consecutive messages of a topic (instance 0); the first message has none. Down is positive. A reset has the
+deltas of the message or, if the two samples contradict them, the step between the samples minus the motion by velocity;
+it has no size for a position whose origin changed at the same time.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ VALID: Final = {
     "xy_global": "xy_not_global", "z_global": "z_not_global", "heading_good_for_control": "heading_not_good",
     "dist_bottom_valid": "dist_bottom_invalid",
 }  # fmt: skip
-JUMP_STEP: Final = 1.0  # m beyond velocity * dt, in one step
-JUMP_DT: Final = 0.5  # s, longest step, and longest pause inside one slide
+JUMP_STEP: Final = 1.0  # m beyond velocity * dt in one step
+JUMP_DT: Final = 0.5  # s; longest step, and longest pause within one slide
 ORIGIN_MIN: Final = 0.01  # m
-DELTA_DT: Final = 0.1  # s, step up to which a delta may be off by DELTA_MARGIN
+DELTA_DT: Final = 0.1  # s; longest step for which DELTA_MARGIN applies
 DELTA_MARGIN: Final = 0.5  # m, m/s, rad
 RATES: Final = {
     "x": ("vx",), "y": ("vy",), "z": ("z_deriv", "vz"), "vx": ("ax",), "vy": ("ay",), "vz": ("az",), "heading": (),
@@ -64,7 +64,7 @@ class Topic:
         return self._columns[field]
 
     def column(self, field: str) -> Any:
-        """Return a field, zeros where the log does not have it."""
+        """Return a field, or zeros if the log does not have it."""
         return self._columns.get(field, np.zeros(self.count))
 
     def __iter__(self) -> Iterator[str]:
@@ -77,7 +77,7 @@ class Topic:
         return int(self.us[index] - self.us[index - 1]) / 1e6
 
     def changes(self, field: str) -> Iterator[tuple[int, float, float]]:
-        """Yield index, value before and value now of each message whose value differs."""
+        """Yield index, previous and new value of each message with a changed value."""
         values = self[field]
         for index in range(1, self.count):
             if differs(values[index - 1], values[index]):
@@ -85,7 +85,7 @@ class Topic:
 
 
 class Table:
-    """The rows of one log."""
+    """Rows of one log."""
 
     def __init__(self) -> None:
         self.rows: list[Row] = []
@@ -94,13 +94,13 @@ class Table:
         self.rows.append({"t": time, "kind": kind, "change": change, "numbers": numbers})
 
     def add_flag(self, topic: Topic, field: str, kind: str, *, bad: bool) -> None:
-        """Add the changes of a flag that is `bad` while the condition holds."""
+        """Add the changes of a flag that equals `bad` while the condition is active."""
         for index, before, now in topic.changes(field) if field in topic else ():
             if bool(before) != bool(now):
                 self.add(topic.time(index), kind, "begin" if bool(now) == bad else "end")
 
     def add_flags(self, topic: Topic, fields: Sequence[str], kind: str, *, bad: bool) -> None:
-        """Add the changes of flags; those that change alike with one message are one row."""
+        """Add the changes of flags; equal changes in one message are one row."""
         found: dict[tuple[int, str], list[str]] = {}
         for field in fields:
             for index, _, now in topic.changes(field):
@@ -112,7 +112,7 @@ class Table:
         self, topic: Topic, kind: str, begins: Callable[[int], bool], ends: Callable[[int], bool],
         numbers: Callable[[int], Mapping[str, int]],
     ) -> None:  # fmt: skip
-        """Add the changes of a condition between two thresholds; the first message sets it without a row."""
+        """Add the changes of a condition with hysteresis; the first message sets it without a row."""
         holds = begins(0)
         for index in range(1, topic.count):
             if (ends if holds else begins)(index):
@@ -129,7 +129,7 @@ def rounded(value: float, digits: int = 4) -> float:
 
 
 def excess_of(position: Topic, index: int) -> tuple[float, float]:
-    """Return how far north and east a message is beyond the mean velocity of it and the one before, times the step."""
+    """Return the step north and east of a message minus mean velocity times interval."""
     north, east = (
         position[axis][index]
         - position[axis][index - 1]
@@ -140,7 +140,7 @@ def excess_of(position: Topic, index: int) -> tuple[float, float]:
 
 
 def origin_of(position: Topic, index: int) -> str | tuple[float, float] | None:
-    """Return "set", or distance and height by which the origin moved; None if it is as before, or unknown."""
+    """Return "set", or distance and height by which the origin moved; None if unchanged or unknown."""
     before, now = ([position[name][each] for name in ("ref_lat", "ref_lon", "ref_alt")] for each in (index - 1, index))
     if not any(differs(*pair) for pair in zip(before, now, strict=True)):
         return None
@@ -213,9 +213,9 @@ def add_reset(table: Table, position: Topic, index: int, *, origin_changed: bool
 
 
 def step_of(position: Topic, quantity: str, deltas: Sequence[str], index: int) -> list[float]:
-    """Return the deltas of a reset; where one is outside all that the rates allow, the steps without motion."""
+    """Return the deltas of a reset, or the steps minus motion if a delta exceeds what the rates allow."""
     margin = DELTA_MARGIN * max(1.0, position.step(index) / DELTA_DT)
-    told, seen, fits = [], [], True
+    deltas_found, steps, fits = [], [], True
     values = {"xy": ("x", "y"), "vxy": ("vx", "vy")}.get(quantity, (quantity,))
     for delta, value in zip(deltas, values, strict=True):
         step = position[value][index] - position[value][index - 1]
@@ -224,9 +224,9 @@ def step_of(position: Topic, quantity: str, deltas: Sequence[str], index: int) -
         moved = [position[rate][each] * position.step(index) for rate in RATES[value] for each in (index - 1, index)]
         allowed = [step, *(step - each for each in moved)]
         fits = fits and min(allowed) - margin <= position[delta][index] <= max(allowed) + margin
-        told.append(rounded(position[delta][index]))
-        seen.append(rounded(step - (sum(moved[:2]) / 2 if moved else 0.0)))
-    return told if fits else seen
+        deltas_found.append(rounded(position[delta][index]))
+        steps.append(rounded(step - (sum(moved[:2]) / 2 if moved else 0.0)))
+    return deltas_found if fits else steps
 
 
 def add_gps(table: Table, gps: Topic) -> None:
@@ -285,7 +285,7 @@ def add_failsafe(table: Table, flags: Topic) -> None:
 
 
 def add_battery(table: Table, battery: Topic) -> None:
-    """Add the warnings; messages of a battery that is not connected are passed over, as if they had not come."""
+    """Add the warnings; ignore messages of a battery that is not connected."""
     before: int | None = None
     for index in range(battery.count):
         if "connected" in battery and not battery["connected"][index]:
@@ -302,7 +302,7 @@ def add_landed(table: Table, detector: Topic) -> None:
 
 
 def rows_of(path: Path) -> list[Row]:
-    """Return what happened in a log, in order."""
+    """Return the rows of a log in order of time."""
     found = ULog(str(path), list(TOPICS)).data_list
     topics = {each.name: Topic(each) for each in found if each.multi_id == 0}
     table = Table()
@@ -318,7 +318,7 @@ def rows_of(path: Path) -> list[Row]:
 
 
 def to_json(logs: Mapping[str, Sequence[Row]]) -> str:
-    """Return the file: a row a line, below how it was made."""
+    """Return the file as JSON, one row per line, below a note on its origin."""
     how = f"python -m {__spec__.name} LOGS: first differences of single topics, with pyulog; see its docstring"
     texts = ["{" + f'"from": {json.dumps(how)}']
     texts += [

@@ -1,11 +1,11 @@
-"""A vehicle with hand-made messages, and its account."""
+"""A vehicle with synthetic messages, and its event log."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any, Final
 
-from nedbus.events import Account, Event
+from nedbus.events import Event, EventLog
 from nedbus_msgs import Address, get_topic
 from tests.flights.messages import VALID, VLP, message
 
@@ -20,10 +20,10 @@ DISARMED, ARMED = 1, 2
 
 
 class Flight:
-    """A vehicle and its account; messages arrive when they are sent, in seconds since boot."""
+    """A vehicle and its event log; messages arrive when they are sent, and times are seconds."""
 
     def __init__(self) -> None:
-        self.account = Account()
+        self.event_log = EventLog()
         self.now = 100.0
         self.booted = 90.0
         self.link = ""
@@ -37,23 +37,23 @@ class Flight:
         self, topic: str = VLP, *, vehicle: str = "1", instance: int | None = None, missing: Iterable[str] = (),
         lost: int = 0, **fields: Any,
     ) -> list[Event]:  # fmt: skip
-        """Send a message with valid flags unless given otherwise; return the new events."""
+        """Send a message, with valid flags by default; return the new events."""
         stamp = round((self.now - self.booted) * 1e6)
         values: object = {"timestamp": stamp, **fields}
         if topic == VLP:
             values = message(stamp, **(VALID | ORIGIN | fields))
         instance = 0 if instance is None and get_topic(topic).instances else instance
         address = Address(vehicle, topic, instance)
-        self.account.add(address, values, self.now, missing=frozenset(missing), lost=lost)
-        return self.take()
+        self.event_log.add(address, values, self.now, missing=frozenset(missing), lost=lost)
+        return self.new_events()
 
     def fly(self, seconds: float, rate: float = 10.0) -> list[Event]:
-        """Send positions for a while; return the new events."""
-        told = []
+        """Send positions for this duration; return the new events."""
+        reported = []
         for _ in range(round(seconds * rate)):
             self.wait(1 / rate)
-            told += self.send()
-        return told
+            reported += self.send()
+        return reported
 
     def gps(self, **fields: Any) -> list[Event]:
         return self.send("vehicle_gps_position", **GOOD_GPS | fields)
@@ -64,30 +64,30 @@ class Flight:
     def battery(self, warning: int) -> list[Event]:
         return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
 
-    def look(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
-        """Update the account with this state of the position stream, None if unknown; return the new events."""
-        self.account.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
-        return self.take()
+    def update(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
+        """Update the event log with the state of the position stream, None if unknown; return the new events."""
+        self.event_log.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
+        return self.new_events()
 
     def reject(self, reason: str = "x is NaN") -> list[Event]:
-        self.account.reject(POSITION, reason, self.now)
-        return self.take()
+        self.event_log.reject(POSITION, reason, self.now)
+        return self.new_events()
 
-    def take(self) -> list[Event]:
-        new, self._seen = self.account.events_since(self._seen)
+    def new_events(self) -> list[Event]:
+        new, self._seen = self.event_log.events_since(self._seen)
         return new
 
     @property
     def severity(self) -> str:
-        return self.account.state("1", self.now).severity
+        return self.event_log.state("1", self.now).severity
 
     @property
     def kinds(self) -> list[str]:
-        return [each.kind for each in self.account.state("1", self.now).conditions]
+        return [each.kind for each in self.event_log.state("1", self.now).conditions]
 
 
 def lose_gps(flight: Flight) -> None:
-    """Lose the receiver, and then the estimate."""
+    """Lose the GPS fix, then the position estimate."""
     flight.gps()
     flight.fly(1)
     flight.gps(fix_type=0, satellites_used=0)

@@ -1,4 +1,4 @@
-"""Events while the host's clock is set: a service and a reader of two vehicles, with fake clocks."""
+"""Events while the host's clock is stepped: a service and a reader of two vehicles, with fake clocks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ GPS: Final = Address("1", "vehicle_gps_position")
 
 
 class World:
-    """A service, a reader, and the clock of their host, which is set by `step` seconds `at` a moment."""
+    """A service, a reader, and their host's clock, which is stepped by `step` seconds `at` a time."""
 
     def __init__(self, patch: pytest.MonkeyPatch, step: float, at: float) -> None:
         self.now, self._step, self._at = 0.0, step, at
@@ -48,7 +48,7 @@ class World:
             publisher=lambda address, *_, **__: SimpleNamespace(definition=BY_TOPIC[address.topic], **vars(publisher)),
         )
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.daemon.account
+            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.daemon.event_log
         )
         bus = SimpleNamespace(
             connected=True,
@@ -63,8 +63,8 @@ class World:
     def offset(self) -> float:
         return self._step if self.now >= self._at else 0.0
 
-    def hear(self, address: Address, fields: dict[str, Any], lost: int = 0) -> None:
-        """Receive a message in the service, live or of a replay, and in the reader, stamped by another host's clock."""
+    def receive(self, address: Address, fields: dict[str, Any], lost: int = 0) -> None:
+        """Deliver a message with another host's timestamp to the service, live or from a replay, and to the reader."""
         received = SourceMessage(0.0, address, fields, lost=lost)
         if address.vehicle == "1":
             self.output.publish_live(received)
@@ -75,19 +75,19 @@ class World:
         self.reader.add(Sample(cast("Any", content), address, 0, lost=lost, _sent=sent))
 
     def run(self) -> Iterator[object]:
-        """Fly: a position without GPS, silence, a rejected message, a reset and losses; return all events."""
+        """Simulate GPS loss, silence, a rejection, a reset and losses; yield the events of service and reader."""
         for tick in range(round(LENGTH * RATE)):
             self.now = tick / RATE
             stamp = round((50 + self.now) * 1e6)
             if tick % RATE == 0:
                 gps = GOOD_GPS | ({"fix_type": 0, "satellites_used": 2} if 5 <= self.now < 9 else {})
-                self.hear(GPS, {"timestamp": stamp, **gps})
+                self.receive(GPS, {"timestamp": stamp, **gps})
             for address in ADDRESSES:
                 fields = VALID | {"xy_valid": not 6 <= self.now < 9, "xy_reset_counter": int(self.now > 25)}
                 if address.vehicle == "2" and 12 <= self.now < 20:
                     continue
-                self.hear(address, message(stamp, **fields).__dict__, lost=3 * (tick == 30 * RATE))
-            if tick == 20 * RATE:  # the retained message of a vehicle that was switched off ten minutes ago
+                self.receive(address, message(stamp, **fields).__dict__, lost=3 * (tick == 30 * RATE))
+            if tick == 20 * RATE:  # retained message of a vehicle switched off ten minutes ago
                 sent = round((START + self.now - 600) * 1e9)
                 self.reader.add(Sample(message(stamp, **VALID), Address("3", VLP), 0, _sent=sent))
             if tick == 22 * RATE:
@@ -95,30 +95,30 @@ class World:
             if tick % (RATE // 2) == 0:
                 self.daemon.update_events()
                 self.reader.poll()
-        for account in (self.daemon.account, self.reader.account):
-            account.settle(START + self.now + 60)
-            yield [asdict(event) for event in account.events_since(0)[0]]
+        for event_log in (self.daemon.event_log, self.reader.event_log):
+            event_log.settle(START + self.now + 60)
+            yield [asdict(event) for event in event_log.events_since(0)[0]]
 
 
 def fly(step: float, at: float) -> tuple[World, list[object]]:
     with pytest.MonkeyPatch.context() as patch:
         world = World(patch, step, at)
-        told = list(world.run())
+        reported = list(world.run())
         read = from_json(json.loads(json.dumps(asdict(world.daemon.report(within=1e5)))))
         assert read is not None
         labels = [event.time for event in read.events]
-        steady = [event.time + world.offset for event in world.daemon.account.events_since(0)[0]]
+        steady = [event.time + world.offset for event in world.daemon.event_log.events_since(0)[0]]
         assert labels == pytest.approx(steady, abs=0.01)
         assert read.now == pytest.approx(START + world.now + world.offset, abs=0.01)
         assert world.daemon.status.started == pytest.approx(START + world.offset, abs=0.01)
-        return world, told
+        return world, reported
 
 
 _, EXPECTED = fly(0.0, 0.0)
 
 
-def test_flight_has_events_of_both_sides() -> None:
-    """The flight that the property compares has an invalid position with evidence, silence, a reset and losses."""
+def test_service_and_reader_detect_the_expected_events() -> None:
+    """The reference flight has an invalid position with evidence, silence, a reset and losses, in both logs."""
     for events in cast("list[list[dict[str, Any]]]", EXPECTED):
         kinds = {(each["vehicle"], each["kind"], each["change"]) for each in events}
         assert {("1", "xy_invalid", "begin"), ("2", "silent", "begin"), ("2", "silent", "end")} <= kinds
@@ -129,6 +129,6 @@ def test_flight_has_events_of_both_sides() -> None:
 
 
 @given(step=st.sampled_from([-3600.0, -1.0, 10.0, 3600.0]), at=st.floats(0.0, LENGTH))
-def test_step_of_the_clock_changes_no_event(step: float, at: float) -> None:
-    """Setting the host's clock at any moment changes no event, time or duration; it only moves labels in reports."""
+def test_clock_step_changes_no_event(step: float, at: float) -> None:
+    """A step of the host's clock at any time changes no event or duration; it only shifts times in reports."""
     assert fly(step, at)[1] == EXPECTED

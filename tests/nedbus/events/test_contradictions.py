@@ -1,4 +1,4 @@
-"""Estimates that GNSS, barometer or ground truth contradict, from hand-made messages."""
+"""Estimates contradicted by GNSS, barometer or ground truth."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def fly(
     flight: Flight, seconds: float, *, up: float = 0.0, north: float = 0.0, baro: float | None = None,
     truth: float | None = None, gps: dict[str, Any] | None = None, missing: tuple[str, ...] = (), **fields: Any,
 ) -> list[Event]:  # fmt: skip
-    """Fly with an estimate that is off from GNSS, and by other values from other references [m]."""
-    told: list[Event] = []
+    """Fly with an estimate off by `up` and `north` from GNSS, and by `baro` and `truth` from other references [m]."""
+    reported: list[Event] = []
     for _ in range(round(seconds * 10)):
-        told += flight.wait(0.1).send(missing=missing, **{**ORIGIN, "z": -20.0 - up, "x": north, **fields})
-        told += flight.send("vehicle_gps_position", **(GPS if gps is None else {**GPS, **gps}))
+        reported += flight.wait(0.1).send(missing=missing, **{**ORIGIN, "z": -20.0 - up, "x": north, **fields})
+        reported += flight.send("vehicle_gps_position", **(GPS if gps is None else {**GPS, **gps}))
         if baro is not None:
-            told += flight.send("vehicle_air_data", baro_alt_meter=1000.0 + up - baro, baro_device_id=1)
+            reported += flight.send("vehicle_air_data", baro_alt_meter=1000.0 + up - baro, baro_device_id=1)
         if truth is not None:
-            told += flight.send(TRUTH, **{**ORIGIN, "ref_alt": 0.0, "z": truth - up, "x": north - truth, "y": 0.0})
-    return [each for each in told if each.kind != "jump"]
+            reported += flight.send(TRUTH, **{**ORIGIN, "ref_alt": 0.0, "z": truth - up, "x": north - truth, "y": 0.0})
+    return [each for each in reported if each.kind != "jump"]
 
 
 @pytest.fixture
@@ -43,30 +43,30 @@ def flight() -> Flight:
     return flight
 
 
-def test_contradicted_height(flight: Flight) -> None:
-    """A contradiction begins when all references disagree for long enough, and ends when the first one agrees."""
+def test_height_is_contradicted_when_all_references_disagree(flight: Flight) -> None:
+    """A contradiction begins after all references have disagreed for 1.5 s, and ends when one agrees."""
     since = flight.now
     begun = fly(flight, 4.0, up=36.0, baro=36.0)
     assert [(each.kind, each.change, each.severity, each.text) for each in begun] == [
-        ("height_contradicted", "begin", "bad", "height 36 m above GNSS and barometer while z is valid")
+        ("height_contradicted", "begin", "bad", "height 36 m above GNSS and barometer while z_valid is true")
     ]
     assert begun[0].time == pytest.approx(since, abs=0.5)
     assert (flight.severity, flight.kinds) == ("bad", ["height_contradicted"])
     ended = fly(flight, 1.0, baro=0.0)
     assert [(each.kind, each.change, each.severity) for each in ended] == [("height_contradicted", "end", "info")]
-    assert ended[0].text.startswith("height 36 m above GNSS and barometer: over after ")
-    assert ended[0].lasted == pytest.approx(4.0, abs=0.4)  # the interval between two comparisons
+    assert ended[0].text.startswith("height no longer contradicted after ")
+    assert ended[0].lasted == pytest.approx(4.0, abs=0.4)  # comparison interval
     assert flight.kinds == []
 
 
-def test_contradicted_position(flight: Flight) -> None:
-    """The limit is 4 m, three times the receiver's accuracy, and the way flown in half a second."""
+def test_position_is_contradicted_beyond_its_limit(flight: Flight) -> None:
+    """The limit is 4 m plus three times the receiver's accuracy and the distance flown in 0.5 s."""
     assert fly(flight, 10.0, north=6.9) == []
     assert fly(flight, 10.0, north=12.0, vx=12.0, x=12.0) == []
     assert fly(flight, 10.0, north=30.0, gps={"eph": 9.0}) == []
-    assert fly(flight, 10.0, north=30.0, gps={"eph": 0.0}) == [], "an accuracy that the receiver does not know"
+    assert fly(flight, 10.0, north=30.0, gps={"eph": 0.0}) == [], "unknown accuracy"
     (begun,) = fly(flight, 10.0, north=7.6)
-    assert begun.text == "position 8 m off GNSS while xy is valid"
+    assert begun.text == "position 8 m off GNSS while xy_valid is true"
     assert begun.numbers == {"distance": pytest.approx(7.6, abs=0.01)}
 
 
@@ -74,71 +74,71 @@ def test_contradicted_position(flight: Flight) -> None:
     "how",
     [
         {"baro": 0.0},  # one reference agrees
-        {"baro": -36.0},  # they contradict each other
+        {"baro": -36.0},  # opposite directions
         {"truth": 0.0},
         {"z_valid": False},
-        {"missing": ("z_valid",)},  # MAVLink does not have it
+        {"missing": ("z_valid",)},  # not provided by MAVLink
         {"gps": {"fix_type": 0, "satellites_used": 0}},
         {"gps": {"latitude_deg": 0.0, "longitude_deg": 0.0}},
         {"gps": {"epv": 10.0}},
-        {"up": 23.0},  # twice (8 m, 5 % of z, 3 x epv) by one reference
+        {"up": 23.0},  # below 2 x (8 m + 5 % of z + 3 x epv), as there is one reference
         {"xy_global": False, "z_global": False, "ref_lat": float("nan"), "ref_lon": float("nan"),
          "ref_alt": float("nan")},
     ],
 )  # fmt: skip
-def test_height_that_is_not_contradicted(flight: Flight, how: dict[str, Any]) -> None:
-    """All references that are there have to say so, of a valid estimate, by more than they may be wrong."""
+def test_height_is_not_contradicted(flight: Flight, how: dict[str, Any]) -> None:
+    """A height is not contradicted if a reference agrees, the estimate is invalid, or the limit is not exceeded."""
     fly(flight, 2.0)
-    told = fly(flight, 10.0, **{"up": 30.0, **how})
-    assert not [each for each in told if each.kind == "height_contradicted"]
+    reported = fly(flight, 10.0, **{"up": 30.0, **how})
+    assert not [each for each in reported if each.kind == "height_contradicted"]
 
 
-def test_short_contradiction_is_no_event(flight: Flight) -> None:
-    """A height for less than 1.5 s, a position for less than 3 s."""
+def test_short_contradiction_is_ignored(flight: Flight) -> None:
+    """Contradictions of a height for less than 1.5 s, or a position for less than 3 s, are ignored."""
     assert fly(flight, 1.2, up=100.0, baro=100.0) == fly(flight, 2.0) == fly(flight, 2.5, north=9.0) == []
 
 
-def test_barometer_is_compared_with_its_beginning(flight: Flight) -> None:
-    """Its heights have no origin; another barometer, and an origin that is set, begin anew."""
+def test_barometer_is_compared_relative_to_its_first_height(flight: Flight) -> None:
+    """Barometer heights are relative to the first comparison; dynamic pressure at 25 m/s is tolerated."""
     none = {"fix_type": 0, "satellites_used": 0}
     fly(flight, 5.0, gps=none, baro=0.0)
     assert fly(flight, 5.0, gps=none, baro=17.0) == []
     (begun,) = fly(flight, 5.0, gps=none, baro=-24.0)
-    assert begun.text == "height 24 m below barometer while z is valid"
+    assert begun.text == "height 24 m below barometer while z_valid is true"
     fast = Flight()
     fast.status(ARMED)
     fly(fast, 5.0, gps=none, baro=0.0)
     assert not [each for each in fly(fast, 5.0, gps=none, baro=50.0, vx=25.0, x=0.0) if "contra" in each.kind]
 
 
-def test_ground_truth(flight: Flight) -> None:
-    """A simulation has a reference for both; its altitude may have another origin."""
+def test_ground_truth_contradicts_height_and_position(flight: Flight) -> None:
+    """Ground truth contradicts height and position, even with another altitude origin."""
     fly(flight, 2.0, truth=0.0, gps={"fix_type": 0})
-    told = fly(flight, 5.0, truth=40.0, gps={"fix_type": 0})
-    assert [each.text for each in told if each.change == "begin" and "contradicted" in each.kind] == [
-        "height 40 m above ground truth while z is valid", "position 40 m off ground truth while xy is valid",
+    reported = fly(flight, 5.0, truth=40.0, gps={"fix_type": 0})
+    assert [each.text for each in reported if each.change == "begin" and "contradicted" in each.kind] == [
+        "height 40 m above ground truth while z_valid is true", "position 40 m off ground truth while xy_valid is true",
     ]  # fmt: skip
 
 
-def test_contradiction_on_the_ground_is_information() -> None:
-    """A receiver indoors may be wrong."""
+def test_contradiction_while_disarmed_is_info() -> None:
+    """While disarmed a contradiction is info, as a receiver indoors is inaccurate."""
     flight = Flight()
     flight.status(DISARMED)
-    told = fly(flight, 10.0, north=50.0)
-    assert [(each.kind, each.severity) for each in told] == [("position_contradicted", "info")]
+    reported = fly(flight, 10.0, north=50.0)
+    assert [(each.kind, each.severity) for each in reported] == [("position_contradicted", "info")]
     assert flight.severity == "info"
 
 
-def test_odd_air_data_is_ignored(flight: Flight) -> None:
-    """Its fields are whatever its publisher defines."""
+def test_malformed_air_data_is_ignored(flight: Flight) -> None:
+    """Air data with missing fields or other types is ignored, as its publisher defines it."""
     for odd in ({}, {"baro_alt_meter": "high"}, {"baro_alt_meter": None, "baro_device_id": (1, 2)}):
         for _ in range(20):
             assert flight.wait(0.5).send("vehicle_air_data", **odd) == []
             flight.send(**ORIGIN)
 
 
-def test_contradiction_is_over_after_a_reboot(flight: Flight) -> None:
-    """The barometer is compared anew then."""
+def test_reboot_ends_contradiction(flight: Flight) -> None:
+    """A reboot ends a contradiction and resets the barometer's offset."""
     fly(flight, 5.0, up=36.0, baro=36.0)
     assert flight.kinds == ["height_contradicted"]
     flight.booted = flight.now

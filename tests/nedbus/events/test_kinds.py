@@ -1,4 +1,4 @@
-"""The table of the kinds of events, with hand-made messages."""
+"""Table of event kinds."""
 
 import pytest
 
@@ -7,17 +7,17 @@ from nedbus.events import KINDS, Event, Kind, spans_of, state_at, stories_of
 from .flight import Flight
 
 
-def test_every_kind_is_known() -> None:
-    """Each kind that may explain another one is a kind of event itself."""
+def test_causes_are_kinds_in_the_table() -> None:
+    """Each cause of a kind is a kind in the table itself."""
     for name, kind in KINDS.items():
         assert set(kind.causes) <= set(KINDS), name
 
 
-def test_kind_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A row of the table is all that a flag needs to be an event, a state, a cause, and a story."""
+def test_row_in_the_table_defines_a_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row in the table is sufficient for a flag to become an event, a state, a cause and a story."""
     row = Kind(
         "freefall", "bad", "VehicleLandDetected", ("gps_fix_lost",), fault=True, flags={"freefall": "freefall"},
-        begin="free fall", end="caught again",
+        begin="free fall", end="free fall ended",
     )  # fmt: skip
     monkeypatch.setitem(KINDS, "freefall", row)
     flight = Flight()
@@ -28,14 +28,14 @@ def test_kind_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
     [begun] = flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=True)
     assert (begun.kind, begun.severity, begun.text) == ("freefall", "bad", "free fall")
     assert [each.kind for each in begun.evidence] == ["gps_fix_lost"]
-    assert flight.account.state("1", flight.now).text == "free fall"
+    assert flight.event_log.state("1", flight.now).text == "free fall"
     flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=False)
-    [story] = [each for each in stories_of(flight.account.events) if each.what == "free fall"]
+    [story] = [each for each in stories_of(flight.event_log.events) if each.what == "free fall"]
     assert [each.kind for each in story.before] == ["gps_fix_lost"]
 
 
-def test_kind_of_a_newer_service_is_an_event() -> None:
-    """An event of a kind that is not in the table, as a newer service reports it, is shown as it is."""
+def test_unknown_kind_is_shown() -> None:
+    """An event of an unknown kind, as from a newer service, is shown with its text and severity."""
     begun = Event("1", "lightning", "begin", "watch", "struck", 1.0)
     assert [each.text for each in spans_of([begun])] == ["struck"]
     assert state_at(spans_of([begun]), 2.0).text == "struck"

@@ -1,7 +1,7 @@
-"""Events of real flight logs, beside a table of what happened in them that was made without nedbus.
+"""Events of real flight logs, compared with a table made without nedbus.
 
-The peers are eight logs of PX4 1.12 to 1.17 (six flights and two simulations), and `events_table.py`, which reads them
-with pyulog and tells first differences of single topics.
+The logs are from PX4 1.12 to 1.17 (six flights and two simulations); `events_table.py` reads them with pyulog and lists
+first differences of single topics.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.events import Event, Story, Times, Verdict, spans_of, state_at, stories_of, verdict_of
-from nedbus.sources import FileAccount
+from nedbus.sources import FileEvents
 from tests.flights import ulogs
 from tests.flights.ulogs import LOGS
 from tests.nedbus.events import events_table
@@ -28,11 +28,11 @@ TABLE: Final = json.loads(events_table.TABLE.read_text())
 TABLES: Final = json.loads((events_table.TABLE.parent / "flight_tables.json").read_text())
 NAMES: Final = [name for name in TABLE if name != "from"]
 MILLISECOND: Final = 1.0005e-3  # the table has rounded times
-FLAPPING: Final = 4, 10.0, 5.0  # changes within so many seconds that are told; then the last, after so many without one
+FLAPPING: Final = 4, 10.0, 5.0  # changes per window, window [s], pause until the last one is reported [s]
 NOT_IN_TABLE: Final = (
     "dropout", "text", "ekf_changed", "other_ekf", "height_contradicted", "position_contradicted",
 )  # fmt: skip
-RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # as the layout of today calls what PX4 1.15 logs
+RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # PX4 1.15 name: current name
 
 pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there")]
 
@@ -41,44 +41,44 @@ def path_of(name: str) -> Path:
     return next(LOGS.parent.rglob(f"{name}.ulg"))
 
 
-def account_of(name: str) -> FileAccount:
-    return ulogs.account_of(path_of(name))
+def cached_events(name: str) -> FileEvents:
+    return ulogs.cached_events(path_of(name))
 
 
-def told_in(name: str) -> list[Event]:
-    return account_of(name).account.events_since(0)[0]
+def events_in(name: str) -> list[Event]:
+    return cached_events(name).event_log.events_since(0)[0]
 
 
 def time_of(event: Event) -> float:
-    """Return the time since boot; of a jump, which is told when it has ended, that of the last message before it."""
+    """Return the time since boot; for a jump, which is reported when it ends, that of the message before it."""
     time = event.numbers["begin"] if event.kind == "jump" else event.boot
     assert time is not None
     return time
 
 
 def without_flapping(rows: Sequence[Row]) -> Iterator[tuple[Row, int]]:
-    """Yield the rows that are told, each with the number of changes that it stands for."""
+    """Yield the rows expected as events, each with the number of changes that it represents."""
     times: dict[tuple[str, ...], list[float]] = {}
-    untold: dict[tuple[str, ...], list[Row]] = {}
+    suppressed: dict[tuple[str, ...], list[Row]] = {}
     limit, window, pause = FLAPPING
     for row in rows:
         key = (row["kind"], *row["numbers"].get("flags", ()))
-        if key in untold and row["t"] - untold[key][-1]["t"] > pause:
-            yield untold[key][-1], len(untold.pop(key))
+        if key in suppressed and row["t"] - suppressed[key][-1]["t"] > pause:
+            yield suppressed[key][-1], len(suppressed.pop(key))
         before = times.setdefault(key, [])
         is_fast = row["change"] != "once" and len(before) >= limit and row["t"] - before[-limit] < window
         before.append(row["t"])
         if is_fast:
-            untold.setdefault(key, []).append(row)
+            suppressed.setdefault(key, []).append(row)
         else:
             yield row, 1
-    for left in untold.values():
+    for left in suppressed.values():
         yield left[-1], len(left)
 
 
 def is_same(row: Row, event: Event) -> bool:
-    """Return whether an event is this row: kind, change, time, flags and quantities."""
-    # The table has the first message that the velocity does not explain; a jump begins with the one before it.
+    """Return whether an event equals a row in kind, change, time, flags and quantities."""
+    # The table has the first message with unexplained motion; a jump begins with the message before it.
     tolerance = 0.05 if row["kind"] == "jump" else MILLISECOND
     names = row["numbers"].get("flags", row["numbers"].get("quantities"))
     return (
@@ -89,25 +89,24 @@ def is_same(row: Row, event: Event) -> bool:
 
 
 def sizes_of(event: Event) -> Mapping[str, float]:
-    """Return the numbers as the table has them: down for up."""
+    """Return the numbers with the table's sign: down in place of up."""
     down = {f"{name.removesuffix('up')}down": -value for name, value in event.numbers.items() if name[-2:] == "up"}
     return {**event.numbers, **(down if event.kind == "reset" else {})}
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_event_of_the_table_is_told(name: str) -> None:
-    """Nothing more, nothing less: kind, change, time within a millisecond, flags and sizes.
+def test_events_equal_the_independent_table(name: str) -> None:
+    """Events and table rows are the same: kind, change, time within a millisecond, flags and sizes.
 
-    Meant to differ: what holds at the first message is no event, in both; a flag that changes more than four times in
-    ten seconds is told once more, when it has come to rest; PX4's older names are those of the newest layout.
+    Intended differences: flapping flags are suppressed, and old PX4 names are mapped to those of the newest layout.
     """
-    dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]  # which the table does not have
-    left = [each for each in told_in(name) if each.kind not in NOT_IN_TABLE]
-    told = [each.numbers["duration"] for each in told_in(name) if each.kind == "dropout"]
-    assert sum(told) == pytest.approx(sum(dropouts))
+    dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]  # not in the table
+    left = [each for each in events_in(name) if each.kind not in NOT_IN_TABLE]
+    durations = [each.numbers["duration"] for each in events_in(name) if each.kind == "dropout"]
+    assert sum(durations) == pytest.approx(sum(dropouts))
     for row, count in without_flapping(TABLE[name]):
         event = next((each for each in left if is_same(row, each)), None)
-        assert event is not None, f"not told: {row}"
+        assert event is not None, f"no event for {row}"
         left.remove(event)
         assert ("suppressed changes" in event.text) == (count > 1), event.text
         assert count == 1 or f"the last of {count} suppressed changes" in event.text
@@ -115,13 +114,13 @@ def test_every_event_of_the_table_is_told(name: str) -> None:
         for number, value in row["numbers"].items():
             if number == "distance" and row["kind"] == "jump":
                 assert sizes[number] == pytest.approx(value, rel=0.01)
-            elif number not in ("flags", "quantities", "origin"):  # with a new origin the table gives no sizes
+            elif number not in ("flags", "quantities", "origin"):  # without sizes if the origin changed
                 assert sizes[number] == pytest.approx(value, abs=2e-4), (number, row)
     assert [(time_of(event), event.kind, event.text) for event in left] == []
 
 
-def test_table_is_what_its_script_makes() -> None:
-    """The file is not edited, and has every log."""
+def test_table_is_generated_by_its_script() -> None:
+    """The table file equals the output of its script, and covers every log."""
     logs = {path.stem: path for path in LOGS.parent.glob("*/*.ulg")}
     made = {name: events_table.rows_of(logs[name]) for name in NAMES}
     assert set(logs) == set(NAMES)
@@ -129,50 +128,52 @@ def test_table_is_what_its_script_makes() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_numbers_are_finite(name: str) -> None:
-    """Each event can be written as JSON, which has no NaN."""
-    for event in told_in(name):
+def test_event_numbers_are_finite(name: str) -> None:
+    """All numbers of events are finite, as JSON has no NaN."""
+    for event in events_in(name):
         assert all(math.isfinite(number) for number in event.numbers.values()), event
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_evidence_precedes(name: str) -> None:
-    """Evidence was told before, or held at the first message; it is at most ten seconds old, or goes on."""
-    told = told_in(name)
-    for index, event in enumerate(told):
+def test_evidence_precedes_the_event(name: str) -> None:
+    """Evidence was reported before, or was active in the first message; it is at most 10 s old, or still active."""
+    events = events_in(name)
+    for index, event in enumerate(events):
         for each in event.evidence:
             assert each.time <= event.time
-            earlier = [other for other in told[:index] if (other.kind, other.text) == (each.kind, each.text)]
-            since = [other for other in told[:index] if other.kind == each.kind and each.time < other.time < event.time]
+            earlier = [other for other in events[:index] if (other.kind, other.text) == (each.kind, each.text)]
+            since = [
+                other for other in events[:index] if other.kind == each.kind and each.time < other.time < event.time
+            ]
             ended = {name for other in since if other.change == "end" for name in other.names}
             is_on = not ended.issuperset(each.names)
             assert event.time - each.time <= 10.0 or is_on
-            begun = [other for other in told[:index] if other.kind == each.kind and other.change == "begin"]
-            assert earlier or (each.change == "begin" and not begun), f"{each.text} was never told"
+            begun = [other for other in events[:index] if other.kind == each.kind and other.change == "begin"]
+            assert earlier or (each.change == "begin" and not begun), f"{each.text} was never reported"
 
 
 def why(name: str, *, at: float | None = None) -> list[Story]:
-    """Return the stories of a log; `at` is seconds since boot."""
-    read, told = account_of(name), told_in(name)
-    followed = read.account.vehicles["1"]
+    """Return the stories of a log; `at`: seconds since boot."""
+    read, events = cached_events(name), events_in(name)
+    followed = read.event_log.vehicles["1"]
     if at is not None:
-        at = read.times.find(str(at), told[-1])
-    return stories_of(told, followed.conditions.values(), topics=list(followed.topics), at=at)
+        at = read.times.find(str(at), events[-1])
+    return stories_of(events, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
 def short(events: Sequence[Event]) -> list[tuple[str, float | None]]:
-    """Return kinds and times since boot of the events but for PX4's texts."""
+    """Return kinds and times since boot of events, without PX4's texts."""
     own = [event for event in events if event.kind != "text"]
     return [(event.kind, None if event.boot is None else round(event.boot, 3)) for event in own]
 
 
-def test_flight_without_a_fault_has_no_story() -> None:
-    """The estimate is good from begin to end; the start of the estimator, without a fix and an origin, is no fault."""
+def test_healthy_flight_has_no_story() -> None:
+    """A flight with a valid estimate has no story; estimator startup without fix and origin is not a fault."""
     assert why("sitl_1.15_events") == []
 
 
 def test_flight_without_gnss_has_one_story() -> None:
-    """It has the lack of a fix and of a global reference from the first message on, and an estimate that is valid."""
+    """A flight without GNSS has one story of severity watch: no fix and no global reference since the first message."""
     (only,) = why("cuav_1.16_gps_interference")
     assert (only.begin, only.until, only.is_bad) == (None, None, False)
     assert only.what == "no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
@@ -185,8 +186,8 @@ def test_flight_without_gnss_has_one_story() -> None:
         ("sitl_1.13_three_topics", ("failsafe_flags",)),
     ],
 )
-def test_estimate_that_was_never_valid(name: str, lacking: tuple[str, ...]) -> None:
-    """Where xy was not valid in any message that is told, and the topics that would say why and are not there."""
+def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...]) -> None:
+    """An estimate that is never valid has one story, which names the missing topics."""
     only = why(name)
     assert [(each.what, each.begin, each.until) for each in only] == [("xy and vxy not valid", None, None)]
     assert only[0].since < 1.0
@@ -194,9 +195,9 @@ def test_estimate_that_was_never_valid(name: str, lacking: tuple[str, ...]) -> N
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_held_for_the_whole_flight(name: str) -> None:
-    """A flight without fix and global reference has these conditions, also after landing; others got both in time."""
-    vehicle = account_of(name).account.vehicles["1"]
+def test_conditions_of_the_whole_flight(name: str) -> None:
+    """Conditions active in the first message and never ended are a missing fix, reference or valid position."""
+    vehicle = cached_events(name).event_log.vehicles["1"]
     held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
     not_global = {"xy has no global reference", "z has no global reference"}
     assert held == {
@@ -206,8 +207,8 @@ def test_what_held_for_the_whole_flight(name: str) -> None:
     }.get(name, set())
 
 
-def test_gps_loss_without_gps_messages() -> None:
-    """The log has the position and the state alone: dead reckoning precedes it, and what is missing is named."""
+def test_gps_loss_without_gps_topic_has_missing_topics() -> None:
+    """In a log with position and status only, dead reckoning is the evidence, and missing topics are named."""
     only = why("gps_loss")
     assert [each.what for each in only] == ["xy and vxy not valid"]
     story = only[0]
@@ -221,8 +222,8 @@ def test_gps_loss_without_gps_messages() -> None:
     assert story.lacking == ("vehicle_gps_position", "estimator_status_flags", "failsafe_flags")
 
 
-def test_gps_loss_with_all_messages() -> None:
-    """With everything logged the receiver is the cause, and the position jumps when it is back."""
+def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
+    """With all topics logged the lost GPS fix is the evidence, and the position jumps when it is regained."""
     only = why("twelve_messages")
     assert [each.what for each in only] == ["xy and vxy not valid"]
     story = only[0]
@@ -238,46 +239,46 @@ def test_gps_loss_with_all_messages() -> None:
     assert story.lacking == ()
 
 
-def test_what_held_at_a_moment() -> None:
-    """Asked about a moment, what held then is told, bad or not, or else what was before."""
+def test_stories_at_a_time() -> None:
+    """At a given time, the stories are those active then, bad or not, else the last one before."""
     assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
     assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
     assert [each.what for each in why("gps_loss", at=36.0)] == ["failsafe"]
 
 
-def test_changes_of_the_ekf_in_use() -> None:
-    """Each change that the selector's messages have is an event, and evidence for the reset after it."""
+def test_primary_ekf_changes_are_events() -> None:
+    """Each change of primary_instance is an event, and evidence for the reset after it."""
     path = path_of("fmuv6c_1.17_selector_whipsaw")
     selector = ULog(str(path), ["estimator_selector_status"]).data_list[0].data
     primary = selector["primary_instance"]
     changes = [index for index in range(1, len(primary)) if primary[index] != primary[index - 1]]
-    told = [each for each in told_in(path.stem) if each.kind == "ekf_changed"]
-    assert [each.boot for each in told] == [pytest.approx(selector["timestamp"][index] / 1e6) for index in changes]
-    assert [each.numbers["to"] for each in told] == [primary[index] for index in changes]
-    assert len(told) == 15  # PX4 counts 16, with the first choice
-    resets = [each for each in told_in(path.stem) if each.kind == "reset" and "xy" in each.names and each.evidence]
+    events = [each for each in events_in(path.stem) if each.kind == "ekf_changed"]
+    assert [each.boot for each in events] == [pytest.approx(selector["timestamp"][index] / 1e6) for index in changes]
+    assert [each.numbers["to"] for each in events] == [primary[index] for index in changes]
+    assert len(events) == 15  # PX4 counts 16, including the first selection
+    resets = [each for each in events_in(path.stem) if each.kind == "reset" and "xy" in each.names and each.evidence]
     assert sum("ekf_changed" in [cause.kind for cause in each.evidence] for each in resets) >= 15
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_only_one_estimate_is_contradicted(name: str) -> None:
-    """The height that ran 27 m below GNSS and barometer in two seconds, and the position that stayed 6 to 9 m off.
+    """Only one log has a contradicted estimate: height 27 m below GNSS and barometer, and position 6 to 9 m off.
 
-    By the logs' own numbers no other valid estimate is off for as long: 92 m in twelve_messages for half a second, 3 m
-    in gps_loss, and by the barometer alone 16 m in fast flight and 6 m at lift-off.
+    In the other logs no valid estimate is off for as long: 92 m for half a second in twelve_messages, 3 m in gps_loss,
+    and from the barometer alone 16 m in fast flight and 6 m at takeoff.
     """
-    told = [each for each in told_in(name) if each.kind.endswith("_contradicted")]
+    events = [each for each in events_in(name) if each.kind.endswith("_contradicted")]
     right = [
-        ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z is valid"),
-        ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy is valid"),
-        ("height_contradicted", "end", 118.9, "height 27 m below GNSS and barometer: over after 2.0 s"),
+        ("height_contradicted", "begin", 116.9, "height 27 m below GNSS and barometer while z_valid is true"),
+        ("position_contradicted", "begin", 118.1, "position 9 m off GNSS while xy_valid is true"),
+        ("height_contradicted", "end", 118.9, "height no longer contradicted after 2.0 s"),
     ]
-    found = [(each.kind, each.change, round(each.boot or 0.0, 1), each.text) for each in told]
+    found = [(each.kind, each.change, round(each.boot or 0.0, 1), each.text) for each in events]
     assert sorted(found, key=lambda each: each[2]) == (right if name == "nxp_v0_ekf_failure" else [])
 
 
-def test_vehicle_that_fell() -> None:
-    """The estimate that fell through the ground: its evidence, the reset that ended it, and the position meanwhile."""
+def test_contradicted_height_has_evidence_and_reset() -> None:
+    """The story of a diverged height has its evidence, the contradicted position, and the reset that ended it."""
     height = next(each for each in why("nxp_v0_ekf_failure") if each.begin and each.begin.kind == "height_contradicted")
     assert [each for each in short(height.before) if each[0] != "text"] == [
         ("dead_reckoning", 116.238), ("estimator_fault", 116.609),
@@ -288,29 +289,29 @@ def test_vehicle_that_fell() -> None:
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_texts_are_those_of_px4(name: str) -> None:
-    """Each statement of a table made by hand with pyulog is an event, once, with its time and words, and no other.
+def test_px4_texts_are_events(name: str) -> None:
+    """Each text in a table made with pyulog is exactly one event with its time and words.
 
-    Of a statement in two forms, one is an event. A failed check that PX4 repeats because another check has changed
-    is an event only the first time.
+    Of a text in two forms, one is an event. A failed check that PX4 repeats because another check has changed is an
+    event only the first time.
     """
-    told = [(each.boot or 0.0, each.text) for each in told_in(name) if each.kind == "text"]
+    events = [(each.boot or 0.0, each.text) for each in events_in(name) if each.kind == "text"]
     checks: set[str] = set()
     for time, _, _, group, has_twin, text in TABLES[name]["texts"]:
-        near = [each for each in told if abs(each[0] - time) < 0.002]
+        near = [each for each in events if abs(each[0] - time) < 0.002]
         same = [each for each in near if text.strip() in each[1] or each[1].rpartition("] ")[2] in text]
         if same:
-            told.remove(same[0])
+            events.remove(same[0])
         else:
             assert text in checks or has_twin, (time, text)
         checks |= {text} if group == "arming_check" else set()
-    assert told == []
+    assert events == []
 
 
 def verdict(path: Path) -> Verdict:
-    """Return the verdict on the vehicle of a log."""
-    read = ulogs.account_of(path)
-    events, (followed,) = read.account.events_since(0)[0], read.account.vehicles.values()
+    """Return the verdict on the vehicle in a log."""
+    read = ulogs.cached_events(path)
+    events, (followed,) = read.event_log.events_since(0)[0], read.event_log.vehicles.values()
     held = [each for each in followed.conditions.values() if each.severity != "info"]
     return verdict_of(followed.name, events, held, topics=followed.topics, times=read.times, end=read.end)
 
@@ -328,13 +329,13 @@ def verdict(path: Path) -> Verdict:
 def test_verdict_names_cause_and_times(
     name: str, begin: float, end: float, cause: list[tuple[str, float]], quoted: str
 ) -> None:
-    """It says what, from when to when, and the causes in order of time, as the table by hand does."""
+    """The verdict has fault, start, end and the causes in order of time, as in a table made by hand."""
     found = verdict(path_of(name))
     assert found.begin is not None
     assert found.end is not None
     assert (found.usable, found.begin.boot, found.end.boot) == (False, begin, end)
     assert [each for each in short(found.cause) if each in cause] == cause
-    times = account_of(name).times
+    times = cached_events(name).times
     moments = [times.text(each) for each in (found.begin, found.end, *found.cause) if (each.kind, each.boot) in cause]
     assert all(moment in found.text for moment in moments)
     assert f"({end - begin:.1f} s)" in found.text
@@ -342,8 +343,8 @@ def test_verdict_names_cause_and_times(
     assert ("Not in the data: vehicle_gps_position" in found.text) == (name == "gps_loss")
 
 
-def test_verdict_of_a_crash() -> None:
-    """Valid flags are not believed: the height that ran away, with PX4's own words first. Table by hand."""
+def test_verdict_names_contradicted_height() -> None:
+    """Despite valid flags the verdict is the contradicted height, with PX4's text as first evidence."""
     found = verdict(path_of("nxp_v0_ekf_failure"))
     assert found.begin is not None
     assert found.end is not None
@@ -353,23 +354,23 @@ def test_verdict_of_a_crash() -> None:
     assert "height 27 m below GNSS" in found.text
     assert found.text.index('PX4: "Attitude failure detected"') < found.text.index("dead reckoning")
     assert [short([each]) for each in found.cause if each.kind == "dead_reckoning"] == [[("dead_reckoning", 116.238)]]
-    assert "position 9 m off GNSS while xy is valid" in found.text
+    assert "position 9 m off GNSS while xy_valid is true" in found.text
 
 
-def test_verdict_of_a_flight_without_gps() -> None:
-    """The position is usable by vision, but a fix and a global reference are missing throughout. Table by hand."""
+def test_vehicle_with_vision_is_usable_without_gps() -> None:
+    """The vehicle is usable with vision, but without fix and global reference throughout."""
     found = verdict(path_of("cuav_1.16_gps_interference"))
     assert found.usable is True
     text = (
         "position valid throughout, but no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
     )
-    assert found.text == f"{text} from the first message on, until the end (62.3 s)."
+    assert found.text == f"{text} from the first message until the end (62.3 s)."
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_state_and_verdict_name_the_same_cause(name: str) -> None:
-    """While a flight goes on, the fault of the badge is the one that the live verdict names, after each event."""
-    events, (followed,) = told_in(name), account_of(name).account.vehicles.values()
+    """After each event of a flight, the live verdict names the same fault as the state."""
+    events, (followed,) = events_in(name), cached_events(name).event_log.vehicles.values()
     spans, states = spans_of(events, list(followed.initial)), 0
     for now in sorted({event.time + after for event in events for after in (0.001, 1.0)}):
         state = state_at(spans, now)
@@ -386,7 +387,7 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
 
 @pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
 def test_verdict_has_three_lines(path: Path) -> None:
-    """A verdict has at most three lines; of a healthy flight it is that there are no faults, and nothing else."""
+    """A verdict has at most three lines; on a healthy flight it is "no faults" only."""
     text = verdict(path).text
     assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3
     is_healthy = path.stem in ("sitl_1.15_events", "ulog_stream_flight1", "ulog_stream_lossy1")

@@ -1,4 +1,4 @@
-"""Reports of accounts, and the faults found in them, from hand-made messages and replies."""
+"""Event reports, and faults found in them, from synthetic messages and replies."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ SCRIPT = AccountReport("", "h", 0.0, {"7": VehicleReport("info", "ok", has_posit
 
 
 def report(flight: Flight, *, service: str = "s", host: str = "h", within: float = 1e9) -> AccountReport:
-    return report_of(flight.account, service, host, flight.now, within=within)
+    return report_of(flight.event_log, service, host, flight.now, within=within)
 
 
 def flying(*, since: float = 1.0, **fields: Any) -> Flight:
-    """Return a vehicle that has sent valid positions, then these messages."""
+    """Return a vehicle that has sent valid positions, then a message with these fields."""
     flight = Flight()
     flight.send()
     flight.fly(1)
@@ -60,8 +60,8 @@ def through_json(given: AccountReport) -> AccountReport:
     return read
 
 
-def test_report_comes_back_as_it_was() -> None:
-    """Events with evidence, states and active conditions survive the way through JSON."""
+def test_report_survives_json() -> None:
+    """Events with evidence, states and active conditions are equal after JSON encoding and decoding."""
     flight = Flight()
     flight.send(z_valid=False)
     flight.gps()
@@ -78,17 +78,17 @@ def test_report_comes_back_as_it_was() -> None:
     assert [(each.text, each.initial) for each in vehicle.held] == [("z not valid", True)]
 
 
-def test_story_is_the_same_from_a_report() -> None:
-    """A story from a report equals that of the service, also for conditions that held before all events."""
+def test_story_from_report_equals_that_of_service() -> None:
+    """A story from a report equals that of the service, even for conditions older than all events."""
     flight = flying(xy_valid=False)
     for within in (1e9, 0.0):
         read = through_json(report(flight, within=within))
-        told = stories_of(read.events, read.vehicles["1"].held, topics=read.vehicles["1"].topics)
-        assert [(each.what, each.since, each.until) for each in told] == [("xy not valid", flight.now, None)]
+        stories = stories_of(read.events, read.vehicles["1"].held, topics=read.vehicles["1"].topics)
+        assert [(each.what, each.since, each.until) for each in stories] == [("xy not valid", flight.now, None)]
 
 
-def test_report_has_all_events_of_the_period() -> None:
-    """A report has all events of the period that the account keeps, and none for a period that is no number."""
+def test_report_has_all_events_of_its_period() -> None:
+    """A report has all kept events of the period, and none for a period of NaN."""
     flight = Flight()
     for number in range(1500):
         flight.wait(0.1).status(ARMED, nav_state=number % 3)
@@ -98,8 +98,8 @@ def test_report_has_all_events_of_the_period() -> None:
     assert report(flight, within=math.nan).events == ()
 
 
-def test_report_of_any_size_is_read_in_parts() -> None:
-    """The parts of a report of a thousand vehicles with faults and events are accepted by readers, who join them."""
+def test_large_report_is_sent_in_parts() -> None:
+    """A report of 1,000 vehicles is split into parts below the size limit, which join to the same report."""
     flight = Flight()
     steps: list[dict[str, Any]] = [{}, {"xy_valid": False}, {"xy_valid": False, "z_valid": False, "v_xy_valid": False}]
     for faults in steps:
@@ -113,8 +113,8 @@ def test_report_of_any_size_is_read_in_parts() -> None:
     assert asdict(joined([each for each in read if each])) == asdict(sent)
 
 
-def test_parts_of_a_status_have_all_sources() -> None:
-    """The status of many sources is split between them; one source that is too large loses the health of streams."""
+def test_large_status_is_split_by_source() -> None:
+    """A status is split between sources; a single source that is too large loses the health of its streams."""
     address = f"{'v' * 60}/{VLP}"
     stream = StreamStatus(address, StreamHealth(VLP).snapshot(0))
     sources = tuple(SourceStatus(f"ulog:{number}", addresses=(address,) * 100) for number in range(100))
@@ -125,8 +125,8 @@ def test_parts_of_a_status_have_all_sources() -> None:
     assert [len(each["streams"]) for each in json.loads(part)["sources"]] == [0]
 
 
-def test_part_that_is_too_large_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    """A vehicle whose report alone is larger than readers accept is left out, with a line in the log."""
+def test_vehicle_with_too_large_report_is_omitted(caplog: pytest.LogCaptureFixture) -> None:
+    """A vehicle whose report alone exceeds the size limit is omitted, which is logged."""
     vehicles = {name: VehicleReport("bad", "x" * size) for name, size in (("1", MAX_REPLY_BYTES), ("2", 9))}
     [part] = reply_parts(AccountReport("s", "h", 1.0, vehicles))
     assert json.loads(part)["vehicles"].keys() == {"2"}
@@ -143,13 +143,13 @@ def test_part_that_is_too_large_is_left_out(caplog: pytest.LogCaptureFixture) ->
         {"service": "s", "host": "h", "now": 1.0, "vehicles": {}, "events": "x" * 1000},
     ],
 )  # fmt: skip
-def test_hostile_answer_is_none(content: object) -> None:
-    """Replies that are not reports are ignored."""
+def test_malformed_reply_is_none(content: object) -> None:
+    """A reply that is not a report is None."""
     assert from_json(content) is None
 
 
-def test_deep_answer_is_none() -> None:
-    """Deeply nested evidence does not break the reader."""
+def test_deeply_nested_reply_is_none() -> None:
+    """A reply with deeply nested evidence is None, not an error."""
     event: dict[str, Any] = {
         "vehicle": "1", "kind": "jump", "change": "once", "severity": "info", "text": "", "time": 0.0
     }  # fmt: skip
@@ -158,8 +158,8 @@ def test_deep_answer_is_none() -> None:
     assert from_json({"service": "s", "host": "h", "now": 1.0, "vehicles": {}, "events": [event]}) is None
 
 
-def test_huge_answer_is_bounded() -> None:
-    """A peer cannot make a reader keep more events and vehicles than a service sends."""
+def test_reply_beyond_limits_is_none() -> None:
+    """A reply with more events or vehicles than a service sends is None."""
     event = asdict(Event("1", "jump", "once", "info", "", 0.0))
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
     assert from_json(content | {"events": [event] * (KEPT + 1)}) is None
@@ -177,8 +177,8 @@ json_values = st.recursive(
 
 
 @given(st.sampled_from(["events", "vehicles", "now", "service", "host"]), json_values)
-def test_any_answer_is_a_report_or_none(name: str, value: object) -> None:
-    """Any reply is a report or None, never an error; stories and faults of the report can be computed."""
+def test_any_reply_is_a_report_or_none(name: str, value: object) -> None:
+    """Any reply is a report or None, and stories and faults of the report can be computed."""
     content = json.loads(json.dumps(asdict(report(flying(xy_valid=False)))))
     read = from_json(content | {name: value})
     if read is not None:
@@ -186,8 +186,8 @@ def test_any_answer_is_a_report_or_none(name: str, value: object) -> None:
         assert isinstance(stories_of(read.events), list)
 
 
-def test_lists_of_vehicles_begin_with_the_worst() -> None:
-    """Vehicles of a report are listed by their state, then in natural order, as on the page."""
+def test_vehicles_are_listed_worst_first() -> None:
+    """Vehicles of a report are listed by state, then in natural order."""
     known: dict[str, Severity] = {"uav-10": "info", "uav-2": "info", "3": "watch", "b": "bad", "a": "bad"}
     vehicles = {name: VehicleReport(severity, f"is {severity}") for name, severity in known.items()}
     given = AccountReport("s", "h", 1.0, vehicles)
@@ -198,58 +198,58 @@ def test_lists_of_vehicles_begin_with_the_worst() -> None:
     assert page.content.decode().splitlines() == ["3 is watch", "uav-2 is info", "uav-10 is info"]
 
 
-def test_well_vehicle_has_no_fault() -> None:
-    """A vehicle that is heard has no fault without further criteria."""
+def test_healthy_vehicle_has_no_fault() -> None:
+    """A vehicle that sends has no fault unless a criterion is violated."""
     assert faults_of([report(flying())], NOTHING) == []
     expected = Expectation(("1",), 1, ("xy", "z", "vxy", "vz"), 60.0)
     assert faults_of([report(flying())], expected) == []
     assert faults_of([report(flying(xy_valid=False))], NOTHING) == []
 
 
-def test_silent_vehicle_is_a_fault() -> None:
-    """A silent vehicle is a fault for an hour; then it counts as switched off unless it is expected."""
+def test_silent_vehicle_is_a_fault_for_an_hour() -> None:
+    """A silent vehicle is a fault for an hour; then it counts as switched off unless expected."""
     flight = flying()
-    flight.wait(10.0).look("stale")
+    flight.wait(10.0).update("stale")
     line = "vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (10.0 s)"
     assert faults_of([report(flight)], NOTHING) == [line]
-    flight.wait(TIMINGS.forgotten - 11).look("stale")
+    flight.wait(TIMINGS.forgotten - 11).update("stale")
     assert len(faults_of([report(flight)], NOTHING)) == 1
-    flight.wait(2).look("stale")
+    flight.wait(2).update("stale")
     assert faults_of([report(flight)], NOTHING) == []
-    asked = faults_of([report(flight)], Expectation(("1",)))
-    assert asked == ["vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (60 min)"]
+    faults = faults_of([report(flight)], Expectation(("1",)))
+    assert faults == ["vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (60 min)"]
 
 
-def test_vehicle_that_moved_is_heard() -> None:
-    """A vehicle that one service lost and another one hears is heard, in either order of the replies."""
+def test_vehicle_received_by_one_service_is_not_missing() -> None:
+    """A vehicle gone for one service but received by another has no fault, in any order of replies."""
     lost, found = flying(), flying()
-    lost.wait(10.0).look("gone")
+    lost.wait(10.0).update("gone")
     reports = [report(lost, service="a"), report(found, service="b")]
     assert faults_of(reports, Expectation(("1",), 1)) == []
     assert faults_of(reports[::-1], Expectation(("1",), 1)) == []
     assert len(faults_of(reports[:1], Expectation(("1",), 1))) == 2
 
 
-def test_expected_vehicles() -> None:
-    """Missing vehicles are named, the others counted; a vehicle published by a script counts as heard."""
+def test_missing_vehicles_are_faults() -> None:
+    """Missing vehicles are faults, by name or by number; vehicles published by scripts count."""
     one = report(flying())
     assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
-    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["2 of 3 vehicles are heard: 1, 7"]
-    assert faults_of([], Expectation(vehicles=1)) == ["0 of 1 vehicles are heard"]
-    assert faults_of([one, SCRIPT], Expectation(("7",), valid=("xy",))) == []  # vehicle 1 is not judged
+    assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["messages arrive from 2 of 3 vehicles: 1, 7"]
+    assert faults_of([], Expectation(vehicles=1)) == ["messages arrive from 0 of 1 vehicles"]
+    assert faults_of([one, SCRIPT], Expectation(("7",), valid=("xy",))) == []  # vehicle 1 is not checked
 
 
-def test_other_hosts_are_not_judged() -> None:
-    """Without criteria for all hosts only the services of this host are checked."""
+def test_other_hosts_are_not_checked() -> None:
+    """With `only`, services on other hosts are not checked."""
     silent = flying()
-    silent.wait(10.0).look("stale")
+    silent.wait(10.0).update("stale")
     assert faults_of([report(silent, host="other")], NOTHING, only="this") == []
     assert len(faults_of([report(silent, host="this")], NOTHING, only="this")) == 1
 
 
-def test_flags_are_judged_since_they_fell() -> None:
-    """All invalid flags of a vehicle are one line, with the time of the first one, not of another condition."""
+def test_invalid_flags_are_one_fault_since_the_first() -> None:
+    """All invalid flags of a vehicle are one line with the time of the first, not of another condition."""
     flight = Flight()
     flight.send()
     flight.status(ARMED, failsafe=True)
@@ -262,15 +262,15 @@ def test_flags_are_judged_since_they_fell() -> None:
     assert faults_of([report(flight)], Expectation(valid=("z", "vz"))) == []
 
 
-def test_vehicle_without_a_position() -> None:
-    """A vehicle without a position fails a check for validity."""
+def test_vehicle_without_position_fails_validity_check() -> None:
+    """A vehicle that publishes no position fails a validity check."""
     flight = Flight()
     flight.status(ARMED)
     assert faults_of([report(flight)], Expectation(valid=("xy",))) == ["vehicle 1: publishes no position"]
 
 
-def test_what_happened_lately() -> None:
-    """No event of severity bad or watch may have happened in the period; info may."""
+def test_recent_events_are_faults() -> None:
+    """Events of severity bad or watch within the period are faults; info is not."""
     flight = flying(xy_valid=False)
     flight.wait(1.0).send()
     lines = faults_of([report(flight)], Expectation(within=60.0))
@@ -279,14 +279,14 @@ def test_what_happened_lately() -> None:
     flight.fly(60)
     assert faults_of([report(flight)], Expectation(within=60.0)) == []
     flight.link = "no link to x"
-    flight.look()
+    flight.update()
     assert faults_of([report(flight)], Expectation(("1",), within=60.0)) == [
         "h: no link to x, at 00:02:43.0 UTC, 0 ms ago"
     ]  # fmt: skip
 
 
-def test_many_events_are_counted() -> None:
-    """The first twenty events are listed, the others counted."""
+def test_recent_events_beyond_twenty_are_counted() -> None:
+    """The first twenty recent events are listed, the others counted."""
     events = tuple(Event(ALL, "lost", "once", "watch", f"{number} lost", float(number)) for number in range(30))
     lines = faults_of([replace(report(flying()), now=30.0, events=events)], Expectation(within=60.0))
     assert len(lines) == 21

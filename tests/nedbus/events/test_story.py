@@ -1,4 +1,4 @@
-"""Stories of a vehicle, and parsing and formatting of times, with hand-made messages."""
+"""Stories of a vehicle with synthetic messages, and parsing and formatting of times."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .flight import ARMED, Flight, lose_gps
 
 
 def why(flight: Flight, *, at: float | None = None) -> list[Story]:
-    """Return the stories of a vehicle; `at` is by the account's clock."""
-    followed = flight.account.vehicles["1"]
-    events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
+    """Return the stories of the vehicle; `at`: time on the event log's clock."""
+    followed = flight.event_log.vehicles["1"]
+    events = sorted(flight.event_log.events_since(0)[0], key=lambda each: each.time)
     return stories_of(events, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
@@ -25,8 +25,8 @@ def recover(flight: Flight) -> None:
     flight.wait(0.5).status(ARMED)
 
 
-def test_story_that_goes_on() -> None:
-    """Flags that become invalid together are one story; consequences are part of it, not stories of their own."""
+def test_flags_invalid_together_are_one_story() -> None:
+    """Flags that become invalid together are one story, which includes its consequences."""
     flight = Flight()
     lose_gps(flight)
     (story,) = why(flight)
@@ -37,8 +37,8 @@ def test_story_that_goes_on() -> None:
     assert story.lacking == ("estimator_status_flags", "failsafe_flags")
 
 
-def test_story_that_ended() -> None:
-    """A story ends with its last flag, and has the events at its end."""
+def test_story_ends_with_last_flag() -> None:
+    """A story ends with its last flag, and includes the events at its end."""
     flight = Flight()
     lose_gps(flight)
     begin = flight.now - 1.0
@@ -51,8 +51,8 @@ def test_story_that_ended() -> None:
     ]  # fmt: skip
 
 
-def test_part_of_the_estimate_that_stays_invalid_is_a_story() -> None:
-    """A fault of the estimate that begins during another one is a story if it outlasts it; its consequences are not."""
+def test_estimate_fault_that_outlasts_another_is_a_story() -> None:
+    """A fault of the estimate that begins during another one and outlasts it is a separate story."""
     flight = Flight()
     flight.status(ARMED)
     flight.send()
@@ -64,7 +64,7 @@ def test_part_of_the_estimate_that_stays_invalid_is_a_story() -> None:
 
 
 def test_reboot_ends_a_story() -> None:
-    """A reboot ends earlier conditions without an event of their own; it is a story itself."""
+    """A reboot ends earlier conditions without further events, and is a story itself."""
     flight = Flight()
     flight.send()
     flight.wait(1.0).send(xy_valid=False)
@@ -72,12 +72,12 @@ def test_reboot_ends_a_story() -> None:
     flight.send()
     stories = why(flight)
     assert [(each.what.partition(":")[0], each.until) for each in stories] == [
-        ("xy not valid", flight.now), ("rebooted", flight.now),
+        ("xy not valid", flight.now), ("reboot", flight.now),
     ]  # fmt: skip
 
 
-def test_end_of_one_flag_is_not_that_of_another() -> None:
-    """The end of a fault that held at the first message does not end one that began later."""
+def test_end_of_one_flag_does_not_end_another() -> None:
+    """The end of a fault from the first message does not end one that began later."""
     flight = Flight()
     flight.send()
     flags: dict[str, Any] = {"cs_baro_fault": True, "fs_bad_hdg": False}
@@ -87,8 +87,8 @@ def test_end_of_one_flag_is_not_that_of_another() -> None:
     assert [(each.what, each.until) for each in why(flight)] == [("EKF fault: heading", None)]
 
 
-def test_condition_to_watch_is_a_story_if_nothing_is_bad() -> None:
-    """A condition of severity watch is only a story without a bad one, or at a given time."""
+def test_watch_condition_is_a_story_without_bad_one() -> None:
+    """A watch condition is a story only if there is no bad one, or at a given time."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -105,8 +105,8 @@ def test_condition_to_watch_is_a_story_if_nothing_is_bad() -> None:
     assert [each.what for each in why(flight, at=flight.now + 50)] == ["xy not valid"]
 
 
-def test_active_warning_is_a_story_beside_a_fault_that_ended() -> None:
-    """A condition of severity watch that is active now is reported, also after a bad one that has ended."""
+def test_active_watch_condition_is_a_story_after_ended_fault() -> None:
+    """A watch condition that is active now is a story, even after a bad one that has ended."""
     flight = Flight()
     lose_gps(flight)
     recover(flight)
@@ -117,19 +117,19 @@ def test_active_warning_is_a_story_beside_a_fault_that_ended() -> None:
     assert [each.what for each in why(flight)] == ["xy and vxy not valid", "xy not valid"]
 
 
-def test_condition_whose_begin_is_not_reported() -> None:
-    """A condition without its begin among the events is active since its begin, or since the first message."""
+def test_condition_without_begin_event_is_a_story() -> None:
+    """A condition whose begin is not among the events is active since its begin, or since the first message."""
     flight = Flight()
     flight.send(z_valid=False)
     flight.wait(2.0).send(z_valid=False, xy_valid=False)
-    held = list(flight.account.vehicles["1"].conditions.values())
+    held = list(flight.event_log.vehicles["1"].conditions.values())
     assert [(each.what, each.begin, each.until) for each in stories_of([], held)] == [
         ("z not valid", None, None), ("xy not valid", held[1].begin, None),
     ]  # fmt: skip
 
 
-def test_nothing_was_wrong() -> None:
-    """A vehicle that is armed, takes off and lands has no story, and neither has an unknown vehicle."""
+def test_healthy_vehicle_has_no_story() -> None:
+    """A vehicle that arms, takes off and lands has no story; neither has an unknown vehicle."""
     flight = Flight()
     flight.send()
     flight.status(ARMED)
@@ -154,54 +154,54 @@ EVENING = datetime(2026, 11, 22, 23, 59, 50, tzinfo=UTC).timestamp()
         (" 11:59:00 ", 43_150.0), ("7", -93.0), ("100.25", 0.25), ("1e2", 0.0),
     ],
 )  # fmt: skip
-def test_moment_is_found(text: str, step: float) -> None:
-    """A time of day is the closest one, also across midnight; a number is seconds since boot."""
-    live, told = Times(is_live=True), event_at(EVENING, boot=100.0)
-    assert live.find(text, told) - told.time == pytest.approx(step, abs=1e-3)
-    of_file, told = Times(offsets={"1": EVENING - 100.0}), event_at(40.0, boot=100.0)
-    assert of_file.find(text, told) - told.time == pytest.approx(step, abs=1e-3)
+def test_time_is_parsed(text: str, step: float) -> None:
+    """A time of day is the closest one, even across midnight; a number is seconds since boot."""
+    live, event = Times(is_live=True), event_at(EVENING, boot=100.0)
+    assert live.find(text, event) - event.time == pytest.approx(step, abs=1e-3)
+    of_file, event = Times(offsets={"1": EVENING - 100.0}), event_at(40.0, boot=100.0)
+    assert of_file.find(text, event) - event.time == pytest.approx(step, abs=1e-3)
 
 
 @pytest.mark.parametrize(
     "text", ["", "noon", "24:00", "12:60", "12:30:60", "12:30:61.5", "1:2", "12.30.00", "nan", "inf", "1:00:00:00"]
 )
-def test_garbage_is_no_moment(text: str) -> None:
-    """A text that is not a time is a ValueError, without the text of Python's own error."""
+def test_invalid_time_raises(text: str) -> None:
+    """Text that is not a time raises ValueError with nedbus's own message."""
     with pytest.raises(ValueError, match="not a time"):
         Times(is_live=True).find(text, event_at(EVENING, boot=100.0))
 
 
-def test_clock_that_is_not_known() -> None:
-    """A log without UTC has seconds since boot; live, a vehicle known only by a rejection has UTC."""
-    times, told = Times(), event_at(40.0, boot=100.0)
-    assert (times.clock(told), times.text(told), times.utc(told)) == ("boot", "100.000", None)
-    assert times.find("99", told) == 39.0
-    assert (times.find("+12.5", told), times.find("-1", told)) == (12.5, -1.0)
-    with pytest.raises(ValueError, match="no message of this vehicle gives UTC"):
-        times.find("12:00", told)
-    with pytest.raises(ValueError, match="no message of this vehicle gives the time since boot"):
+def test_unavailable_clock_raises() -> None:
+    """A time on a clock that no message contains raises; a log without UTC uses seconds since boot."""
+    times, event = Times(), event_at(40.0, boot=100.0)
+    assert (times.clock(event), times.text(event), times.utc(event)) == ("boot", "100.000", None)
+    assert times.find("99", event) == 39.0
+    assert (times.find("+12.5", event), times.find("-1", event)) == (12.5, -1.0)
+    with pytest.raises(ValueError, match="no message of this vehicle has UTC"):
+        times.find("12:00", event)
+    with pytest.raises(ValueError, match="no message of this vehicle has the time since boot"):
         Times(is_live=True).find("99", event_at(EVENING))
-    with pytest.raises(ValueError, match="live data has no start to count from"):
+    with pytest.raises(ValueError, match="live data has no start"):
         Times(is_live=True).find("+12.5", event_at(EVENING, boot=100.0))
 
 
-def test_time_since_the_start() -> None:
-    """An event before any time since boot is labelled since the start of the recording, as `find` reads it."""
-    told = event_at(40.0)
-    assert (Times().clock(told), Times().text(told), unit_of(Times().clock(told))) == (
+def test_event_without_boot_time_is_relative_to_start() -> None:
+    """An event without a time since boot is shown relative to the start of the recording, as `find` parses it."""
+    event = event_at(40.0)
+    assert (Times().clock(event), Times().text(event), unit_of(Times().clock(event))) == (
         "start",
         "+40.000",
         "s since the start of the recording",
     )
-    assert Times().find(Times().text(told), told) == 40.0
+    assert Times().find(Times().text(event), event) == 40.0
 
 
-def test_simulator_has_unix_time() -> None:
-    """A time since boot that is a Unix time gives UTC by itself."""
-    told = event_at(1.0, boot=EVENING)
-    assert (Times().clock(told), Times().text(told)) == ("vehicle", "23:59:50.0")
+def test_unix_time_since_boot_is_utc() -> None:
+    """A time since boot that is a Unix time, as in the simulator, is shown as UTC."""
+    event = event_at(1.0, boot=EVENING)
+    assert (Times().clock(event), Times().text(event)) == ("vehicle", "23:59:50.0")
 
 
 def test_time_of_day_is_rounded_once() -> None:
-    """59.96 s is shown as the next minute, never as 60.0."""
+    """59.96 s is shown as the next minute, not as 60.0 s."""
     assert Times(is_live=True).text(event_at(EVENING + 9.96)) == "00:00:00.0"

@@ -1,4 +1,4 @@
-"""Verdicts on a vehicle with hand-made messages."""
+"""Verdicts on a vehicle with synthetic messages."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ LIVE = Times(is_live=True)
 
 
 def verdict(flight: Flight, *, times: Times | None = None, at: float | None = None) -> Verdict:
-    """Return the verdict on the vehicle now; by default in seconds since boot."""
-    followed = flight.account.vehicles["1"]
-    events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
+    """Return the current verdict, by default with times since boot."""
+    followed = flight.event_log.vehicles["1"]
+    events = sorted(flight.event_log.events_since(0)[0], key=lambda each: each.time)
     held = [each for each in followed.conditions.values() if each.severity != "info"]
     return verdict_of("1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at)
 
 
-def test_verdict_of_a_fault_that_lasts() -> None:
-    """It names the fault, its begin, its duration and clock, the evidence in order of time, and what is missing."""
+def test_verdict_on_active_fault() -> None:
+    """The verdict has the fault, its start, duration and clock, the evidence in order of time, and missing topics."""
     flight = Flight()
     lose_gps(flight)
     found = verdict(flight)
     assert found.text == (
         "not usable: xy and vxy not valid from 16.000 s since boot, until the end (1.0 s). "
-        "Evidence: 11.000 GPS fix 3D to none, "
-        "12 satellites to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
+        "Evidence: 11.000 GPS fix lost: 3D to none, "
+        "satellites 12 to 0, only 0 satellites; 12.000 dead reckoning. Not in the data: estimator_status_flags, "
         "failsafe_flags."
     )
     assert (found.usable, found.end, len(found.stories)) == (False, None, 1)
@@ -44,8 +44,8 @@ def test_verdict_of_a_fault_that_lasts() -> None:
     assert "UTC, until now (1.0 s)" in verdict(flight, times=LIVE).text
 
 
-def test_verdict_of_a_fault_that_ended() -> None:
-    """The vehicle was not usable, from when to when."""
+def test_verdict_on_ended_fault() -> None:
+    """The verdict has the start and end of a fault that has ended."""
     flight = Flight()
     lose_gps(flight)
     flight.wait(1.0).send()
@@ -59,28 +59,28 @@ def test_verdict_of_a_fault_that_ended() -> None:
 
 
 def test_verdict_without_faults() -> None:
-    """Nothing but that there was none, and whether the data tells that the position is valid."""
+    """Without faults the verdict says so, and whether the data has position validity."""
     flight = Flight()
     flight.fly(5)
     found = verdict(flight)
     assert (found.text, found.usable, found.stories) == ("no faults in 105 s", True, ())
-    assert verdict(flight, times=LIVE).text == "no faults in the history of the services"
+    assert verdict(flight, times=LIVE).text == "no faults in the services' history"
     unknown = verdict_of("1", [], topics=["vehicle_attitude"], times=Times(), end=5.0)
-    assert (unknown.usable, "the data has no validity of a position" in unknown.text) == (None, True)
+    assert (unknown.usable, "the data has no position validity" in unknown.text) == (None, True)
 
 
-def test_verdict_of_a_vehicle_that_does_not_send_its_validity() -> None:
-    """A position without flags, as of ArduPilot, is neither usable nor not."""
+def test_verdict_without_validity_flags_is_unknown() -> None:
+    """With a position without validity flags, as from ArduPilot, `usable` is None."""
     flight = Flight()
     for _ in range(5):
         flight.wait(0.1).send(missing=("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
-    (known,) = report_of(flight.account, "s", "h", flight.now, within=60).vehicles.values()
+    (known,) = report_of(flight.event_log, "s", "h", flight.now, within=60).vehicles.values()
     found = verdict_of("1", [], topics=known.topics, unknown=known.unknown, times=Times(), end=0.5)
-    assert (found.usable, found.text) == (None, "no faults in 0 s; the data has no validity of a position")
+    assert (found.usable, found.text) == (None, "no faults in 0 s; the data has no position validity")
 
 
-def test_verdict_of_a_vehicle_that_stays_usable() -> None:
-    """A condition to watch leaves the vehicle usable."""
+def test_watch_condition_leaves_vehicle_usable() -> None:
+    """A vehicle with a condition of severity watch stays usable."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -92,43 +92,43 @@ def test_verdict_of_a_vehicle_that_stays_usable() -> None:
     assert found.text.startswith("position valid throughout, but GNSS jamming: indicator 100 from 11.000 to 16.000 s ")
 
 
-def text(flight: Flight, words: str, level: int = 4) -> None:
-    """Have PX4 say something now."""
+def px4_text(flight: Flight, words: str, level: int = 4) -> None:
+    """Emit a PX4 text."""
     severity: Any = "bad" if level < 3 else "watch" if level < 5 else "info"
     said = Finding("text", "once", words, ("warning",), {"level": level}, severity)
-    flight.account.vehicles["1"].emit(said, "log_message", flight.now)
+    flight.event_log.vehicles["1"].emit(said, "log_message", flight.now)
 
 
-def test_evidence_of_an_end_is_not_earlier_than_its_begin() -> None:
-    """A receiver that was back before the position became invalid does not explain its end, nor does a text of PX4."""
+def test_evidence_of_end_is_later_than_begin() -> None:
+    """A GPS fix regained before the position became invalid does not explain its end, nor does a PX4 text."""
     flight = Flight()
     flight.gps(fix_type=0)
     flight.fly(1)
     flight.gps()
     flight.wait(1.0).send(xy_valid=False)
     flight.wait(2.0).send()
-    ended = flight.account.events_since(0)[0][-1]
+    ended = flight.event_log.events_since(0)[0][-1]
     assert (ended.kind, ended.change, ended.evidence) == ("xy_invalid", "end", ())
     assert "GPS" not in verdict(flight).text
     flight.wait(1.0).send(xy_valid=False)
-    text(flight, "Failsafe activated")
+    px4_text(flight, "Failsafe activated")
     flight.wait(2.0).send()
-    assert flight.account.events_since(0)[0][-1].evidence == ()
+    assert flight.event_log.events_since(0)[0][-1].evidence == ()
 
 
 def test_verdict_quotes_px4() -> None:
-    """PX4's own texts are evidence, in order of time with the rest, but not what it had said all along."""
+    """PX4's texts are evidence in order of time, except texts that already appeared before the fault."""
     flight = Flight()
     flight.send()
     for _ in range(3):
-        text(flight, "No manual control input", 3)
+        px4_text(flight, "No manual control input", 3)
         flight.fly(6)
-    text(flight, "No manual control input", 3)
+    px4_text(flight, "No manual control input", 3)
     flight.wait(1.0).send(dead_reckoning=True)
-    text(flight, "GNSS fix too low")
+    px4_text(flight, "GNSS fix too low")
     flight.wait(1.0).send(dead_reckoning=True, xy_valid=False)
     flight.wait(0.2)
-    text(flight, "Failsafe activated", 2)
+    px4_text(flight, "Failsafe activated", 2)
     flight.wait(5.0).send(xy_valid=False)
     assert verdict(flight).text.startswith(
         "not usable: xy not valid from 30.000 s since boot, until the end (5.2 s). Evidence: 29.000 "
@@ -136,8 +136,8 @@ def test_verdict_quotes_px4() -> None:
     )
 
 
-def test_verdict_has_evidence_of_any_kind_before_it_has_none() -> None:
-    """Events shortly before are shown, even if they are no known cause; phases of the flight are not."""
+def test_unrelated_events_are_evidence_if_there_is_no_other() -> None:
+    """Without a known cause, all events shortly before a fault are shown, except phases of the flight."""
     flight = Flight()
     flight.status(ARMED)
     flight.send("failsafe_flags", fd_critical_failure=False)
@@ -146,31 +146,31 @@ def test_verdict_has_evidence_of_any_kind_before_it_has_none() -> None:
     flight.wait(0.5).status(ARMED, nav_state=3)
     flight.send("failsafe_flags", fd_critical_failure=True)
     found = verdict(flight)
-    assert "failsafe flags: attitude or altitude beyond its limit" in found.text
+    assert "failsafe flags: attitude or altitude limit exceeded" in found.text
     assert [each.kind for each in found.cause] == ["heading_not_good"]
 
 
 def held(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
-    """Return a condition that held in the first message."""
+    """Return a condition that was active in the first message."""
     begin = Event("1", kind, "begin", "watch", words, since, 10.0, names=(flag,))
     return Condition(kind, "watch", words, since, begin, initial=True)
 
 
-def test_verdict_of_what_holds_from_begin_to_end() -> None:
-    """Conditions of a whole flight are one fault, and evidence of a position that was never valid."""
+def test_verdict_on_conditions_of_whole_flight() -> None:
+    """Conditions active for a whole flight are one fault, and evidence if the position was never valid."""
     conditions = [
         held("gps_fix_lost", "", "no GPS fix"), held("xy_not_global", "xy_global", "xy has no global reference", 0.1),
     ]  # fmt: skip
     topics = ["vehicle_local_position", "vehicle_gps_position"]
     found = verdict_of("1", [], conditions, topics=topics, times=Times(), end=62.0)
     assert found.text == (
-        "position valid throughout, but no GPS fix; xy has no global reference from the first message on, "
+        "position valid throughout, but no GPS fix; xy has no global reference from the first message "
         "until the end (62.0 s)."
     )
     assert (found.usable, len(found.stories)) == (True, 1)
     invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
-    assert found.text.startswith("not usable: xy not valid from the first message on, until the end (62.0 s). ")
+    assert found.text.startswith("not usable: xy not valid from the first message until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
     assert (found.usable, len(found.stories)) == (False, 1)
 
@@ -183,56 +183,56 @@ def test_verdict_of_what_holds_from_begin_to_end() -> None:
             [lambda f: f.send(xy_valid=False), lambda f: f.status(ARMED, failsafe=True), lambda f: f.send()],
             "failsafe",
         ),
-        ([lambda f: f.send(xy_valid=False)] * 2 + [lambda f: f.look("gone")], "gone: no publisher of "),
-        ([lambda f: f.look("gone"), lambda f: f.look("ok"), lambda f: f.send(z_valid=False)], "z not valid"),
+        ([lambda f: f.send(xy_valid=False)] * 2 + [lambda f: f.update("gone")], "gone: no publisher of "),
+        ([lambda f: f.update("gone"), lambda f: f.update("ok"), lambda f: f.send(z_valid=False)], "z not valid"),
         ([lambda f: f.send(dead_reckoning=True), lambda f: f.battery(2)], "battery "),
     ],
 )  # fmt: skip
 def test_state_and_verdict_name_the_same_cause(steps: list[Callable[[Flight], object]], cause: str) -> None:
-    """An invalid position is the cause of the failsafe while it lasts, a vehicle that is gone worse than both."""
+    """An active invalid position is named before the failsafe, and a gone vehicle before both."""
     flight = Flight()
     flight.send()
     for step in steps:
         step(flight.wait(1.0))
-    assert flight.account.state("1", flight.now).text.startswith(cause)
+    assert flight.event_log.state("1", flight.now).text.startswith(cause)
     assert verdict(flight, times=LIVE).text.removeprefix("not usable: ").startswith(cause)
 
 
-def test_verdict_is_of_this_vehicle_and_of_a_moment() -> None:
-    """Events of other vehicles are left out; asked about a moment, it says what held then."""
+def test_verdict_is_limited_to_vehicle_and_time() -> None:
+    """Events of other vehicles are ignored; with `at`, the verdict is on the fault at that time."""
     flight = Flight()
     lose_gps(flight)
     flight.wait(1.0).send()
     flight.status(ARMED)
     flight.gps()
     flight.fly(60)
-    events = flight.account.events_since(0)[0]
+    events = flight.event_log.events_since(0)[0]
     other: list[Any] = [replace(each, vehicle="2") for each in events]
     topics = ["vehicle_local_position"]
     assert verdict_of("1", other, topics=topics, times=LIVE, end=flight.now).stories == ()
     assert verdict_of("1", [replace(other[0], vehicle=ALL)], topics=topics, times=LIVE, end=flight.now).stories
-    assert verdict(flight, at=flight.now - 30).text.startswith("no fault then; the nearest: ")
+    assert verdict(flight, at=flight.now - 30).text.startswith("no fault at that time; nearest: ")
     assert verdict(flight, at=flight.now - 30).usable is True
     assert verdict(flight, at=107.0).text.startswith(
         "not usable: xy and vxy not valid from 16.000 to 18.000 s since boot"
     )
 
 
-def test_verdict_of_a_vehicle_that_was_never_ready_quotes_px4() -> None:
-    """The most severe text while the fault lasts answers why a vehicle is not ready, however late it comes."""
+def test_verdict_on_vehicle_that_was_never_valid_quotes_px4() -> None:
+    """The most severe text during a fault since the first message is evidence, however late it appears."""
     flight = Flight()
     flight.send(xy_valid=False)
-    text(flight, "Preflight Fail: GPS Vertical Pos Drift too high", 4)
+    px4_text(flight, "Preflight Fail: GPS Vertical Pos Drift too high", 4)
     flight.wait(30.0).send(xy_valid=False)
-    text(flight, "Preflight Fail: ekf2 missing data", 2)
+    px4_text(flight, "Preflight Fail: ekf2 missing data", 2)
     assert verdict(flight).text.startswith(
-        "not usable: xy not valid from the first message on, until the end (30.0 s). "
+        "not usable: xy not valid from the first message until the end (30.0 s). "
         'Evidence: 40.000 PX4: "Preflight Fail: ekf2 missing data". Not in the data: '
     )
 
 
-def test_verdict_counts_faults_of_a_kind() -> None:
-    """The longest of several equal faults is the worst one, and the verdict says that there are more."""
+def test_verdict_counts_equal_faults() -> None:
+    """The longest of several equal faults is the worst, and the verdict has their number."""
     flight = Flight()
     flight.send()
     for seconds in (1.0, 3.0, 2.0):
@@ -243,24 +243,24 @@ def test_verdict_counts_faults_of_a_kind() -> None:
     )
 
 
-def test_verdict_is_short() -> None:
-    """Long texts of PX4 are cut: a verdict has at most three lines of 100 columns."""
+def test_verdict_fits_three_lines() -> None:
+    """Long PX4 texts are truncated: a verdict has at most three lines of 100 columns."""
     flight = Flight()
     flight.send()
     for number in range(40):
-        text(flight, f"{number} " + "very long " * 12)
+        px4_text(flight, f"{number} " + "very long " * 12)
     flight.wait(0.1).send(xy_valid=False, v_xy_valid=False, z_valid=False, v_z_valid=False)
     assert len(textwrap.wrap(f"1: {verdict(flight).text}", 100, subsequent_indent="   ")) <= 3
 
 
-def test_texts_of_one_moment_are_different_events() -> None:
-    """PX4 says several things at once; each is an event of origin px4, in quotes, and survives a report as JSON."""
+def test_simultaneous_px4_texts_are_separate_events() -> None:
+    """Texts with equal times are separate events of origin px4, in quotes, and survive a JSON report."""
     flight = Flight()
     flight.send()
     for words in ("invalid setpoints", "Failsafe: blind land"):
-        text(flight, words)
+        px4_text(flight, words)
     flight.wait(0.1).send(xy_valid=False)
-    sent = report_of(flight.account, "s", "h", flight.now, within=60)
+    sent = report_of(flight.event_log, "s", "h", flight.now, within=60)
     read = from_json(json.loads(json.dumps(asdict(sent))))
     assert read is not None
     assert [each.words for each in read.events if each.origin == "px4"] == [

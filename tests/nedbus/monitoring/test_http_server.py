@@ -1,4 +1,4 @@
-"""The HTTP server of metrics and health: whatever is asked, by whomever, it answers, and nothing can be changed."""
+"""The HTTP server answers any request from any client, and is read-only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from nedbus.monitoring import HttpServer, Page, http_server
 from nedbus.timings import Timings
-from tests.peers.http_pages import Pages
+from tests.peers.http_client import HttpClient
 from tests.waits import DEADLINE, repeating
 
 GO, BUSY = threading.Event(), threading.Semaphore(0)
@@ -23,11 +23,11 @@ PATHS = ("/metrics", "/healthz", "/readyz", "/vehicles", "/status")
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Pages]:
-    """Serve a page, one that fails, and one that waits until it is told to go."""
+def server() -> Iterator[HttpClient]:
+    """Serve a page, one that raises, and one that blocks until GO is set."""
 
     def fail() -> Page:
-        raise RuntimeError("a page that fails")
+        raise RuntimeError("broken page")
 
     def wait() -> Page:
         BUSY.release()
@@ -35,31 +35,31 @@ def server() -> Iterator[Pages]:
 
     pages = {"/page": lambda: Page.text("a page"), "/fails": fail, "/waits": wait}
     with closing(HttpServer("127.0.0.1:0", pages)) as server:
-        yield Pages(server.port)
+        yield HttpClient(server.port)
 
 
 @pytest.fixture(scope="module")
-def others() -> Iterator[tuple[Pages, Pages]]:
-    """Serve the pages of a service, for this host and for others."""
+def others() -> Iterator[tuple[HttpClient, HttpClient]]:
+    """Serve the pages of a service on loopback and on all interfaces."""
     content = {path: lambda: Page.text("content") for path in PATHS}
     with closing(HttpServer("127.0.0.1:0", content)) as local, closing(HttpServer("0.0.0.0:0", content)) as public:
-        yield Pages(local.port), Pages(public.port)
+        yield HttpClient(local.port), HttpClient(public.port)
 
 
-def test_unknown_path_is_not_found(server: Pages, caplog: pytest.LogCaptureFixture) -> None:
-    """404 says which pages there are, as / does; a page that fails is 500, goes to the log, and ends nothing."""
-    assert server.ask("/other") == (404, "available pages: /page, /fails, /waits\n")
-    assert server.ask("/")[0] == 200
-    assert server.ask("/fails") == (500, "unexpected error, see the log\n")
-    assert "a page that fails" in caplog.text
-    assert server.ask("/page") == (200, "a page\n")
+def test_unknown_path_is_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
+    """404 and / list the available pages; a page that raises is 500, is logged, and does not stop the server."""
+    assert server.request("/other") == (404, "available pages: /page, /fails, /waits\n")
+    assert server.request("/")[0] == 200
+    assert server.request("/fails") == (500, "unexpected error: see the log\n")
+    assert "broken page" in caplog.text
+    assert server.request("/page") == (200, "a page\n")
 
 
-def test_nothing_can_be_changed(server: Pages) -> None:
-    """Whatever is not GET or HEAD is refused; HEAD has the headers of GET, and no content."""
+def test_only_get_and_head_are_allowed(server: HttpClient) -> None:
+    """Other methods than GET and HEAD are 501; HEAD returns the headers of GET without content."""
     for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"):
-        assert server.ask("/page", method)[0] == 501, method
-    assert server.ask("/page", "HEAD") == (200, "")
+        assert server.request("/page", method)[0] == 501, method
+    assert server.request("/page", "HEAD") == (200, "")
     with closing(http.client.HTTPConnection(server.where, timeout=DEADLINE)) as connection:
         connection.request("HEAD", "/page")
         headers = connection.getresponse().headers
@@ -70,14 +70,14 @@ def test_nothing_can_be_changed(server: Pages) -> None:
     ("host", "status", "elsewhere"),
     [
         ("127.0.0.1:9464", 200, 200),
-        ("192.0.2.1", 200, 200),  # of a forwarded port
+        ("192.0.2.1", 200, 200),  # forwarded port
         ("[::1]:9464", 200, 200),
         ("[fe80::1]", 200, 200),
         ("localhost:1234", 200, 200),
         ("LocalHost.", 200, 200),
         (f"{socket.gethostname()}:9464", 200, 200),
         (f"{socket.getfqdn()}:9464", 200, 200),
-        ("vehicle-1:9464", 403, 200),  # of a container
+        ("vehicle-1:9464", 403, 200),  # Docker container
         ("evil.example:9464", 403, 403),
         ("localhost.evil.example", 403, 403),
         ("127.0.0.1.evil.example", 403, 403),
@@ -85,17 +85,19 @@ def test_nothing_can_be_changed(server: Pages) -> None:
         ("[evil.example]", 403, 403),
     ],
 )
-def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, status: int, elsewhere: int) -> None:
-    """A page of somebody else whose name leads here cannot read the status, and on loopback nothing at all.
+def test_foreign_host_header_is_forbidden(
+    others: tuple[HttpClient, HttpClient], host: str, status: int, elsewhere: int
+) -> None:
+    """A page whose host name is rebound to this server cannot read the status, and on loopback nothing at all.
 
-    Where other hosts may ask, a Prometheus and probes get metrics, health, readiness and vehicles under any name.
+    On other interfaces, metrics, health, readiness and vehicles are served under any name.
     """
     local, public = others
     for path in PATHS:
-        assert local.ask(path, Host=host)[0] == status, path
-        assert public.ask(path, Host=host)[0] == (elsewhere if path == "/status" else 200), path
+        assert local.request(path, Host=host)[0] == status, path
+        assert public.request(path, Host=host)[0] == (elsewhere if path == "/status" else 200), path
     refused = "/status is only served under an IP address or a name of this host\n"
-    assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
+    assert local.request("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 
 @pytest.mark.parametrize(
@@ -110,24 +112,26 @@ def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, statu
         (b"GET /\xff\x00<script> HTTP/1.0\r\n\r\n", b"HTTP/1.0 404 "),
     ],
 )
-def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes) -> None:
-    """Whatever is sent gets an answer, and no line in the log; the next client gets its page."""
+def test_malformed_requests_are_rejected(
+    server: HttpClient, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes
+) -> None:
+    """A malformed request gets an HTTP error and no log line; the next client is served."""
     with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as client:
         client.sendall(sent)
         assert answer in client.recv(10_000)
-    assert server.ask("/page") == (200, "a page\n")
+    assert server.request("/page") == (200, "a page\n")
     assert not caplog.records
 
 
 @pytest.mark.parametrize(
     ("sent", "each_second"),
     [(b"", b""), (b"GET /page HTTP/1.0\r\nHost:", b""), (b"GET /", b"a"), (b"GET /large HTTP/1.0\r\n\r\n", b"")],
-    ids=["silent", "half a request", "byte by byte", "reads no answer"],
+    ids=["no request", "half a request", "byte by byte", "response not read"],
 )
-def test_slow_clients_are_ended(timings: Timings, sent: bytes, each_second: bytes) -> None:
-    """With 16 clients that send nothing, or not all, or read nothing, the next is answered when their time is over."""
+def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes) -> None:
+    """While 16 clients stall in sending or reading, further clients are served once the stalled ones time out."""
     timings.http_client = 0.5
-    large = Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+    large = Page.text("x" * 20_000_000)  # exceeds the socket buffers
     server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})
     with closing(server), ExitStack() as clients:
         slow = [
@@ -143,17 +147,17 @@ def test_slow_clients_are_ended(timings: Timings, sent: bytes, each_second: byte
 
         with repeating(drip) if each_second else nullcontext():
             for _ in range(20):
-                assert Pages(server.port).ask("/page") == (200, "a page\n")
+                assert HttpClient(server.port).request("/page") == (200, "a page\n")
 
 
-def test_close_waits_for_no_client(timings: Timings) -> None:
-    """While 16 clients do not read their answers and another waits for a free thread, it closes at once."""
+def test_close_does_not_wait_for_clients(timings: Timings) -> None:
+    """The server closes at once while 16 clients do not read responses and another one is queued."""
     timings.http_client = 10_000.0  # far beyond the deadline of this test
     made = threading.Semaphore(0)
 
     def make() -> Page:
         made.release()
-        return Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+        return Page.text("x" * 20_000_000)  # exceeds the socket buffers
 
     server = HttpServer("127.0.0.1:0", {"/large": make})
     with ExitStack() as clients:
@@ -165,21 +169,21 @@ def test_close_waits_for_no_client(timings: Timings) -> None:
         server.close()
 
 
-def test_more_clients_than_it_has_room_for(server: Pages) -> None:
-    """While 16 are being answered a further one waits; all get their answers."""
+def test_client_beyond_thread_limit_waits(server: HttpClient) -> None:
+    """While 16 clients are served, another one waits; all get their responses."""
     with ThreadPoolExecutor(17) as pool:
         answers = []
-        for _ in range(16):  # one after the other: a client that has not sent its request yet may be disconnected
-            answers.append(pool.submit(server.ask, "/waits"))
+        for _ in range(16):  # sequential: a client that has not yet sent its request may be disconnected
+            answers.append(pool.submit(server.request, "/waits"))
             assert BUSY.acquire(timeout=DEADLINE)
-        answers.append(pool.submit(server.ask, "/waits"))
+        answers.append(pool.submit(server.request, "/waits"))
         assert not BUSY.acquire(timeout=0.2)
         GO.set()
         assert {answer.result(DEADLINE) for answer in answers} == {(200, "True\n")}
 
 
-def test_server_pauses_without_a_file_for_a_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit of open files a client stays in the queue, and accepting it is not tried again without a pause."""
+def test_server_pauses_without_free_file_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of open files a client stays queued, and the server pauses before it retries."""
     pauses: list[float] = []
     is_full = threading.Event()
     accept = socket.socket.accept
@@ -197,5 +201,5 @@ def test_server_pauses_without_a_file_for_a_client(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(http_server, "time", SimpleNamespace(sleep=sleep))
     is_full.set()
     with closing(HttpServer("127.0.0.1:0", {"/page": lambda: Page.text("a page")})) as server:
-        assert Pages(server.port).ask("/page") == (200, "a page\n")
+        assert HttpClient(server.port).request("/page") == (200, "a page\n")
     assert pauses == [http_server._ACCEPT_PAUSE]

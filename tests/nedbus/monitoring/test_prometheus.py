@@ -1,4 +1,4 @@
-"""A real Prometheus scrapes real services and evaluates the rules that are shipped: each alert fires, and clears."""
+"""A real Prometheus scrapes real services and evaluates the packaged rules: each alert fires and clears."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ ROW = {
     "x": 1.5, "y": -2.25, "z": -10.0, "vx": 0.5, "vy": -0.25, "vz": 0.125, "heading": -1.0, "eph": 0.5, "epv": 0.75,
     "ref_lat": 47.3977418, "ref_lon": 8.5455939, "ref_alt": 487.957, "dist_bottom": 10.5,
 }  # fmt: skip
-PATIENCE = 90.0  # s until all alerts have fired, or cleared
-# A nedbus that gives up what is missing, and tries failed sources again, within a second, and keeps 100 messages for a
-# reader in place of 65,536, so that a small burst is too much for it.
-HURRIED = """
+TIMEOUT = 90.0  # s until all alerts have fired, or cleared
+# nedbus with timeouts of one second for retransmission and backoff, and queues of 100 instead of 65,536 messages, which
+# a small burst overflows.
+SHORT_TIMEOUTS = """
 import nedbus.client.receiving.pending_queue
 from nedbus.cli import main
 from nedbus.timings import TIMINGS
@@ -47,16 +47,16 @@ main()
 
 
 @contextmanager
-def traffic(bus: nedbus.Bus, raw: Session, udp_port: int) -> Iterator[threading.Event]:
-    """Publish as clients do, 50 times a second, and give an event: while that is set all goes wrong.
+def traffic(bus: nedbus.Bus, zenoh_session: Session, udp_port: int) -> Iterator[threading.Event]:
+    """Publish at 50 Hz; yield an event that makes everything fail while it is set.
 
-    Then vehicle "gone" is silent, "lost" leaves out every other number of its sequence, "doubtful" is invalid and flies
-    by dead reckoning, in failsafe, "many" sends bursts, and junk is sent to a key, and by a stranger to a MAVLink port.
+    Then vehicle "gone" is silent, "lost" skips every other sequence number, "doubtful" is invalid, dead reckoning and
+    in failsafe, "many" sends bursts, and junk is sent to a key and to a MAVLink port.
     """
     bad = threading.Event()
     gone, doubtful, many = (bus.publisher(VLP, vehicle=name) for name in ("gone", "doubtful", "many"))
     status = bus.publisher("vehicle_status", vehicle="doubtful")
-    junk, numbered = (raw.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost"))
+    junk, numbered = (zenoh_session.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost"))
     burst = to_array([message(number, **VALID) for number in range(1, 401)])
     numbers = count(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -89,18 +89,18 @@ def traffic(bus: nedbus.Bus, raw: Session, udp_port: int) -> Iterator[threading.
 
 
 def shorten(rules: str) -> str:
-    """Return rules that wait 1 s before they fire, and look back 10 s: nothing else is changed."""
+    """Shorten all `for` times to 1 s, and all ranges to 10 s."""
     return re.sub(r"\[\dm\]", "[10s]", re.sub(r"for: \d+[sm]", "for: 1s", rules))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_every_alert_fires_and_clears(
-    start: Start, run_nedbus: Start, bus: nedbus.Bus, raw: Session, tmp_path: Path
+    start: Start, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
-    """Each alert is caused by what it is for, names what it is about, and ends with its cause.
+    """Each alert fires for its cause, has labels that name it, and clears when the cause ends.
 
-    All are caused at the same time; the rules are those that are shipped, with shorter times.
+    All causes are present at the same time; the packaged rules have shortened times.
     """
     rules, (endpoint,) = shorten(ALERTS.read_text()), bus.routers
     silent, lossy = free_port(), free_port()
@@ -120,17 +120,26 @@ def test_every_alert_fires_and_clears(
         "lossy": f"mavlink:udpin:127.0.0.1:{lossy}?vehicles=1:lossy",
         "missing": f"ulog:{missing}?vehicle=missing&loop=1",
     }
-    start("-c", HURRIED, "export", "-c", endpoint, "--http", exporter)
+    start("-c", SHORT_TIMEOUTS, "export", "-c", endpoint, "--http", exporter)
     router = route()
     run_nedbus("serve", "-c", second, "--http", lonely, "-s", "sim:?speed=0.3&vehicle=lonely")
     run_nedbus("export", "--wait", "-c", second, "--http", lonely_exporter)
     to_end = export_ended()
     small = start_small_router(run_nedbus, tmp_path, full, full_exporter)
-    mend_rules = refuse_vehicle(run_nedbus, tmp_path, refused)
+    restore_rules = refuse_vehicle(run_nedbus, tmp_path, refused)
     vehicle = fly(lossy, "--drop", "0.3")
-    start("-c", HURRIED, "serve", "-c", endpoint, "--http", service, *[f"--source={text}" for text in sources.values()])
+    start(
+        "-c",
+        SHORT_TIMEOUTS,
+        "serve",
+        "-c",
+        endpoint,
+        "--http",
+        service,
+        *[f"--source={text}" for text in sources.values()],
+    )
     prometheus = Prometheus(start, tmp_path, rules, {"nedbus": addresses})
-    wait_for(lambda: len(prometheus.query("up == 1")) == 8, what="all eight to be scraped", seconds=PATIENCE)
+    wait_for(lambda: len(prometheus.query("up == 1")) == 8, what="all eight to be scraped", seconds=TIMEOUT)
 
     expected: dict[str, list[dict[str, str]]] = {
         "NedbusDown": [{"instance": ended}],
@@ -150,22 +159,22 @@ def test_every_alert_fires_and_clears(
     }
     assert expected.keys() == set(re.findall(r"alert: (\w+)", rules))
 
-    with traffic(bus, raw, silent) as bad, ExitStack() as crowd:
+    with traffic(bus, zenoh_session, silent) as bad, ExitStack() as crowd:
         of_gone = f'nedbus_messages_received_total{{instance="{exporter}", vehicle="gone"}} > 10'
-        wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=PATIENCE)
+        wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=TIMEOUT)
         bad.set()
-        for _ in range(6):  # with the two of the exporter eight of ten
+        for _ in range(6):  # plus two of the exporter: eight of ten
             crowd.enter_context(nedbus.connect(small))
         router.kill()
         to_end.kill()
         for name, causes in expected.items():
             for cause in causes:
-                wait_for(partial(prometheus.alerts, name, **cause), what=f"{name} {cause}", seconds=PATIENCE)
+                wait_for(partial(prometheus.alerts, name, **cause), what=f"{name} {cause}", seconds=TIMEOUT)
         assert not [text for text in prometheus.annotations() if "<" in text]  # <no value>, <error expanding template>
 
         bad.clear()
         crowd.close()
-        mend_rules()
+        restore_rules()
         route()
         export_ended()
         vehicle.kill()
@@ -173,13 +182,13 @@ def test_every_alert_fires_and_clears(
         fly(silent)
         write_log(missing, range(0, 10_000_000, 100_000), topic="vehicle_local_position_groundtruth")
         for name in expected:
-            wait_for(lambda: not prometheus.alerts(name), what=f"the end of {name}", seconds=PATIENCE)  # noqa: B023 - it is asked at once
+            wait_for(lambda: not prometheus.alerts(name), what=f"the end of {name}", seconds=TIMEOUT)  # noqa: B023 - called immediately
     assert not any(prometheus.scrape_errors().values())
     assert not prometheus.process.err
 
 
 def start_small_router(run_nedbus: Start, folder: Path, service: str, exporter: str) -> str:
-    """Start a service that is a router with room for ten sessions, and an exporter, which has two; return where."""
+    """Start a service with a router limited to ten sessions, and an exporter with two; return the endpoint."""
     where, file = free_endpoint(), folder / "small.json5"
     shipped = (PACKAGING.parent / "config" / "router.json5").read_text()
     file.write_text(shipped.replace("max_sessions: 1000", "max_sessions: 10"))
@@ -190,7 +199,7 @@ def start_small_router(run_nedbus: Start, folder: Path, service: str, exporter: 
 
 
 def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], None]:
-    """Start a service whose router does not know its vehicle; return what restarts the router with rules for it."""
+    """Start a service whose router refuses its vehicle; return a function that adds access rules for it."""
     pki, file, endpoint = folder / "pki", folder / "secure.json5", free_endpoint().replace("tcp/", "tls/")
     make_authority(pki)
     make_certificate(pki, "router", hosts=["127.0.0.1"])
@@ -202,18 +211,18 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
     shown = [f"--tls-{option}={pki / name}" for option, name in files.items()]
     run_nedbus("serve", "-c", endpoint, *shown, "-s", "sim:?vehicle=2&speed=0.3", "--http", pages)
 
-    def mend() -> None:
+    def restore() -> None:
         write_access_rules(file, ["1", "2"])
         router.kill()
         run_nedbus("router", str(file))
 
-    return mend
+    return restore
 
 
 @pytest.mark.parametrize(
     ("name", "series", "times"),
     [
-        (  # dead reckoning of 15 s, as in every lap of the simulation, is not long; 31 s are
+        (  # 15 s of dead reckoning, as in each lap of the simulation, do not fire; 31 s do
             "NedbusDeadReckoning",
             'nedbus_vehicle_condition{condition="dead_reckoning"} _x10 1x14 stale _x5 1x60',
             {"25s": False, "1m0s": False, "1m10s": True},
@@ -224,32 +233,32 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
             "nedbus_stream_age_seconds 0+1x30; nedbus_stream_usual_rate_hertz 0.2x30",
             {"9s": False, "16s": True},
         ),
-        (  # the count by rule appears with 1, which increase() does not see; the one of the source was 0 before
+        (  # a count by rule first appears as 1, which increase() misses; the source's count was 0 before
             "NedbusMessagesRejected",
             "nedbus_source_rejected_total 0x30 1x500; nedbus_messages_rejected_total _x30 1x500",
             {"25s": False, "45s": True, "5m45s": False},
         ),
-        (  # a replay that waits for a reader
+        (  # a replay waiting for a reader
             "NedbusSourceSilent",
             'nedbus_source_state{state="waiting"} 1x100; nedbus_source_addresses 5x100',
             {"1m30s": False},
         ),
-        (  # from four fifths on, and not for those who connect for a moment
+        (  # from 80 % on, but not for brief connections
             "NedbusRouterFull",
             'nedbus_sessions{role="router"} 799x100 800x100; nedbus_sessions_max{role="router"} 1000x300',
             {"1m40s": False, "2m30s": False, "2m50s": True},
         ),
-        (  # by an exporter, for each router
+        (  # from an exporter, for each router
             "NedbusRouterFull",
             'nedbus_router_sessions{router="a"} 10x30 9x10 10x80; nedbus_router_sessions_max{router="a"} 12x300',
             {"59s": False, "1m20s": False, "1m45s": True},
         ),
     ],
 )
-def test_rules_wait_as_long_as_they_say(
+def test_rules_fire_after_their_time(
     start: Start, tmp_path: Path, name: str, series: str, times: dict[str, bool]
 ) -> None:
-    """With their own times rules neither fire too early, nor for what is no fault."""
+    """With unchanged times rules do not fire too early or without a fault."""
     inputs = []
     for each in series.split("; "):
         metric, _, values = each.rpartition("} ") if "}" in each else each.partition(" ")
@@ -270,7 +279,7 @@ def test_rules_wait_as_long_as_they_say(
 
 
 def test_rules_and_scrape_configuration_are_valid(start: Start) -> None:
-    """Promtool accepts both, and each rule says how bad it is, what it is, and what to do."""
+    """Promtool accepts both; each rule has a severity, a summary and a description."""
     for arguments in (("rules", str(ALERTS)), ("config", str(ALERTS.with_name("prometheus.yml")))):
         promtool = start_promtool(start, "check", *arguments)
         assert promtool.wait() == 0, promtool.err
@@ -283,8 +292,10 @@ def test_rules_and_scrape_configuration_are_valid(start: Start) -> None:
 
 
 @pytest.mark.slow
-def test_dashboard_and_rules_use_what_exists(run_nedbus: Start, start: Start, endpoint: str, tmp_path: Path) -> None:
-    """Each metric of the rules and of the dashboard is one that a service or an exporter has; each query has data."""
+def test_dashboard_and_rules_use_existing_metrics(
+    run_nedbus: Start, start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    """Each metric in rules and dashboard is exported by a service or an exporter; each query returns data."""
     dashboard = json.loads((PACKAGING / "grafana" / "nedbus.json").read_text())
     assert {each["name"] for each in dashboard["templating"]["list"]} == {"datasource", "vehicle", "topic"}
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
@@ -296,13 +307,13 @@ def test_dashboard_and_rules_use_what_exists(run_nedbus: Start, start: Start, en
     for query in queries:
         filled = re.sub(r"\$__(rate_interval|range)", "10s", query).replace("$vehicle", ".*").replace("$topic", "ve.*")
         assert "$" not in filled
-        found = partial(prometheus.query, filled.removesuffix(" > 0"))  # only what increased is shown
-        if "rejected" in query:  # it has no series before the first rejection
+        found = partial(prometheus.query, filled.removesuffix(" > 0"))  # the panel shows only increases
+        if "rejected" in query:  # no series before the first rejection
             found()
         else:
             wait_for(found, what=query)
     exposed = {each["__name__"] for each, _ in prometheus.query('{__name__!=""}')}
     used = set(re.findall(r"\b(?:nedbus|process)_\w+", " ".join([*queries, ALERTS.read_text()])))
-    without = {"nedbus_messages_rejected_total", "nedbus_vehicle_refused"}  # not without a fault, or TLS
-    assert used - exposed - {"nedbus_vehicle_condition"} == without  # which the simulation has at times
+    without = {"nedbus_messages_rejected_total", "nedbus_vehicle_refused"}  # only with a fault or TLS
+    assert used - exposed - {"nedbus_vehicle_condition"} == without  # the simulation has it at times
     assert len(used) > 20

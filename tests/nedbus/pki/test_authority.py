@@ -37,11 +37,11 @@ from nedbus.transport import open_client, open_router
 from nedbus_msgs import AddressError
 from tests.flights.messages import VLP, message
 from tests.peers import certificates
-from tests.peers.certificates import secure_endpoint, tls_of, write_config
+from tests.peers.certificates import secure_endpoint, client_tls, write_config
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
-from tests.peers.zenohd import EITHER, start_zenohd
+from tests.peers.zenohd import ROUTER_KINDS, start_zenohd
 from tests.waits import DEADLINE, wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -72,7 +72,7 @@ def endpoint_of(file: Path) -> str:
     return "tls/" + file.read_text().split('listen: { endpoints: ["tls/')[1].split('"')[0]
 
 
-@pytest.fixture(params=EITHER)
+@pytest.fixture(params=ROUTER_KINDS)
 def run_router(request: pytest.FixtureRequest) -> Iterator[RunRouter]:
     """Run a router with a file, embedded or a real zenohd, and return a function that stops it."""
     with ExitStack() as stack:
@@ -95,7 +95,7 @@ def join(file: Path, pki: Path) -> Iterator[Join]:
 
         def join_as(name: str, *endpoints: str, tls: nedbus.Tls | None = None) -> nedbus.Bus:
             where = endpoints or endpoint_of(file)
-            return stack.enter_context(nedbus.connect(where, tls=tls or tls_of(pki, name), timeout=DEADLINE))
+            return stack.enter_context(nedbus.connect(where, tls=tls or client_tls(pki, name), timeout=DEADLINE))
 
         yield join_as
 
@@ -261,11 +261,11 @@ def test_old_and_renewed_certificate_are_both_valid(run_router: RunRouter, file:
     renewed = next(entry for entry in list_certificates(pki) if entry.name == "vehicle-99")
     assert renewed.certificate.ends > entry.certificate.ends
     assert (old / "vehicle-99.crt").read_bytes() != (pki / "vehicle-99.crt").read_bytes()
-    for bus in (before, join("vehicle-99"), join("", tls=tls_of(old, "vehicle-99"))):
+    for bus in (before, join("vehicle-99"), join("", tls=client_tls(old, "vehicle-99"))):
         assert_writes_only(bus, reader, "99", ["1"])
     assert renew_certificate(renewed, replace_key=True) == [pki / "vehicle-99.key", pki / "vehicle-99.crt"]
     assert stat.S_IMODE((pki / "vehicle-99.key").stat().st_mode) == 0o600
-    for bus in (join("vehicle-99"), join("", tls=tls_of(old, "vehicle-99"))):
+    for bus in (join("vehicle-99"), join("", tls=client_tls(old, "vehicle-99"))):
         assert_writes_only(bus, reader, "99", ["1"])
 
 
@@ -341,7 +341,7 @@ def test_renewed_authority_keeps_its_certificates_valid(run_router: RunRouter, t
     assert renew_certificate(first) == [folder / "ca.crt"]
     assert list_certificates(folder)[0].certificate.ends > first.certificate.ends + timedelta(days=3000)
     run_router(write_config(folder, tmp_path / "router-secure.json5", endpoint))
-    nedbus.connect(endpoint, tls=tls_of(folder, "reader"), timeout=DEADLINE).close()
+    nedbus.connect(endpoint, tls=client_tls(folder, "reader"), timeout=DEADLINE).close()
 
 
 def test_expired_authority_is_ignored_if_a_valid_one_is_in_the_file(pki: Path, tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def remove_key_identifiers(path: Path, authority: Path) -> None:
 @pytest.mark.parametrize("earlier", [False, True], ids=["this version", "earlier version"])
 def test_certificates_pass_strict_verification(pki: Path, *, earlier: bool) -> None:
     """Certificates pass the strict verification of Python 3.13; earlier ones stay valid, and pass it once renewed."""
-    router, reader = tls_of(pki, "router"), tls_of(pki, "reader")
+    router, reader = client_tls(pki, "router"), client_tls(pki, "reader")
     for name in ("ca", "router", "reader") if earlier else ():
         remove_key_identifiers(pki / f"{name}.crt", pki / "ca.key")
     assert ("Identifier" in handshake_error(pki / "ca.crt", router, reader, strict=True)) == earlier
@@ -476,7 +476,7 @@ def test_running_zenohd_rejects_new_rules(start: Start, file: Path, pki: Path, j
     router = start_zenohd(start, "-c", str(file))
     refused = "Error inserting conf value {} : updating config is only supported for keys starting with"
     values = {"access_control": '{ "enabled": false }', "access_control/default_permission": '"allow"'}
-    with open_client([endpoint_of(file)], tls=tls_of(pki, "operator"), timeout=DEADLINE) as operator:
+    with open_client([endpoint_of(file)], tls=client_tls(pki, "operator"), timeout=DEADLINE) as operator:
         (answer,) = [reply.ok for reply in operator.get("@/*/router") if reply.ok]
         for name, value in values.items():
             operator.put(f"{answer.key_expr}/config/{name}", value)

@@ -17,7 +17,7 @@ from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
 from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay
-from tests.flights.ulogs import LOGS, account_of
+from tests.flights.ulogs import LOGS, cached_events
 from tests.peers.command_line import run_command
 
 REAL = sorted(LOGS.parent.glob("*/*.ulg"))
@@ -55,9 +55,9 @@ def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) 
 
 def events_of(path: Path) -> list[Event]:
     """Return the events of a log, including the start of its initial conditions."""
-    account = account_of(path).account
-    held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
-    return [*held, *account.events_since(0)[0]]
+    event_log = cached_events(path).event_log
+    held = [each.begin for each in event_log.vehicles["1"].conditions.values() if each.initial]
+    return [*held, *event_log.events_since(0)[0]]
 
 
 def marks_of(axes: Any, marker: str) -> list[tuple[float, float]]:
@@ -130,7 +130,7 @@ def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
 
 def test_events_are_marked_by_severity() -> None:
     """A condition is a bar from start to end; the shape of a mark is its severity."""
-    lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix 3D to none")
+    lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix lost: 3D to none")
     events = [
         event_of("mode", "once", "info", 2.0, names=("Hold", "Mission")),
         event_of("dist_bottom_invalid", "begin", "info", 3.0),
@@ -153,7 +153,8 @@ def test_events_are_marked_by_severity() -> None:
     assert marks_of(parts["events"], "x") == [(5.0, 0), (5.5, 1)]
     assert marks_of(parts["events"], "D") == [(3.0, 2), (7.5, 3)]
     assert marks_of(parts["events"], "|") == [(1.0, 4)]
-    assert {text.get_text() for text in parts["events"].texts} >= {"xy not valid", "GPS fix 3D to none", "Mission"}
+    texts = {text.get_text() for text in parts["events"].texts}
+    assert texts >= {"xy not valid", "GPS fix lost: 3D to none", "Mission"}
     assert np.allclose(marks_of(parts["track"], "x"), [(0.0, 5.0), (0.0, 5.5)])
     assert np.allclose(marks_of(parts["track"], "D"), [(0.0, 3.0), (0.0, 7.5)])
     for name in ("altitude", "speed"):

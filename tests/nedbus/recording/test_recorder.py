@@ -36,7 +36,7 @@ from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 ADDRESS = Address("7", VLP)
 
@@ -76,7 +76,7 @@ def test_independent_reader_decodes_every_field(tmp_path: Path) -> None:
 
 
 def test_replay_of_a_recording_is_bit_exact(
-    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session, tmp_path: Path
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
     """A recording replays the same messages as those on the bus, with the same missing fields."""
     messages = list(open_replay("sim:?duration=1&topics=VehicleLocalPosition").messages)
@@ -90,7 +90,7 @@ def test_replay_of_a_recording_is_bit_exact(
     thread = threading.Thread(target=recorder.run, args=(stop,))
     thread.start()
     for publisher in publishers.values():
-        wait_for_reader(raw, publisher.key)
+        wait_for_matching(zenoh_session, publisher.key)
     sent: dict[str, list[bytes]] = {}
     for each in messages:
         published = upgrade({name: value for name, value in each.fields.items() if name != "tilt_var"})
@@ -121,7 +121,7 @@ def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tm
     costs: list[int] = []
     while not costs or (costs[-1] >= 1_500_000 and len(costs) < 5):
         path = tmp_path / f"cut{len(costs)}.mcap"
-        recorder = run_nedbus("record", "-c", endpoint, "-o", str(path), measured=False)
+        recorder = run_nedbus("record", "-c", endpoint, "-o", str(path), coverage=False)
         wait_for(path.exists, what="the file")
         with nedbus.connect(endpoint) as bus, bus.subscribe(VLP) as subscription:
             first = subscription.receive(DEADLINE).message.timestamp
@@ -328,7 +328,7 @@ def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float],
 def test_ctrl_c_finishes_the_recording(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
     """Ctrl-C finishes the file, prints the counts, and exits with 0."""
     path = tmp_path / "a.mcap"
-    recorder = run_nedbus("record", VLP, "-c", endpoint, "-o", str(path), measured=False)
+    recorder = run_nedbus("record", VLP, "-c", endpoint, "-o", str(path), coverage=False)
     wait_for(path.exists, what="the file")
     publisher = bus.publisher(VLP, vehicle="1")
     bus.publisher("external_ins_local_position", vehicle="1").publish(message(1))

@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import read_account
+from nedbus.sources import read_file_events
 from nedbus.web.playback import Recording
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
@@ -56,7 +56,7 @@ def test_events_of_several_files_share_utc(swarm: list[str]) -> None:
     shown = run_command("events", "--json", *swarm)
     assert shown.exit_code == 0, shown.err
     for path, name in zip(swarm, ("a_1", "b", "c"), strict=True):
-        assert f"{path}: vehicle 1 is {name} here, as several files have a vehicle 1" in shown.err.splitlines()
+        assert f"{path}: vehicle 1 is named {name} here, as several files have a vehicle 1" in shown.err.splitlines()
     found = [json.loads(line) for line in shown.out.splitlines()]
     assert {(each["vehicle"], each["time"]) for each in found} == {("b", "2025-10-09T08:54:25.000+00:00")}
     assert run_command("events", "-v", "a_1", *swarm).out == ""
@@ -79,9 +79,9 @@ def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
     """The gap between two flights of a vehicle does not matter."""
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
     second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
-    account = read_account(first, second)
-    assert [event.vehicle for event in account.account.events_since(0)[0]] == ["a", "a", "b", "b"]
-    assert math.isclose(account.end, 3e8 - 60 + 9.9, abs_tol=0.01)
+    event_log = read_file_events(first, second)
+    assert [event.vehicle for event in event_log.event_log.events_since(0)[0]] == ["a", "a", "b", "b"]
+    assert math.isclose(event_log.end, 3e8 - 60 + 9.9, abs_tol=0.01)
 
 
 def test_file_without_utc_raises_among_several(tmp_path: Path, swarm: list[str]) -> None:
@@ -131,4 +131,4 @@ def test_reported_swarm_is_aligned() -> None:
     streams = nedbus.read(paths, [VLP])
     assert [*streams] == [f"{name}/{VLP}" for name in ("swarm_a", "swarm_b", "3")]
     assert {int(each["timestamp"][0]) for each in streams.values()} == {EPOCH + 60_000_000}
-    assert 9.9 < read_account(*paths).end < 10.1
+    assert 9.9 < read_file_events(*paths).end < 10.1

@@ -10,7 +10,7 @@ import pytest
 
 import nedbus
 from nedbus.errors import SourceError
-from nedbus.sources import FileAccount, parse_source, read_account
+from nedbus.sources import FileEvents, parse_source, read_file_events
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.peers.command_line import run_command
@@ -40,11 +40,11 @@ def dues(name: str) -> tuple[float, float]:
 
 def events(name: str) -> set[tuple[str, str]]:
     """Return kind and severity of all events."""
-    return {(each.kind, each.severity) for each in account(name).account.events}
+    return {(each.kind, each.severity) for each in account(name).event_log.events}
 
 
-def account(name: str) -> FileAccount:
-    return read_account(CASES / name)
+def account(name: str) -> FileEvents:
+    return read_file_events(CASES / name)
 
 
 EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
@@ -83,7 +83,7 @@ def test_end_of_fake_position_is_the_cause() -> None:
     lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in lines if "BAD    xy not valid" in line)
     assert invalid.startswith("   154.300")
-    assert "no horizontal aiding: fake position ended, nothing else is fused (200 ms before)" in invalid
+    assert "no horizontal aiding: EKF stopped fusing fake position (200 ms before)" in invalid
 
 
 @pytest.mark.parametrize(

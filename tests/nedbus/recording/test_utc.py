@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import nedbus
-from nedbus.sources import read_account
+from nedbus.sources import read_file_events
 from nedbus_msgs import DEFAULT_TOPIC, is_unix_time
 from tests.flights.replays import convert_replay, open_replay
 
@@ -32,7 +32,7 @@ def test_utc_of_align_and_events_agree(path: Path, utc: str, source: str) -> Non
     assert (found.source, str(found.at(first))) == (source, f"{utc}+00:00")
     assert nedbus.align(path, utc=True)["utc"][0] == np.datetime64(utc.replace(" ", "T"))
     event: Any = SimpleNamespace(vehicle="1", boot=first / 1e6)
-    assert read_account(path).times.utc(event) == pytest.approx(found.unix_us(int(first)) / 1e6)
+    assert read_file_events(path).times.utc(event) == pytest.approx(found.unix_us(int(first)) / 1e6)
 
 
 def test_conversion_keeps_the_boot_time(tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""Sources: MAVLink, PX4 over Zenoh, logs, the simulator."""
+"""Tests of the sources: MAVLink, PX4 over Zenoh, logs, and the simulator."""

@@ -1,10 +1,10 @@
-"""Damaged recordings and logs: what is hit is left out and reported, what is read is right, in every try.
+"""Damaged recordings and logs: damaged parts are skipped and reported, and all messages that are read are correct.
 
-The chunks of a recording have CRCs, so that every message that is read equals the original to the bit.
-A log has no checksums: a bit inside a value cannot be noticed by anybody.
-There the rule is that only messages that were hit differ, and that damage of the structure is noticed.
+Chunks of a recording have CRCs, so each message that is read must equal the original bit by bit.
+A log has no checksums, so a flipped bit in a value goes unnoticed: there, at most the damaged messages may differ, and
+damage to the structure must be detected.
 
-`DAMAGE_TRIES=10000 pytest tests/nedbus/sources/test_damage.py` tries more, on the real logs of ../shared as well.
+`DAMAGE_TRIES=10000 pytest tests/nedbus/sources/test_damage.py` tries more, including the real logs of ../shared.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ from tests.peers.ports import free_endpoint
 _log = logging.getLogger(__name__)
 
 TRIES = int(os.environ.get("DAMAGE_TRIES", "320"))
-FEW = 60  # tries of the quick tier, of files that are made here
+FEW = 60  # tries of the quick tier, which uses generated files only
 each_tier = pytest.mark.parametrize("tries", [FEW, pytest.param(TRIES, marks=pytest.mark.slow)])
-MAX_LOG = 150_000  # bytes of a real log that a try reads
+MAX_LOG = 150_000  # bytes of a real log per try
 
 Rows = Counter[tuple[str, bytes]]  # topic and values of messages
 
 
 def damage(data: bytes, rng: random.Random) -> tuple[str, int, bytes]:
-    """Flip a bit, cut the end off, or zero a range; return what was done, how many bytes were hit, and the rest."""
+    """Flip a bit, cut off the end, or zero a range; return a description, the number of bytes hit, and the result."""
     kind, damaged = rng.choice(("bit", "bit", "cut", "zeros")), bytearray(data)
     offset = rng.randrange(len(data))
     if kind == "bit":
@@ -69,7 +69,7 @@ def damage(data: bytes, rng: random.Random) -> tuple[str, int, bytes]:
 
 
 def write_recording(path: Path, *, finish: bool) -> Path:
-    """Write a flight of two vehicles in a dozen chunks; without `finish` as a power cut leaves it."""
+    """Write a flight of two vehicles in a dozen chunks; without `finish`, as after a power cut."""
     messages = [
         (each.address, upgrade(each.fields))
         for each in open_replay("sim:?duration=2&topics=VehicleLocalPosition").messages
@@ -105,8 +105,8 @@ def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], RecordingRe
 
 @pytest.mark.timeout(120 + TRIES)
 @each_tier
-def test_damaged_recordings_are_read_in_part_and_never_wrong(tmp_path: Path, tries: int) -> None:
-    """Whatever is hit, each message that is read is one of the original, none twice, and what is lost is reported."""
+def test_damaged_recording_yields_only_original_messages(tmp_path: Path, tries: int) -> None:
+    """Each message that is read is an original one, none is repeated, and losses are reported."""
     rng = random.Random(12)
     originals = [(path.read_bytes(), payloads_of(path)[0], path.stem) for path in make_recordings(tmp_path)]
     path = tmp_path / "damaged.mcap"
@@ -120,14 +120,14 @@ def test_damaged_recordings_are_read_in_part_and_never_wrong(tmp_path: Path, tri
             read, reader = payloads_of(path)
             run = open_replay(f"mcap:{path}?speed=max")
         except SourceError:
-            outcomes["refused"] += 1
+            outcomes["rejected"] += 1
             continue
         lost = original - read
         assert not read - original, where
         assert reader.damaged or not lost, f"{where}: {sum(lost.values())} lost: {reader.warnings}"
         assert bool(run.damage) == reader.damaged, where
         assert run.total == sum(read.values()), where
-        # Where the index is lost as well, nobody knows whether there was anything in what cannot be read.
+        # Without the index it is unknown whether the unreadable part contained messages.
         assert lost or not reader.damaged or not reader._files[0].chunks.summary, (
             f"{where}: nothing lost: {reader.warnings}"
         )
@@ -139,13 +139,13 @@ def test_damaged_recordings_are_read_in_part_and_never_wrong(tmp_path: Path, tri
             if expected:
                 array = nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
                 assert len(array) == expected, where
-    assert outcomes["lost"] > outcomes["refused"], outcomes
+    assert outcomes["lost"] > outcomes["rejected"], outcomes
     assert outcomes["whole"], outcomes
     _log.info("%s", outcomes)
 
 
 def write_log(path: Path) -> Path:
-    """Write a log of two instances of the estimate and of the selected one, all of one format."""
+    """Write a log of two estimator instances and the selected estimate, all of one format."""
     writer = UlogWriter()
     writer.define([VLP, "estimator_local_position"])
     for number in range(60):
@@ -177,7 +177,7 @@ def make_logs(folder: Path) -> list[Path]:
 
 
 def rows_of(path: Path) -> dict[Address, MessageArray]:
-    """Return the messages of a log without PX4's words: one bit of the metadata changes all that are events."""
+    """Return the messages of a log except log_message, as one flipped bit of the metadata alters all events."""
     return {
         address: nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
         for address in nedbus.addresses_of(path)
@@ -186,7 +186,7 @@ def rows_of(path: Path) -> dict[Address, MessageArray]:
 
 
 def count_rows(streams: dict[Address, MessageArray], missing: Mapping[str, set[str]]) -> Counter[tuple[str, bytes]]:
-    """Count the messages of each topic by the values of all fields that its log has; names of vehicles are values."""
+    """Count the messages of each topic by the values of all fields in the log; names of vehicles are values."""
     found: Counter[tuple[str, bytes]] = Counter()
     for address, messages in streams.items():
         fields = [name for name in messages.dtype.names or () if name not in missing.get(address.topic, ())]
@@ -195,15 +195,15 @@ def count_rows(streams: dict[Address, MessageArray], missing: Mapping[str, set[s
     return found
 
 
-def is_shorter(damaged: bytes, data: bytes) -> bool:
-    """Return whether a log is the beginning of another one."""
+def is_truncation(damaged: bytes, data: bytes) -> bool:
+    """Return whether `damaged` is a proper prefix of `data`."""
     return len(damaged) < len(data) and data.startswith(damaged)
 
 
 @pytest.mark.timeout(120 + TRIES)
 @each_tier
-def test_damaged_logs_are_read_in_part(tmp_path: Path, tries: int) -> None:
-    """No more messages differ than were hit, and what is lost with the structure is reported."""
+def test_damaged_log_loses_only_damaged_messages(tmp_path: Path, tries: int) -> None:
+    """No more messages differ than were damaged, and losses from a damaged structure are reported."""
     rng = random.Random(13)
     logs = make_logs(tmp_path) if tries > FEW else [write_log(tmp_path / "ours.ulg")]
     originals = [(path.read_bytes(), rows_of(path), path.stem) for path in logs]
@@ -218,17 +218,19 @@ def test_damaged_logs_are_read_in_part(tmp_path: Path, tries: int) -> None:
             read, run = rows_of(path), open_replay(f"ulog:{path}")
             assert list(run.messages)
         except SourceError:
-            outcomes["refused"] += 1
+            outcomes["rejected"] += 1
             continue
         missing: dict[str, set[str]] = {}
         for address, messages in read.items():
             missing.setdefault(address.topic, set()).update(nedbus.missing_of(messages))
         before, after = count_rows(original, missing), count_rows(read, missing)
-        hit = 1 + count // 50 if count else 0
-        strange, lost = (after - before).total(), (before - after).total()
-        assert strange <= hit, f"{where}: {strange} messages differ: {run.warnings}"
-        # A log has no end: one whose writer lost power is a whole log.
-        assert run.damage or lost <= hit or is_shorter(damaged, data), f"{where}: {lost} lost: {run.warnings}"
+        damaged_messages = 1 + count // 50 if count else 0
+        altered, lost = (after - before).total(), (before - after).total()
+        assert altered <= damaged_messages, f"{where}: {altered} messages differ: {run.warnings}"
+        # A log has no end mark: one truncated by a power loss is complete.
+        assert run.damage or lost <= damaged_messages or is_truncation(damaged, data), (
+            f"{where}: {lost} lost: {run.warnings}"
+        )
         outcomes["reported" if run.damage else "lost" if lost else "whole"] += 1
     assert outcomes["whole"], outcomes
     assert outcomes["reported"], outcomes
@@ -236,7 +238,7 @@ def test_damaged_logs_are_read_in_part(tmp_path: Path, tries: int) -> None:
 
 
 def damage_chunk(path: Path, number: int) -> int:
-    """Flip a bit in the middle of a chunk of a recording; return how many messages are in it."""
+    """Flip a bit in the middle of a chunk of a recording; return the number of messages lost."""
     data = bytearray(path.read_bytes())
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -250,7 +252,7 @@ def damage_chunk(path: Path, number: int) -> int:
 
 
 def rewrite_index(path: Path, field: str, value: int) -> None:
-    """Change a field of the first two chunks in the index of a recording, and give it the CRC that fits."""
+    """Change a field of the first two chunks in the index of a recording, and update its CRC."""
     data = path.read_bytes()
     start, _, _ = struct.unpack_from("<QQI", data, len(data) - 28)
     builder = RecordBuilder()
@@ -270,8 +272,8 @@ def rewrite_index(path: Path, field: str, value: int) -> None:
     [("chunk_start_offset", each) for each in (0, 100, 2**40, 2**62, 2**63, 2**64 - 1)]
     + [("chunk_length", each) for each in (10_000, 2**40, 2**62, 2**63, 2**64 - 1)],
 )
-def test_index_that_points_elsewhere_is_not_used(tmp_path: Path, field: str, value: int) -> None:
-    """Chunks outside of the file, or two in one place: the file is read without its index, and nothing is lost."""
+def test_invalid_index_is_ignored(tmp_path: Path, field: str, value: int) -> None:
+    """With chunks outside the file, or two at one place, the file is read without its index, and nothing is lost."""
     path = write_recording(tmp_path / "a.mcap", finish=True)
     original = payloads_of(path)[0]
     rewrite_index(path, field, value)
@@ -281,7 +283,7 @@ def test_index_that_points_elsewhere_is_not_used(tmp_path: Path, field: str, val
 
 
 def add_chunk(path: Path, records: bytes, *, size: int, compression: str, in_index: bool) -> None:
-    """Add a chunk that says to be of this size to the end of a recording without an index, or make it the index."""
+    """Append a chunk with this declared size to a recording without an index, or use it as the index."""
     data = path.read_bytes()
     end = len(data) - 50
     packed = zstandard.compress(records) if compression == "zstd" else lz4.frame.compress(records)
@@ -296,18 +298,20 @@ def add_chunk(path: Path, records: bytes, *, size: int, compression: str, in_ind
 
 
 @pytest.mark.parametrize(
-    ("size", "said", "compression", "in_index"),
-    [(2**28, said, compression, False) for said in (2**28, 2**20) for compression in ("zstd", "lz4")]
+    ("size", "declared", "compression", "in_index"),
+    [(2**28, declared, compression, False) for declared in (2**28, 2**20) for compression in ("zstd", "lz4")]
     + [(2**28, 2**28, "zstd", True), (2**20, 2**20, "zstd", False)],
 )
-def test_chunk_too_large_is_left_out(tmp_path: Path, size: int, said: int, compression: str, *, in_index: bool) -> None:
-    """A chunk of 256 MiB that is packed into some kilobytes is not unpacked, whatever size it says; the rest is read.
+def test_oversized_chunk_is_skipped(
+    tmp_path: Path, size: int, declared: int, compression: str, *, in_index: bool
+) -> None:
+    """A chunk that would decompress to 256 MiB is skipped, whatever its declared size; the rest is read.
 
-    A smaller one is unpacked: no record is of zeros, so that the rest of the chunk is left out where they begin.
+    A smaller one is decompressed: zeros are not a record, so the rest of that chunk is skipped.
     """
     path = write_recording(tmp_path / "a.mcap", finish=False)
     original = payloads_of(path)[0]
-    add_chunk(path, bytes(size), size=said, compression=compression, in_index=in_index)
+    add_chunk(path, bytes(size), size=declared, compression=compression, in_index=in_index)
     tracemalloc.start()
     try:
         read, reader = payloads_of(path)
@@ -321,8 +325,8 @@ def test_chunk_too_large_is_left_out(tmp_path: Path, size: int, said: int, compr
         assert reader.warnings == ["damaged: a chunk has an invalid record; skipped the rest of that chunk"]
 
 
-def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
-    """A file of a thousand damaged places causes a hundred warnings, and one that says that there are more."""
+def test_number_of_damage_warnings_is_limited(tmp_path: Path) -> None:
+    """A file with a thousand damaged places causes a hundred warnings, and one that there are more."""
     path = write_recording(tmp_path / "a.mcap", finish=False)
     place = struct.pack("<BQ", Opcode.MESSAGE_INDEX, 6) + bytes(6)
     path.write_bytes(path.read_bytes()[:-50] + (place + struct.pack("<BQ", 0x80, 0)) * 1000)
@@ -334,15 +338,15 @@ def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
 CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged: its messages are skipped"
 
 
-def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
-    """One flipped bit: convert, plot and serve --until-done use what can be read, say what is lost, and exit with 1."""
+def test_commands_read_undamaged_part_and_exit_1(tmp_path: Path) -> None:
+    """With one flipped bit, convert, plot and serve --until-done use the readable part, and report the loss."""
     path = write_recording(tmp_path / "a.mcap", finish=True)
     with RecordingReader(path, vehicle="1") as reader:
         total = sum(reader.counts.values())
     assert (lost := damage_chunk(path, 3)) == 80
     [warning] = open_replay(f"mcap:{path}").warnings
     assert re.fullmatch(CHUNK, warning)
-    said = []
+    errors = []
     for arguments in (
         ["convert", str(path), "b.mcap"],
         ["plot", str(path), "-v", "1", "-o", "b.png"],
@@ -351,16 +355,16 @@ def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
         ended = run_command(*arguments)
         assert ended.exit_code == 1, ended.err
         assert re.search(CHUNK, ended.err)
-        said.append(ended.err)
-    assert f"{total - lost} messages" in said[0]
-    assert f"{total - lost} published" in said[2]
+        errors.append(ended.err)
+    assert f"{total - lost} messages" in errors[0]
+    assert f"{total - lost} published" in errors[2]
     assert Path("b.png").stat().st_size > 10_000
     with RecordingReader("b.mcap", vehicle="1") as reader:
         assert sum(reader.counts.values()) == total - lost
 
 
-def test_damage_of_a_converted_flight_costs_seconds(tmp_path: Path) -> None:
-    """`convert` writes chunks that are small enough for the rest to be worth reading."""
+def test_damaged_chunk_of_converted_flight_is_small(tmp_path: Path) -> None:
+    """`convert` writes small chunks, so one damaged chunk loses less than a fifth of 30 s."""
     path = tmp_path / "a.mcap"
     convert_replay("sim:?duration=30", path)
     with RecordingReader(path, vehicle="1") as reader:
@@ -368,8 +372,8 @@ def test_damage_of_a_converted_flight_costs_seconds(tmp_path: Path) -> None:
     assert 0 < damage_chunk(path, 3) < total / 5
 
 
-def test_cut_log_is_converted_with_a_warning(tmp_path: Path) -> None:
-    """A log that ends inside a message, as after a loss of power, is converted up to there; nothing is missing."""
+def test_truncated_log_is_converted_with_warning(tmp_path: Path) -> None:
+    """A log that ends inside a message, as after a power loss, is converted up to there with exit code 0."""
     path = write_log(tmp_path / "a.ulg")
     path.write_bytes(path.read_bytes()[:-50])
     convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))
@@ -379,7 +383,7 @@ def test_cut_log_is_converted_with_a_warning(tmp_path: Path) -> None:
 
 
 def write_payloads(path: Path, payloads: Iterable[bytes], *, layout: str = "1.16") -> Path:
-    """Write a recording of one vehicle as another program may write it: any payload, one a millisecond."""
+    """Write a recording of one vehicle, like another program's, with any payloads at 1 kHz."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
@@ -396,7 +400,7 @@ def payload(timestamp: int, *, layout: str = "1.16", **fields: object) -> bytes:
 
 
 BAD_BOOL = payload(7)[: 4 + 16] + b"\x02" + payload(7)[4 + 16 + 1 :]  # xy_valid
-POISON = {
+INVALID = {
     "bool of 2": BAD_BOOL,
     "big-endian": b"\x00\x00" + payload(7)[2:],
     "short": payload(7)[:-4],
@@ -405,10 +409,10 @@ POISON = {
 }
 
 
-@pytest.mark.parametrize("poison", POISON.values(), ids=POISON)
-def test_undecodable_message_is_skipped(tmp_path: Path, poison: bytes, caplog: pytest.LogCaptureFixture) -> None:
-    """It is rejected with its place, and counted; the others are replayed, converted and read."""
-    path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), poison, payload(3)])
+@pytest.mark.parametrize("invalid", INVALID.values(), ids=INVALID)
+def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    """It is rejected with its position, and counted; the others are replayed, converted and read."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), invalid, payload(3)])
     run = open_replay(f"mcap:{path}")
     messages = list(run.messages)
     assert [each.error is None for each in messages] == [True, True, False, True]
@@ -420,8 +424,8 @@ def test_undecodable_message_is_skipped(tmp_path: Path, poison: bytes, caplog: p
     assert "1 of 4 messages" in caplog.text
 
 
-def test_service_goes_on_after_a_message_that_cannot_be_decoded(tmp_path: Path) -> None:
-    """The replay is not started again: what follows is published once, and the exit code is 0."""
+def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
+    """The replay is not restarted: the following messages are published once, and the exit code is 0."""
     path = write_payloads(tmp_path / "a.mcap", [payload(1), BAD_BOOL, payload(2)])
     service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
     assert service.exit_code == 0, service.err
@@ -430,15 +434,15 @@ def test_service_goes_on_after_a_message_that_cannot_be_decoded(tmp_path: Path) 
     assert "done, 2 published, 1 rejected" in service.err
 
 
-def test_wrong_sizes_do_not_shift_into_each_other(tmp_path: Path) -> None:
-    """55 payloads that are all too long by the same number of bytes are 55 invalid messages, not 56 of garbage."""
+def test_payloads_of_wrong_size_are_rejected(tmp_path: Path) -> None:
+    """55 payloads that are equally too long are 55 invalid messages, not 56 misaligned ones."""
     path = write_payloads(tmp_path / "a.mcap", [payload(each) + bytes(60) for each in range(55)])
     assert len(nedbus.read(path)) == 0
 
 
 @pytest.mark.parametrize("layout", ["1.13", "V0", "1.16"])
-def test_invalid_message_is_left_out(tmp_path: Path, layout: str, caplog: pytest.LogCaptureFixture) -> None:
-    """`read` leaves one invalid message out and counts it, whatever the layout."""
+def test_invalid_message_is_skipped(tmp_path: Path, layout: str, caplog: pytest.LogCaptureFixture) -> None:
+    """`read` skips one invalid message and counts it, in any layout."""
     bad = bytearray(payload(2, layout=layout, ref_lat=12.5))
     offset = bad.index(struct.pack("<d", 12.5))
     bad[offset : offset + 8] = struct.pack("<d", 91.0)

@@ -1,4 +1,4 @@
-"""Small files that describe gigabytes, or take hours to parse: refused or read within fixed resources."""
+"""Small files that describe gigabytes, or take hours to parse: rejected, or read within fixed resources."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from mcap.writer import Writer
 from tests.flights.ulogs import UlogWriter
 from tests.peers.processes import Start
 
-_SECONDS: Final = 30  # of processor time for all that reads files, on any machine; they take 1 to 2
+_SECONDS: Final = 30  # of CPU time for all readers, on any machine; they need 1 to 2
 _MEMORY: Final = 100_000  # KiB
 
-# Everything that reads files in one process; an error must be one of nedbus, which the command line turns into a line.
+# All readers of files in one process; only nedbus's own errors are allowed, which the command line shows as one line.
 _READ: Final = """
 import resource, sys
 from pathlib import Path
@@ -39,7 +39,7 @@ def play():
 
 uses = [
     lambda: nedbus.read(path, ["*"]), lambda: nedbus.align(path, on=10.0), lambda: nedbus.utc_of(path),
-    lambda: nedbus.sources.read_account(path), convert, play,
+    lambda: nedbus.sources.read_file_events(path), convert, play,
 ]
 resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -54,7 +54,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
 def _ulog(formats: Iterable[str], subscriptions: Iterable[str], size: int = 8, repeat: int = 1) -> bytes:
-    """Return a log with these formats, and a message of this size for each subscription; `NAME:1` is an instance."""
+    """Return a log with these formats, and a message of this size per subscription; `NAME:1` is an instance."""
     writer = UlogWriter()
     for each in formats:
         writer.put("F", each.encode())
@@ -99,7 +99,7 @@ ULOGS: Final[dict[str, Callable[[], bytes]]] = {
         TOPICS[:200],
         1028,
     ),
-    "refused": lambda: _ulog(
+    "rejected": lambda: _ulog(
         ["t0:uint64_t timestamp;" + "".join(f"float f{k};" for k in range(1500))], ["t0"], 8, 50_000
     ),
     "instances": lambda: _ulog(
@@ -122,24 +122,24 @@ SCHEMAS: Final[dict[str, Callable[[], Iterable[str]]]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ULOGS)
-def test_hostile_log_needs_few_resources(start: Start, tmp_path: Path, kind: str) -> None:
-    """Whatever the formats of a log describe, all that reads logs ends within the limits of time and memory."""
+def test_hostile_log_is_read_within_limits(start: Start, tmp_path: Path, kind: str) -> None:
+    """All code that reads logs stays within limits of time and memory, whatever the formats describe."""
     (tmp_path / "hostile.ulg").write_bytes(ULOGS[kind]())
     _check(start, tmp_path / "hostile.ulg")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SCHEMAS)
-def test_hostile_recording_needs_few_resources(start: Start, tmp_path: Path, kind: str) -> None:
-    """Whatever the schemas of a recording describe, all that reads recordings ends within the limits."""
+def test_hostile_recording_is_read_within_limits(start: Start, tmp_path: Path, kind: str) -> None:
+    """All code that reads recordings stays within limits of time and memory, whatever the schemas describe."""
     _mcap(SCHEMAS[kind](), tmp_path / "hostile.mcap")
     _check(start, tmp_path / "hostile.mcap")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nested", "topics", "instances"])
-def test_service_ends_with_a_hostile_log(run_nedbus: Start, endpoint: str, tmp_path: Path, kind: str) -> None:
-    """A service publishes what it can of such a log, and ends."""
+def test_service_ends_after_hostile_log(run_nedbus: Start, endpoint: str, tmp_path: Path, kind: str) -> None:
+    """A service publishes what it can decode, and ends."""
     (tmp_path / "hostile.ulg").write_bytes(ULOGS[kind]())
     service = run_nedbus("serve", "-s", f"ulog:{tmp_path}/hostile.ulg?topics=*", "-c", endpoint, "--until-done")
     assert service.wait() == 1

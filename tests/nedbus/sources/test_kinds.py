@@ -1,4 +1,4 @@
-"""Sources as texts and as tables of TOML."""
+"""Sources as texts and as TOML tables."""
 
 import re
 from pathlib import Path
@@ -25,8 +25,8 @@ from nedbus.sources import parse_source
         ('["sim:", { kind = "sim", vehicle = 2 }]', ["sim:", "sim:?vehicle=2"]),
     ],
 )
-def test_source_as_a_table_is_the_same_as_its_text(tmp_path: Path, sources: str, texts: list[str]) -> None:
-    """Both forms give the same options, and may be mixed; the text is how status and metrics name the source."""
+def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: list[str]) -> None:
+    """Both forms produce the same options, and may be mixed; status and metrics use the text."""
     (tmp_path / "nedbus.toml").write_text(f"source = {sources}")
     specs = [parse_source(source) for source in load_settings().source]
     assert [spec.text for spec in specs] == texts
@@ -45,7 +45,6 @@ def test_source_as_a_table_is_the_same_as_its_text(tmp_path: Path, sources: str,
         ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
     ],
 )
-def test_wrong_table_is_explained(source: dict[str, object], reason: str) -> None:
-    """As a wrong text is."""
+def test_invalid_source_table_raises(source: dict[str, object], reason: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(reason)):
         parse_source(source)

@@ -1,4 +1,4 @@
-"""The simulated flight: deterministic, at PX4's rates, with outage and resets whose deltas explain the jumps."""
+"""The simulated flight: deterministic, at PX4's rates, with an outage, and resets whose deltas explain the jumps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def simulate(options: str) -> list[SourceMessage]:
 
 @pytest.fixture(scope="module")
 def streams() -> dict[str, list[VehicleLocalPosition]]:
-    """Simulate more than one lap, validate everything, and group it by stream."""
+    """Simulate more than one lap, validate all messages, and group them by stream."""
     by_stream: dict[str, list[VehicleLocalPosition]] = defaultdict(list)
     for each in simulate("?duration=140&topics=VehicleLocalPosition"):
         assert set(each.fields) == set(FIELD_TYPES)
@@ -34,7 +34,7 @@ def streams() -> dict[str, list[VehicleLocalPosition]]:
 
 @pytest.fixture(scope="module")
 def others() -> dict[str, list[Any]]:
-    """Simulate what is said beside VehicleLocalPosition, validate everything, and group it by stream."""
+    """Simulate all topics but those of VehicleLocalPosition, validate all messages, and group them by stream."""
     topics = ",".join(TOPICS.keys() - DEFAULT.topics)
     by_stream: dict[str, list[Any]] = defaultdict(list)
     for each in simulate(f"?duration=140&topics={topics}"):
@@ -47,7 +47,7 @@ def others() -> dict[str, list[Any]]:
 
 
 def test_origin_moves_the_flight() -> None:
-    """Vehicles with other origins fly elsewhere: only global positions move; an impossible one raises."""
+    """Another origin moves only the global positions; an impossible one raises."""
     moved, standard = (
         {each.address.stream: each.fields for each in simulate(f"?duration=3{options}")}
         for options in ("&origin=10.5,-20.25,100", "")
@@ -74,28 +74,26 @@ def encoded(options: str) -> list[tuple[float, str, bytes]]:
     ]
 
 
-def test_same_seed_same_bits() -> None:
-    """The flight is a function of its seed."""
+def test_same_seed_yields_identical_flight() -> None:
     one, two, other = (encoded(f"?duration=3&seed={seed}") for seed in (3, 3, 4))
     assert one == two
     assert one != other
 
 
 @pytest.mark.parametrize("topic", ["vehicle_local_position", "estimator_local_position", "vehicle_attitude", "*"])
-def test_what_is_chosen_is_the_same_flight(topic: str) -> None:
-    """A choice of topics has the messages that they have in the whole flight, to the bit."""
+def test_selected_topics_equal_those_of_whole_flight(topic: str) -> None:
+    """A selection of topics has exactly the messages that they have in the whole flight."""
     whole, chosen = encoded("?duration=18"), encoded(f"?duration=18&topics={topic}")
     assert chosen == [each for each in whole if topic in ("*", each[1].split("/")[1])]
 
 
-def test_topic_that_no_simulated_vehicle_has_is_an_error() -> None:
-    """A choice of nothing is said, not flown."""
+def test_selection_without_simulated_topic_raises() -> None:
     with pytest.raises(SourceError, match="has no timesync_status"):
         simulate("?duration=1&topics=timesync_status")
 
 
-def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
-    """Each stream has its topic's nominal rate, evenly."""
+def test_rates_are_nominal(streams: dict[str, list[VehicleLocalPosition]]) -> None:
+    """Each stream has the nominal rate of its topic, without jitter."""
     assert set(streams) == {name for name, topic in DEFAULT.topics.items() if not topic.instances} | {
         "estimator_local_position/0",
         "estimator_local_position/1",
@@ -107,7 +105,7 @@ def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
 
 @pytest.mark.parametrize("options", ["?duration=3.3", "?duration=0.5", "?duration=3.3&topics=home_position,SensorGps"])
 def test_messages_are_in_time_order_and_counted(options: str) -> None:
-    """A finite flight has exactly `total` messages, in order of `due`, and those of all its addresses."""
+    """A finite flight has exactly `total` messages, in order of `due`, and only at the announced addresses."""
     run = open_replay(f"sim:{options}")
     messages = list(run.messages)
     due = [each.due for each in messages]
@@ -116,8 +114,8 @@ def test_messages_are_in_time_order_and_counted(options: str) -> None:
     assert {each.address for each in messages} == set(run.addresses)
 
 
-def test_outage_is_dead_reckoning_with_growing_error(streams: dict[str, list[VehicleLocalPosition]]) -> None:
-    """Without GPS dead_reckoning is set, error and sigma grow, and after 10 s xy is no longer valid."""
+def test_gps_outage_causes_dead_reckoning(streams: dict[str, list[VehicleLocalPosition]]) -> None:
+    """Without GPS dead_reckoning is set, error and sigma grow, and xy becomes invalid after 10 s."""
     outage = [message for message in streams[VLP] if message.dead_reckoning]
     assert [(message.timestamp / 1e6 - 10.0) // 1 for message in (outage[0], outage[-1])] == [60.0, 74.0]
     assert outage[-1].eph > outage[len(outage) // 2].eph > outage[0].eph
@@ -135,15 +133,15 @@ def test_outage_is_dead_reckoning_with_growing_error(streams: dict[str, list[Veh
         ("heading", ("heading",), 0.01, 2),
     ],
 )
-def test_reset_delta_explains_the_jump(
+def test_reset_delta_equals_the_jump(
     streams: dict[str, list[VehicleLocalPosition]], quantity: str, fields: tuple[str, ...], motion: float, count: int
 ) -> None:
-    """At a reset the counter rises by one, and the delta is the jump but for 10 ms of motion; else nothing jumps."""
+    """At a reset the counter increments, and the delta equals the jump up to 10 ms of motion; nothing else jumps."""
     resets = 0
     for before, after in itertools.pairwise(streams[VLP]):
         jump = [getattr(after, name) - getattr(before, name) for name in fields]
         if quantity == "heading" and abs(jump[0]) > 3:
-            continue  # the heading went through pi
+            continue  # the heading wrapped at pi
         rise = getattr(after, f"{quantity}_reset_counter") - getattr(before, f"{quantity}_reset_counter")
         assert rise in {0, 1}
         if rise:
@@ -151,13 +149,13 @@ def test_reset_delta_explains_the_jump(
             delta = getattr(after, f"delta_{quantity}")
             jump = [a - b for a, b in zip(jump, delta if isinstance(delta, tuple) else (delta,), strict=True)]
         elif quantity == "heading" and abs(after.timestamp / 1e6 - 10 - 115) < 0.02:
-            continue  # the compass is disturbed here: that is what the next alignment resets
+            continue  # the heading disturbance that the next alignment corrects
         assert all(abs(value) <= motion for value in jump), (after.timestamp, jump)
     assert resets == count
 
 
-def test_estimate_is_near_the_truth(streams: dict[str, list[VehicleLocalPosition]]) -> None:
-    """With GPS the estimates stay within a few sigma of the groundtruth, and the velocity fits the positions."""
+def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPosition]]) -> None:
+    """With GPS estimates stay within a few sigma of the groundtruth, whose velocity fits its positions."""
     truth = {message.timestamp: message for message in streams["vehicle_local_position_groundtruth"]}
     for message in streams[VLP]:
         if message.timestamp in truth and not message.dead_reckoning:
@@ -171,19 +169,21 @@ def test_estimate_is_near_the_truth(streams: dict[str, list[VehicleLocalPosition
 
 
 def test_origin_is_set_in_flight(streams: dict[str, list[VehicleLocalPosition]]) -> None:
-    """The first two seconds have no global origin, as before the first fix."""
+    """There is no global origin for the first two seconds, as before the first fix."""
     first, last = streams[VLP][0], streams[VLP][-1]
     assert (first.xy_global, last.xy_global, last.ref_lat) == (False, True, 47.397742)
 
 
 def test_seeds_have_different_directions() -> None:
-    """Vehicles with different seeds fly apart, as soon as they have climbed."""
+    """Vehicles with different seeds fly apart once they have climbed."""
     ends = [upgrade(simulate(f"?duration=12&seed={seed}")[-1].fields) for seed in (0, 1)]
     assert abs(ends[0].x - ends[1].x) + abs(ends[0].y - ends[1].y) > 5
 
 
-def test_attitude_fits_the_flight(streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]) -> None:
-    """Its heading is that of the estimate, its reset too, and its thrust makes the acceleration."""
+def test_attitude_is_consistent_with_estimate(
+    streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
+) -> None:
+    """Heading and resets equal those of the estimate, and the thrust explains the acceleration."""
     estimates = {message.timestamp: message for message in streams[VLP]}
     attitudes = others["vehicle_attitude"]
     assert len(attitudes) == 7000
@@ -198,17 +198,17 @@ def test_attitude_fits_the_flight(streams: dict[str, list[VehicleLocalPosition]]
         )
         thrust = math.hypot(estimate.ax, estimate.ay, estimate.az - 9.80665)
         assert thrust * math.cos(roll) * math.cos(pitch) == pytest.approx(9.80665 - estimate.az, abs=1e-4)
-        if 26e6 < message.timestamp < 124e6:  # there is no error of the heading
+        if 26e6 < message.timestamp < 124e6:  # without a heading error
             along = estimate.ax * math.cos(heading) + estimate.ay * math.sin(heading)
             assert -thrust * math.cos(roll) * math.sin(pitch) == pytest.approx(along, abs=1e-4)
             across = estimate.ay * math.cos(heading) - estimate.ax * math.sin(heading)
             assert thrust * math.sin(roll) == pytest.approx(across, abs=1e-4)
 
 
-def test_global_position_is_the_local_one(
+def test_global_position_fits_local_position(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
-    """It is the estimate's position on the globe, valid while that is."""
+    """It is the projected position of the estimate, and valid while that is valid."""
     estimates = {message.timestamp: message for message in streams[VLP]}
     assert others["vehicle_global_position"][0].timestamp == 12_000_000  # the origin is known
     for message in others["vehicle_global_position"]:
@@ -222,10 +222,10 @@ def test_global_position_is_the_local_one(
         assert message.lat_lon_valid == estimate.xy_valid
 
 
-def test_state_and_gps_fit_the_outage(
+def test_status_and_gps_are_consistent_with_outage(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
-    """Without GPS the receiver has no fix; while the position is invalid a failsafe is in force."""
+    """During the outage the receiver has no fix; while the position is invalid a failsafe is active."""
     estimates = {message.timestamp: message for message in streams[VLP]}
     for message in others["vehicle_status"]:
         estimate = estimates[message.timestamp]
@@ -247,8 +247,8 @@ def test_state_and_gps_fit_the_outage(
             )
 
 
-def test_battery_home_and_landing_fit_the_flight(others: dict[str, list[Any]]) -> None:
-    """The battery gets emptier, home is said at the start and with the origin, and the vehicle takes off once."""
+def test_battery_home_and_land_detection_are_consistent(others: dict[str, list[Any]]) -> None:
+    """The battery discharges, home is sent at the start and with the origin, and the vehicle takes off once."""
     batteries = others["battery_status/0"]
     assert all(after.remaining < before.remaining for before, after in itertools.pairwise(batteries))
     assert all(0.8 < each.remaining <= 1 and 14 < each.voltage_v < 17 for each in batteries)

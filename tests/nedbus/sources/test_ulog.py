@@ -1,4 +1,4 @@
-"""Flight logs: all topics and instances, old layouts, damage of every kind."""
+"""Replay of flight logs: all topics and instances, old layouts, damage of every kind."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def read_all(run: ReplayRun) -> list[tuple[str, VehicleLocalPosition]]:
 
 @pytest.mark.logs
 @pytest.mark.parametrize("name", REAL)
-def test_real_log_is_read_whole_and_exact(name: str) -> None:
-    """Every message of a real log is valid, and every field is what pyulog reads, to the bit."""
+def test_real_log_is_read_completely_and_exactly(name: str) -> None:
+    """Each message of a real log is valid, and each field equals what pyulog reads, bit by bit."""
     path = LOGS / name
     if not path.exists():
         pytest.skip(f"the real log is not here: {path}")
@@ -73,7 +73,7 @@ def test_real_log_is_read_whole_and_exact(name: str) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_is_read(tmp_path: Path, layout: str) -> None:
-    """A log of any layout is read; fields that it lacks are not provided."""
+    """A log of any layout is read; fields that it lacks are left out."""
     writer = UlogWriter(layout=layout)
     writer.define([VLP])
     writer.add(VLP, message(5, x=1.5, delta_xy=(1.0, 2.0), hagl_max_z=9.0, xy_reset_counter=3))
@@ -86,7 +86,7 @@ def test_every_layout_is_read(tmp_path: Path, layout: str) -> None:
 
 
 def test_all_topics_and_instances_are_read_in_order(tmp_path: Path) -> None:
-    """All four topics and every estimator instance, in the order in which they were logged."""
+    """All four topics and every estimator instance are read in logged order."""
     writer = UlogWriter(system_id=7)
     writer.define(DEFAULT.topics)
     expected = []
@@ -109,8 +109,8 @@ def test_all_topics_and_instances_are_read_in_order(tmp_path: Path) -> None:
     ]
 
 
-def test_vehicle_is_the_options_else_the_logs_else_the_default(tmp_path: Path) -> None:
-    """`vehicle=` wins over MAV_SYS_ID, which wins over the service's default."""
+def test_vehicle_comes_from_option_log_or_default(tmp_path: Path) -> None:
+    """`vehicle=` overrides MAV_SYS_ID, which overrides the service's default."""
     for system_id, options, expected in ((7, "?vehicle=x", "x"), (7, "", "7"), (None, "", "1")):
         writer = UlogWriter(system_id=system_id)
         writer.define([VLP])
@@ -119,8 +119,7 @@ def test_vehicle_is_the_options_else_the_logs_else_the_default(tmp_path: Path) -
         assert address.vehicle == expected
 
 
-def test_many_rows_are_read_in_order(tmp_path: Path) -> None:
-    """Messages are read in chunks; none is lost between two."""
+def test_no_message_is_lost_between_chunks(tmp_path: Path) -> None:
     run = open_log(write_log(tmp_path / "a.ulg", range(0, 2_500_000, 1000)))
     assert [read.x for _, read in read_all(run)] == list(range(2500))
 
@@ -128,14 +127,14 @@ def test_many_rows_are_read_in_order(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("timestamps", "due"),
     [
-        ([10, 20, 15, 30, 40], [10, 20, 20, 30, 40]),  # one comes late
-        ([10, 20, 10**15, 30, 40], [10, 20, 20, 30, 40]),  # one is in the future: it must not delay the others
-        ([10, 20, 30, 40, 10**15], [10, 20, 30, 40, 40]),  # the last one is
-        ([10, 20, 10**15, 30, 0, 40, 50], [10, 20, 20, 30, 30, 40, 50]),  # two, one each way
+        ([10, 20, 15, 30, 40], [10, 20, 20, 30, 40]),  # one is late
+        ([10, 20, 10**15, 30, 40], [10, 20, 20, 30, 40]),  # one is in the future, which must not delay the others
+        ([10, 20, 30, 40, 10**15], [10, 20, 30, 40, 40]),  # the last one is in the future
+        ([10, 20, 10**15, 30, 0, 40, 50], [10, 20, 20, 30, 30, 40, 50]),  # one in the future, one in the past
         ([10, 20, 30 + 61_000_000, 40 + 61_000_000], [10, 20, 20, 30]),  # a gap of a minute
     ],
 )
-def test_unordered_timestamps_keep_the_logs_order(tmp_path: Path, timestamps: list[int], due: list[int]) -> None:
+def test_unordered_timestamps_keep_logged_order(tmp_path: Path, timestamps: list[int], due: list[int]) -> None:
     """Out-of-order timestamps and impossible gaps lose no message and never stall the replay; there is a warning."""
     run = open_log(write_log(tmp_path / "a.ulg", timestamps))
     messages = list(run.messages)
@@ -145,8 +144,8 @@ def test_unordered_timestamps_keep_the_logs_order(tmp_path: Path, timestamps: li
 
 
 @pytest.mark.parametrize("age", [50_000_000, 108_000_000])
-def test_old_latched_message_delays_nothing(tmp_path: Path, age: int) -> None:
-    """A log begins with a message of some time ago, as of home_position: no delay of the flight, and no warning."""
+def test_old_first_message_does_not_delay_replay(tmp_path: Path, age: int) -> None:
+    """A first message from long before, such as home_position, causes neither a delay nor a warning."""
     writer = UlogWriter()
     writer.define([VLP])
     struct.pack_into("<Q", writer.data, 8, 300_000_000)  # the start of logging
@@ -160,7 +159,7 @@ def test_old_latched_message_delays_nothing(tmp_path: Path, age: int) -> None:
     assert run.warnings == ()
 
 
-def test_bool_that_is_neither_0_nor_1_is_rejected_by_the_model(tmp_path: Path) -> None:
+def test_bool_other_than_0_or_1_is_rejected(tmp_path: Path) -> None:
     """A damaged flag is rejected, not read as true."""
     writer = UlogWriter()
     writer.define([VLP])
@@ -172,8 +171,8 @@ def test_bool_that_is_neither_0_nor_1_is_rejected_by_the_model(tmp_path: Path) -
     assert upgrade(second.fields).timestamp == 2
 
 
-def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) -> None:
-    """A topic without instances has one stream per vehicle."""
+def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> None:
+    """A topic without instances has one stream per vehicle; there is a warning."""
     writer = UlogWriter()
     writer.define([VLP])
     writer.add(VLP, message(1, x=1.0))
@@ -196,8 +195,8 @@ def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) 
         ),
     ],
 )
-def test_unreadable_file_is_a_clear_error(tmp_path: Path, write: Callable[[Path], object], reason: str) -> None:
-    """The error names the file and what is wrong with it, be it a log of other topics."""
+def test_unreadable_log_raises(tmp_path: Path, write: Callable[[Path], object], reason: str) -> None:
+    """The error names the file and the problem, also for a log of other topics."""
     path = tmp_path / "a.ulg"
     write(path)
     with pytest.raises(SourceError, match=reason) as info:
@@ -205,8 +204,8 @@ def test_unreadable_file_is_a_clear_error(tmp_path: Path, write: Callable[[Path]
     assert str(path) in str(info.value)
 
 
-def test_unknown_version_is_read_with_a_warning(tmp_path: Path) -> None:
-    """A newer version of the format is read as far as it is known."""
+def test_unknown_ulog_version_is_read_with_warning(tmp_path: Path) -> None:
+    """Messages of a newer format version are read as far as they are known."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000))
     data = bytearray(path.read_bytes())
     data[7] = 9
@@ -216,8 +215,8 @@ def test_unknown_version_is_read_with_a_warning(tmp_path: Path) -> None:
     assert len(read_all(run)) == 100
 
 
-def test_damaged_definition_is_noticed(tmp_path: Path) -> None:
-    """A field whose type changed, or that every release has and the log lacks, is damage, and never read as another."""
+def test_damaged_format_is_detected(tmp_path: Path) -> None:
+    """A field with an invalid type, or missing although every release has it, is damage, and never read as another."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000), topic="estimator_local_position")
     good = path.read_bytes()
     for before, after in ((b"float[2] delta_xy;", b"float[0] delta_xy;"), (b"float z;", b"float \0;")):
@@ -237,13 +236,13 @@ OLD_STATUS = "uint64_t timestamp;uint32_t system_id;uint32_t component_id;uint8_
 
 
 def write_old_log(path: Path, counts: Sequence[int], *, temperature: float = 20.5) -> Path:
-    """Write a log as of PX4 1.9, without its release: fields of other types than today's."""
+    """Write a log like PX4 1.9's, without its release: fields have other types than today's."""
     topics = {"battery_status": (OLD_BATTERY, "Qid3fB"), "vehicle_status": (OLD_STATUS, "QIIB")}
     rows = [("battery_status", (10 + n, count, temperature, 4.1, 4.2, 4.0, 1)) for n, count in enumerate(counts)]
     return write_raw_log(path, topics, [*rows, ("vehicle_status", (100, 1, 1, 2)), ("vehicle_status", (200, 1, 1, 5))])
 
 
-def test_fields_of_another_type_keep_their_values(tmp_path: Path) -> None:
+def test_field_of_another_type_is_converted(tmp_path: Path) -> None:
     """A value is converted where it fits, in a replay, in arrays and in a recording; such a log is not damaged."""
     path = write_old_log(tmp_path / "a.ulg", [6, 6])
     run = open_log(path, "?topics=*")
@@ -262,32 +261,32 @@ def test_fields_of_another_type_keep_their_values(tmp_path: Path) -> None:
         assert "cell_count" not in nedbus.missing_of(battery)
 
 
-def test_value_that_does_not_fit_is_named_once(tmp_path: Path) -> None:
-    """Such a field is left out of its message, and the log names it with a value; the rest of the message is read."""
+def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
+    """The field is left out of its message, and logged once with a value; the rest of the message is read."""
     path = write_old_log(tmp_path / "a.ulg", [6, -1, 256, 7], temperature=0.1)
     run = open_log(path, "?topics=*")
     batteries = [each.fields for each in run.messages if each.address.topic == "battery_status"]
     assert [fields.get("cell_count") for fields in batteries] == [6, None, None, 7]
     assert run.damage is None
     assert sorted(run.warnings) == [
-        "battery_status: left out cell_count where it is not a uint8, such as -1",
-        "battery_status: left out temperature where it is not a float32, such as 0.1",
+        "battery_status: cell_count left out where its value is not a uint8, such as -1",
+        "battery_status: temperature left out where its value is not a float32, such as 0.1",
     ]
     table = nedbus.read(path, "battery_status", dataframe="pandas")
     assert table["cell_count"].isna().tolist() == [False, True, True, False]
     assert nedbus.read(path, "battery_status")["cell_count"].tolist() == [6, 0, 0, 7]
 
 
-def test_old_log_without_its_release_is_not_damaged(tmp_path: Path) -> None:
-    """A log that is read whole is converted with exit code 0, and its change of mode is an event."""
+def test_old_log_without_release_is_not_damaged(tmp_path: Path) -> None:
+    """It is converted with exit code 0, and a change of mode in it is an event."""
     path = write_old_log(tmp_path / "a.ulg", [6])
     converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)
-    assert "mode Position to Return" in run_command("events", str(path)).out
+    assert "mode changed from Position to Return" in run_command("events", str(path)).out
 
 
-def test_dropout_in_a_log_is_an_event_of_the_logger(tmp_path: Path) -> None:
-    """A dropout of 5 s becomes an event with its duration; a gap without such a record is silence of the vehicle."""
+def test_dropout_is_an_event(tmp_path: Path) -> None:
+    """A dropout of 5 s becomes an event with its duration; a gap without a dropout record is a silent vehicle."""
     for is_recorded in (True, False):
         writer = UlogWriter()
         writer.define([VLP])
@@ -296,11 +295,11 @@ def test_dropout_in_a_log_is_an_event_of_the_logger(tmp_path: Path) -> None:
                 writer.put("O", struct.pack("<H", 5000))
             writer.add(VLP, message(time, **VALID))
         lines = run_command("events", str(writer.write(tmp_path / "a.ulg"))).out
-        assert ("the logger recorded nothing for 5.0 s" in lines, "silent" in lines) == (is_recorded, not is_recorded)
+        assert ("logging dropout of 5.0 s" in lines, "silent" in lines) == (is_recorded, not is_recorded)
 
 
 def test_event_before_the_first_timestamp_has_a_time_since_boot(tmp_path: Path) -> None:
-    """Rejections begin and end on one clock, also if the first messages have no timestamp."""
+    """Rejections begin and end on one clock, even if the first messages have no timestamp."""
     writer = UlogWriter()
     writer.define([VLP])
     for time in (0, 0, *range(100_000_000, 108_000_000, 100_000)):

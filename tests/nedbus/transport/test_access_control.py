@@ -28,14 +28,14 @@ from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import take
 from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_demand
 from tests.nedbus.sources.px4.test_source import Px4
-from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import CONFIG, client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import run_command
-from tests.peers.hasty import start_hasty
-from tests.peers.http_pages import Pages
+from tests.peers.custom_timings import start_with_timings
+from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
-from tests.peers.zenohd import EITHER, start_zenohd
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.peers.zenohd import ROUTER_KINDS, start_zenohd
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 __all__ = ["clock", "pki"]
 
@@ -50,7 +50,7 @@ def configured(pki: Path, tmp_path: Path) -> tuple[Path, str]:
     return write_config(pki, tmp_path / "router-secure.json5", endpoint), endpoint
 
 
-@pytest.fixture(params=EITHER)
+@pytest.fixture(params=ROUTER_KINDS)
 def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iterator[str]:
     """Run an embedded router, or a real zenohd, with the shipped configuration."""
     file, endpoint = configured
@@ -66,14 +66,14 @@ def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iter
 def join(secure: str, pki: Path) -> Iterator[Join]:
     """Connect a bus with the certificate of this name."""
     with ExitStack() as opened:
-        yield lambda name: opened.enter_context(nedbus.connect(secure, tls=tls_of(pki, name), timeout=DEADLINE))
+        yield lambda name: opened.enter_context(nedbus.connect(secure, tls=client_tls(pki, name), timeout=DEADLINE))
 
 
 @pytest.fixture
 def open_as(secure: str, pki: Path) -> Iterator[Open]:
     """Open a plain session with the certificate of this name."""
     with ExitStack() as opened:
-        yield lambda name: opened.enter_context(open_client([secure], tls=tls_of(pki, name), timeout=DEADLINE))
+        yield lambda name: opened.enter_context(open_client([secure], tls=client_tls(pki, name), timeout=DEADLINE))
 
 
 def test_reader_receives_everything_of_a_vehicle(join: Join) -> None:
@@ -120,7 +120,7 @@ def test_message_without_msg_file_is_decoded(join: Join) -> None:
     sent = definition.model.model_validate({"timestamp": 1, "wheel_speed": (0.5, 2.0)})
     with reader.subscribe("*", mode="every") as subscription:
         for key in (encoders.key, attitude.key):
-            wait_for_reader(vehicle._session, key)
+            wait_for_matching(vehicle._session, key)
         attitude.publish({"timestamp": 1, "q": (1.0, 0.0, 0.0, 0.0)})
         assert subscription.receive(DEADLINE).topic == "vehicle_attitude"
 
@@ -200,8 +200,10 @@ def test_incomplete_tls_settings_raise(
 
 def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Path, run_nedbus: Start) -> None:
     """Service and commands accept TLS files as flags or variables; `health` reports a vehicle denied by the router."""
-    run_nedbus("serve", "-c", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
-    wait_for(lambda: run_command("health", "-c", secure, "-v", "1", *flags_of(pki, "reader")).exit_code == 0, what="1")
+    run_nedbus("serve", "-c", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+    wait_for(
+        lambda: run_command("health", "-c", secure, "-v", "1", *tls_options(pki, "reader")).exit_code == 0, what="1"
+    )
     files = {"CA": "ca.crt", "CERTIFICATE": "reader.crt", "KEY": "reader.key"}
     environment = {"NEDBUS_CONNECT": secure, **{f"NEDBUS_TLS_{name}": f"{pki / file}" for name, file in files.items()}}
     echo = run_command("echo", "-n", "20", **environment)
@@ -221,7 +223,7 @@ def test_px4_without_tls_is_bridged_to_the_secure_router(
     local = free_endpoint()
     service = run_nedbus(
         *("serve", "--vehicle", "1", "-s", "px4-zenoh:", "--listen", local),
-        *("--connect", secure, *flags_of(pki, "vehicle-1")),
+        *("--connect", secure, *tls_options(pki, "vehicle-1")),
     )
     wait_for(lambda: f"joined {secure}" in service.err, what="the secure link")
     beyond = open_as("reader").declare_subscriber("*/fmu/**", zenoh.handlers.RingChannel(10))
@@ -245,12 +247,12 @@ def test_list_hints_at_access_rules_if_a_service_replies(secure: str, pki: Path,
     """If a service replies but no vehicle is visible, `list` does not suggest to start a source."""
 
     def hint() -> str:
-        listed = run_command("list", "-c", secure, *flags_of(pki, "reader"))
+        listed = run_command("list", "-c", secure, *tls_options(pki, "reader"))
         assert listed.exit_code == 0
         return listed.err
 
     assert "start a source with 'nedbus serve'" in hint()
-    run_nedbus("serve", "--connect", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
+    run_nedbus("serve", "--connect", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
     wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
 
 
@@ -294,7 +296,7 @@ def test_refused_clients_are_logged(
     file, endpoint = configured
     router = run_nedbus(*command, str(file), **environment)
     wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")
-    with nedbus.connect(endpoint, tls=tls_of(pki, "reader")) as bus:
+    with nedbus.connect(endpoint, tls=client_tls(pki, "reader")) as bus:
         assert bus.connected
     assert "refused" not in router.err
 
@@ -305,7 +307,7 @@ def test_refused_clients_are_logged(
         ("reader", "foreign/ca.crt", "it does not accept the certificate of this router", "is not signed by"),
     ):
         with pytest.raises(nedbus.ConnectError) as refused:
-            nedbus.connect(endpoint, tls=tls_of(pki, name, ca), timeout=0.1)
+            nedbus.connect(endpoint, tls=client_tls(pki, name, ca), timeout=0.1)
         assert str(refused.value).startswith(f"no TLS connection to {endpoint}: ")
         assert advice in str(refused.value)
         assert len(str(refused.value)) < 250, "readable length"
@@ -326,7 +328,7 @@ for number in range(2000):
     print(number, flush=True)
 print("the end", end="")
 """
-    process = start("-c", code, measured=False)
+    process = start("-c", code, coverage=False)
     assert process.wait() == 0
     assert process.out.split("\n") == [*map(str, range(2000)), "the end"]
 
@@ -368,15 +370,15 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     def start_router() -> Process:
         return run_nedbus("router", str(file)) if kind == "nedbus" else start_zenohd(start, "-c", str(file))
 
-    router, pages = start_router(), Pages(free_port())
-    options = (*flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
-    service = start_hasty(start, SOON, "serve", "-c", endpoint, *options)
+    router, pages = start_router(), HttpClient(free_port())
+    options = (*tls_options(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
+    service = start_with_timings(start, SOON, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses vehicle 2\n")
     wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
-    assert (pages.ask("/healthz"), pages.ask("/readyz")) == (refused, refused)
+    assert (pages.request("/healthz"), pages.request("/readyz")) == (refused, refused)
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
-    assert json.loads(pages.ask("/status")[1])["refused"] == ["2"]
-    reader = ("--wait", "-c", endpoint, *flags_of(pki, "reader"))
+    assert json.loads(pages.request("/status")[1])["refused"] == ["2"]
+    reader = ("--wait", "-c", endpoint, *tls_options(pki, "reader"))
     if certificate == "vehicle-1":  # else its status is denied, too
         info = run_command("info", *reader)
         assert info.exit_code == 0, info.err
@@ -393,7 +395,7 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     router.kill()
     start_router()
     wait_for(lambda: "the router accepts vehicle 2 now" in service.err, what="the acceptance")
-    assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [0.0]
     health = run_command("health", "--vehicle", "2", *reader)
     assert health.exit_code == 0, health.err
@@ -403,7 +405,7 @@ Outcome = tuple[bool | None, float]
 
 
 def permission_of(session: Session, endpoint: str, pki: Path, *vehicles: str) -> WritePermission:
-    tls = tls_of(pki, "vehicle-1")
+    tls = client_tls(pki, "vehicle-1")
     return WritePermission(session, [endpoint], tls=tls, prefix="nedbus", vehicles=lambda: set(vehicles))
 
 
@@ -429,12 +431,18 @@ def check(permission: WritePermission) -> Mapping[str, bool]:
     ids=lambda value: " ".join(map(str, value)),
 )
 def test_three_consecutive_denials_are_a_refusal(
-    endpoint: str, raw: Session, pki: Path, monkeypatch: pytest.MonkeyPatch, *, history: list[str], outcome: Outcome
+    endpoint: str,
+    zenoh_session: Session,
+    pki: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    history: list[str],
+    outcome: Outcome,
 ) -> None:
     """A vehicle is refused after three consecutive denials, until the router accepts a probe."""
     verdicts = iter(history)
     monkeypatch.setattr(f"{PERMISSION}probe_writes", lambda *_, **__: {"1": next(verdicts)})
-    permission = permission_of(raw, endpoint, pki, "1")
+    permission = permission_of(zenoh_session, endpoint, pki, "1")
     refused, pause = outcome
     assert [permission.check() for _ in history][-1] == pause
     assert permission.refused == ({} if refused is None else {"1": refused})
@@ -443,7 +451,7 @@ def test_three_consecutive_denials_are_a_refusal(
 def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timings: Timings) -> None:
     """The permissions of a service with an embedded router depend on the certificate of its uplink."""
     timings.probe = 0.5
-    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=tls_of(pki, "vehicle-1")) as session:
+    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=client_tls(pki, "vehicle-1")) as session:
         permission = permission_of(session, secure, pki, "1", "2")
         wait_for(lambda: check(permission) == {"1": False}, what="the allowed vehicle")
         wait_for(lambda: check(permission) == {"1": False, "2": True}, what="the denied vehicle")
@@ -459,7 +467,7 @@ def test_unreachable_or_open_router_is_not_a_refusal(
     shipped = file.read_text()
     file.write_text(shipped.replace("@doctor", "@probe"))
     older = open_router(config_file=file)
-    with open_client([endpoint], timeout=DEADLINE, tls=tls_of(pki, "vehicle-1")) as session:
+    with open_client([endpoint], timeout=DEADLINE, tls=client_tls(pki, "vehicle-1")) as session:
         permission = permission_of(session, endpoint, pki, "1", "2")
         assert check(permission) == {}
         older.close()

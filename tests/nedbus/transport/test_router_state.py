@@ -159,9 +159,11 @@ def test_invalid_session_limit_is_unknown(limit: object) -> None:
         assert read_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
 
 
-def test_large_and_many_state_replies_are_bounded(endpoint: str, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_and_many_state_replies_are_bounded(
+    endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A peer that pretends to be many routers, or one with a huge session list, cannot exhaust memory."""
-    (real,) = query_routers(raw, timeout=5.0)
+    (real,) = query_routers(zenoh_session, timeout=5.0)
 
     def answer(query: zenoh.Query) -> None:
         for number in range(20):
@@ -170,10 +172,10 @@ def test_large_and_many_state_replies_are_bounded(endpoint: str, raw: Session, m
 
     with open_client([endpoint], timeout=DEADLINE) as impostor:
         impostor.declare_queryable("@/*/router", answer)
-        wait_for(lambda: len(query_routers(raw, timeout=5.0)) == 21, what="the replies of the impostor")
-        assert real.zid in {state.zid for state in query_routers(raw, timeout=5.0)}
+        wait_for(lambda: len(query_routers(zenoh_session, timeout=5.0)) == 21, what="the replies of the impostor")
+        assert real.zid in {state.zid for state in query_routers(zenoh_session, timeout=5.0)}
         monkeypatch.setattr("nedbus.transport.router._MAX_ROUTERS", 5)
-        assert len(query_routers(raw, timeout=5.0)) == 5
+        assert len(query_routers(zenoh_session, timeout=5.0)) == 5
 
 
 def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None:

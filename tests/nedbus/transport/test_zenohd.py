@@ -20,7 +20,7 @@ import nedbus
 from nedbus.transport import Session, open_client
 from tests.flights.local_position import decode, encode
 from tests.flights.messages import VLP, message
-from tests.peers.certificates import flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.certificates import client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
@@ -62,7 +62,7 @@ def raw(zenohd: str) -> Iterator[Session]:
 
 def join(endpoint: str, pki: Path, name: str) -> nedbus.Bus:
     """Connect with the certificate of this name."""
-    return nedbus.connect(endpoint, tls=tls_of(pki, name), timeout=DEADLINE)
+    return nedbus.connect(endpoint, tls=client_tls(pki, name), timeout=DEADLINE)
 
 
 def start_storage(start: Start, tmp_path: Path, router: str) -> Process:
@@ -88,7 +88,9 @@ def last_messages(session: Session) -> list[int]:
     return [decode(reply.ok.payload.to_bytes()).timestamp for reply in replies if reply.ok]
 
 
-def test_storage_retains_the_last_message_of_a_vehicle(start: Start, tmp_path: Path, zenohd: str, raw: Session) -> None:
+def test_storage_retains_the_last_message_of_a_vehicle(
+    start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
+) -> None:
     """config/storage.json5 replies for a vehicle that has gone, and does not change timestamps that others receive."""
     start_storage(start, tmp_path, zenohd)
     with nedbus.connect(zenohd) as reader, open_client([zenohd], timeout=DEADLINE) as vehicle:
@@ -104,26 +106,28 @@ def test_storage_retains_the_last_message_of_a_vehicle(start: Start, tmp_path: P
             vehicle.put(f"nedbus/1/{VLP}", encode(message(number)), timestamp=stamps[-1])
             with suppress(nedbus.NoDataError):
                 received.append(subscription.receive(0.1))
-            return bool(received and last_messages(raw))
+            return bool(received and last_messages(zenoh_session))
 
         wait_for(are_received, what="the storage and the reader")
         vehicle.close()
         last = next(timestamps) - 1
-        wait_for(lambda: last_messages(raw) == [last], what="the last message")
+        wait_for(lambda: last_messages(zenoh_session) == [last], what="the last message")
         while received[-1].message.timestamp != last:
             received.append(subscription.receive(DEADLINE))
         assert {sample.stamp for sample in received} <= set(stamps)
         assert reader.vehicles() == {}
 
 
-def test_live_reply_takes_precedence_over_the_storage(start: Start, tmp_path: Path, zenohd: str, raw: Session) -> None:
+def test_live_reply_takes_precedence_over_the_storage(
+    start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
+) -> None:
     """After a restart with an earlier clock, live replies take precedence, and `get` marks stored ones."""
     start_storage(start, tmp_path, zenohd)
-    ahead = zenoh.Timestamp(raw.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
+    ahead = zenoh.Timestamp(zenoh_session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
 
     def is_stored() -> bool:
-        raw.put(f"nedbus/1/{VLP}", encode(message(99)), timestamp=ahead)
-        return last_messages(raw) == [99]
+        zenoh_session.put(f"nedbus/1/{VLP}", encode(message(99)), timestamp=ahead)
+        return last_messages(zenoh_session) == [99]
 
     wait_for(is_stored, what="the message in the storage")
     with nedbus.connect(zenohd) as reader:
@@ -189,7 +193,7 @@ def test_http_is_read_only(start: Start, secure: str, pki: Path, tmp_path: Path)
 
 def test_ros_2_bridge_requires_a_separate_router(run_nedbus: Start, secure: str, zenohd: str, pki: Path) -> None:
     """`nedbus ros2` exits at the secure router, which has no rules for ROS 2, and works with --to."""
-    flags = flags_of(pki, "reader")
+    flags = tls_options(pki, "reader")
     with join(secure, pki, "vehicle-1") as vehicle:
         vehicle.publisher(VLP, vehicle="1")
         alone = run_nedbus("ros2", "-c", secure, *flags)

@@ -1,4 +1,4 @@
-"""The incremental ULog parser: equal to pyulog on real logs, in pieces of any size, with damage and hostile formats."""
+"""Incremental ULog parser: compared with pyulog on real logs, with chunks of any size, damage and hostile formats."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
 
 
 def parse(data: bytes, *, chunk: int | None = None, verify: bool = True) -> list[Record]:
-    """Return all records of a log that is fed in pieces."""
+    """Return all records of a log that is fed in chunks."""
     parser, records = UlogParser(verify=verify), list[Record]()
     for start in range(0, len(data), chunk or len(data) or 1):
         records += parser.feed(data[start : start + (chunk or len(data))])
@@ -32,7 +32,7 @@ def parse(data: bytes, *, chunk: int | None = None, verify: bool = True) -> list
 
 
 def small_log(messages: int = 20) -> bytes:
-    """Return a log of one topic with a mark after every fifth message."""
+    """Return a log of one topic with a sync message after every fifth message."""
     writer = UlogWriter()
     writer.define([VLP])
     for number in range(messages):
@@ -55,7 +55,7 @@ def data_of(records: list[Record]) -> list[bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
 def test_real_log_equals_pyulog(path: Path) -> None:
-    """Every field of every message of logs of real PX4s is what pyulog reads, to the bit, and so are texts."""
+    """Every field of every message, and every logged string, equals what pyulog reads, bit by bit."""
     log, payloads = ULog(str(path)), defaultdict[Subscription, list[bytes]](list)
     records = parse(path.read_bytes(), chunk=65_536)
     for record in records:
@@ -83,8 +83,7 @@ def test_real_log_equals_pyulog(path: Path) -> None:
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=30), st.booleans())
-def test_pieces_of_any_size_give_the_same_records(sizes: list[int], verify: bool) -> None:
-    """The records do not depend on how the bytes are cut."""
+def test_records_do_not_depend_on_chunk_size(sizes: list[int], verify: bool) -> None:
     log, parser, records, start = small_log(), UlogParser(verify=verify), list[Record](), 0
     while start < len(log):
         size = sizes[start % len(sizes)]
@@ -94,15 +93,14 @@ def test_pieces_of_any_size_give_the_same_records(sizes: list[int], verify: bool
     assert len(data_of(records)) >= 19
 
 
-def test_single_bytes_give_the_same_records() -> None:
-    """Fed byte by byte, the records are those of the whole log."""
+def test_log_can_be_fed_byte_by_byte() -> None:
     log = small_log()
     assert text_of(parse(log, chunk=1)) == text_of(parse(log))
 
 
 @given(st.randoms(use_true_random=False), st.sampled_from(("flip", "cut", "insert")))
-def test_damage_gives_no_wrong_message(rng: random.Random, kind: str) -> None:
-    """Cut and inserted bytes cost messages, and never change one; flips change no other message than their own."""
+def test_damage_alters_no_message(rng: random.Random, kind: str) -> None:
+    """Missing and inserted bytes lose messages, but alter none; a flipped bit alters at most its own message."""
     log = small_log(60)
     whole = data_of(parse(log))
     start = rng.randrange(200, len(log) - 50)
@@ -117,16 +115,16 @@ def test_damage_gives_no_wrong_message(rng: random.Random, kind: str) -> None:
     try:
         found = data_of(parse(bytes(damaged)))
     except UlogError:
-        return  # a flag that a parser must refuse
+        return  # a flag that a parser must reject
     wrong = [each for each in found if each not in whole]
     assert len(wrong) <= (1 if kind == "flip" else 0)
-    if start > 2000:  # behind the definitions
+    if start > 2000:  # after the definitions
         assert len(found) >= len(whole) - 15 - size // 200
 
 
 @pytest.mark.parametrize("chunk", [100, 1_000_000])
-def test_sync_in_place_of_cut_bytes_is_seen(chunk: int) -> None:
-    """Where the bytes cut out of a message are the length of the sync behind it, the sync is not read as its end."""
+def test_sync_inside_message_is_detected_as_damage(chunk: int) -> None:
+    """If the bytes missing from a message are as long as the sync message after it, the sync is not read as data."""
     log = small_log(10)
     sync = log.index(bytes.fromhex("2f731320250cbb12")) - 3
     whole = data_of(parse(log))
@@ -135,8 +133,8 @@ def test_sync_in_place_of_cut_bytes_is_seen(chunk: int) -> None:
     assert len(found) == 9
 
 
-def test_nested_bomb_is_refused_at_once() -> None:
-    """A log of 200 bytes whose formats would expand to gigabytes, and a recursive one, are undecodable in no time."""
+def test_nested_format_bomb_is_rejected_quickly() -> None:
+    """Formats that are recursive, or expand to gigabytes, are rejected within a second."""
     writer = UlogWriter(system_id=None)
     for level in range(1, 7):
         writer.put("F", f"n{level}:n{level - 1}[300] a;".encode())
@@ -160,8 +158,8 @@ def test_nested_bomb_is_refused_at_once() -> None:
         ("I", b"\x0dfloat16_t abcxx"), ("M", b"\0\x0down_struct abc123"), ("P", b"\x0bint32_t abc1234more"),
     ],
 )  # fmt: skip
-def test_extensions_are_skipped(kind: str, content: bytes) -> None:
-    """Types of records and of values that a later version adds, and fields after the known ones, are no damage."""
+def test_unknown_record_types_are_skipped(kind: str, content: bytes) -> None:
+    """Record types, value types and trailing fields that a later version may add are not damage."""
     writer = UlogWriter()
     writer.define([VLP])
     for number in range(5):

@@ -23,7 +23,7 @@ from bokeh.models.widgets import Div
 
 import nedbus
 from nedbus.client import LogStreamStatus, Monitor, Sample, stream_state
-from nedbus.events import Account
+from nedbus.events import EventLog
 from nedbus.monitoring import Snapshot
 from nedbus.recording import RecordingWriter
 from nedbus.web import PageOptions, serve_live
@@ -54,8 +54,8 @@ class SimulatedFleet:
     def __init__(self) -> None:
         self.fleet = Fleet()
         self.monitor = Monitor()
-        self.account = Account()
-        self.timeline = EventTimeline(self.account)
+        self.event_log = EventLog()
+        self.timeline = EventTimeline(self.event_log)
         self.time = NOON
 
     def add(self, address: Address = WING, **fields: object) -> None:
@@ -70,7 +70,7 @@ class SimulatedFleet:
             received = other.model.model_validate({"timestamp": stamp, **known})
         sample = Sample(received, address, round(self.time * 1e9))
         self.monitor.add(sample, received=sample.received)
-        self.account.add(address, received, self.time)
+        self.event_log.add(address, received, self.time)
         self.fleet.add(sample, self.time)
 
     def fly(self, seconds: float, *addresses: Address, rate: int = 10, **fields: object) -> None:
@@ -98,8 +98,8 @@ class SimulatedFleet:
             ).name
             for address, health in healths.items()
         }
-        self.account.update(self.time, arrival, link=link, is_behind=is_behind)
-        states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
+        self.event_log.update(self.time, arrival, link=link, is_behind=is_behind)
+        states = {name: self.event_log.state(name, self.time) for name in self.event_log.vehicles}
         self.fleet.update(Snapshot(self.time, healths, publishers, link=link, behind=behind), states, logs)
         return self.fleet.snapshot
 

@@ -18,10 +18,10 @@ from nedbus.web import PageOptions
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP, message
 from tests.nedbus.web.page import flying, serving_live, write_flight
-from tests.peers.browser import PATIENCE, VEHICLE, Tab, browser, open_tabs
+from tests.peers.browser import PAGE_TIMEOUT, VEHICLE, Tab, browser, open_tabs
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
-from tests.waits import repeating, wait_for, wait_for_reader
+from tests.waits import repeating, wait_for, wait_for_matching
 
 __all__ = ["browser"]  # a fixture
 
@@ -76,7 +76,7 @@ def fly(bus: nedbus.Bus) -> Iterator[Fly]:
 
 
 def until(condition: Callable[[], object], what: str) -> None:
-    wait_for(condition, what=what, seconds=PATIENCE)
+    wait_for(condition, what=what, seconds=PAGE_TIMEOUT)
 
 
 def until_states(page: Tab, **states: str) -> None:
@@ -102,7 +102,7 @@ def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Sta
     until(lambda: "1 ok" in page.panel("head"), "the vehicle to be ok")
     assert page.page.title() == "nedbus"
     until(lambda: page.chosen == ["wing"], "the vehicle")
-    assert page.asked == {}
+    assert page.query == {}
     assert page.marks["wing"]["shape"] == "circle"
     until(lambda: len(points(page.source("valid0"), "valid0")) > 10, "the track")
     until(lambda: len(page.source("speed").get("time", ())) > 10, "the plots")
@@ -166,7 +166,7 @@ def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: st
     page.page.locator("[data-do=streams]").click()
     for width, height in SIZES:
         page.page.set_viewport_size({"width": width, "height": height})
-        wait_for_none(page.misplaced, f"{width}x{height}, {theme}")
+        wait_for_none(page.layout_problems, f"{width}x{height}, {theme}")
         wait_for_none(lambda: overlapping_labels(page), f"labels at {width}x{height}, {theme}")
         assert "uav-7" in [label[0] for label in page.labels()]
     texts = page.contrasts("head", "list", "why", "nums", "tool", "more")
@@ -209,7 +209,7 @@ def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
         return not last
 
     try:
-        wait_for(are_none, what=what, seconds=PATIENCE)
+        wait_for(are_none, what=what, seconds=PAGE_TIMEOUT)
     except AssertionError:
         pytest.fail(f"{what}: {'; '.join(last)}")
 
@@ -225,7 +225,7 @@ def overlapping_labels(page: Tab) -> list[str]:
     ] or ([] if len(labels) > 2 else ["too few labels"])
 
 
-def test_hostile_text_is_escaped(fly: Fly, tab: Open, raw: Session, endpoint: str, tmp_path: Path) -> None:
+def test_hostile_text_is_escaped(fly: Fly, tab: Open, zenoh_session: Session, endpoint: str, tmp_path: Path) -> None:
     """HTML in a peer's rejection reason or in a GeoJSON file is shown as text and creates no element."""
     field = tmp_path / f"{HOSTILE[:24].replace('/', '')}.geojson"
     line = {"type": "LineString", "coordinates": [[8.545, 47.397], [8.546, 47.398]]}
@@ -235,8 +235,8 @@ def test_hostile_text_is_escaped(fly: Fly, tab: Open, raw: Session, endpoint: st
         page = tab()
         page.open(url)
         key = Address("wing", VLP).rejected_key()
-        wait_for_reader(raw, key)
-        raw.put(key, json.dumps({"reason": HOSTILE, HOSTILE: HOSTILE}))
+        wait_for_matching(zenoh_session, key)
+        zenoh_session.put(key, json.dumps({"reason": HOSTILE, HOSTILE: HOSTILE}))
         page.wait_for_text("1 rejected")
         page.page.locator("[data-do=streams]").click()
         until(lambda: HOSTILE in page.panel("more"), "the reason")
@@ -245,7 +245,7 @@ def test_hostile_text_is_escaped(fly: Fly, tab: Open, raw: Session, endpoint: st
         page.page.get_by_placeholder("search").fill(HOSTILE)
         until(lambda: page.states == {}, "the list to be empty")
         page.page.get_by_placeholder("search").fill("")
-        raw.put(key, json.dumps({"reason": [HOSTILE]}))
+        zenoh_session.put(key, json.dumps({"reason": [HOSTILE]}))
         page.wait_for_text("2 rejected")
         assert page.page.evaluate("window.hacked") is None
         assert page.page.locator("img").count() == 0
@@ -255,7 +255,7 @@ def test_hostile_text_is_escaped(fly: Fly, tab: Open, raw: Session, endpoint: st
 # Viewers
 
 
-def test_viewers_are_independent(url: str, tab: Open, fly: Fly, raw: Session) -> None:
+def test_viewers_are_independent(url: str, tab: Open, fly: Fly, zenoh_session: Session) -> None:
     """Two pages show the same fleet; a click, tap or key selects a vehicle or a moment in that page only.
 
     Whatever a browser changes in its document, the other page is not affected, and nothing is sent to the bus.
@@ -292,17 +292,17 @@ def test_viewers_are_independent(url: str, tab: Open, fly: Fly, raw: Session) ->
     until(lambda: " to " in first.panel("why"), "the end of the condition")
     first.page.keyboard.press("p")
     first.page.get_by_text("back to now").wait_for()
-    until(lambda: set(first.asked) == {"vehicle", "time"}, "the URL")
+    until(lambda: set(first.query) == {"vehicle", "time"}, "the URL")
     third = tab(width=1280, height=800)
     third.open(first.url)
     third.page.get_by_text("back to now").wait_for()
-    until(lambda: (third.asked, third.chosen) == (first.asked, ["b"]), "the same moment")
+    until(lambda: (third.query, third.chosen) == (first.query, ["b"]), "the same moment")
     third.page.close()
     first.page.get_by_text("back to now").click()
-    until(lambda: first.asked == {"vehicle": "b"}, "the current time")
-    until(lambda: second.asked == {"vehicle": "a"}, "the other page to be unchanged")
+    until(lambda: first.query == {"vehicle": "b"}, "the current time")
+    until(lambda: second.query == {"vehicle": "a"}, "the other page to be unchanged")
     received: set[str] = set()
-    watcher = raw.declare_subscriber("**", lambda sample: received.add(str(sample.key_expr)))
+    watcher = zenoh_session.declare_subscriber("**", lambda sample: received.add(str(sample.key_expr)))
     assert second.page.evaluate(
         """() => {
           for (const model of Bokeh.documents[0].all_models) {
@@ -329,7 +329,7 @@ def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly:
     fly("wing")
     port = free_port()
     process = web(port, "-c", endpoint)
-    with open_tabs(browser, may_complain=True) as make:
+    with open_tabs(browser, allow_console_errors=True) as make:
         page = make()
         page.open(f"http://127.0.0.1:{port}")
         until_states(page, wing="ok")
@@ -338,7 +338,9 @@ def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly:
         web(port, "-c", endpoint)
         until(lambda: not page.shows("nedbus web has not responded since"), "the page to load again")
         until_states(page, wing="ok")
-        assert all("ERR_CONNECTION" in error or "WebSocket" in error or "bokeh" in error for error in page.complaints)
+        assert all(
+            "ERR_CONNECTION" in error or "WebSocket" in error or "bokeh" in error for error in page.console_errors
+        )
 
 
 # Recordings
@@ -360,7 +362,7 @@ def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_p
     page.page.get_by_text("pause", exact=True).click()
     page.page.get_by_text("play", exact=True).wait_for()
     until(lambda: len(page.marks) == 1, "the vehicle")
-    wait_for_none(page.misplaced, "the layout")
+    wait_for_none(page.layout_problems, "the layout")
 
     def seek(fraction: float) -> None:
         # The slider ignores input for 0.3 s after each click.
@@ -381,13 +383,13 @@ def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_p
     page.page.locator(".strip [data-do=event]").click()
     until(lambda: time() == pytest.approx(60, abs=0.1), "the moment of the event")
     until_states(page, wing="xy not valid")
-    until(lambda: "time" in page.asked, "the URL")
+    until(lambda: "time" in page.query, "the URL")
     page.page.get_by_text("flight.mcap").click()  # moves the focus from the button, so that keys reach the page
     for key, seconds in (("ArrowLeft", 59), ("Shift+ArrowLeft", 49), ("ArrowRight", 50), ("n", 60)):
         page.page.keyboard.press(key)
         until(lambda seconds=seconds: time() == pytest.approx(seconds, abs=0.1), key)  # type: ignore[misc]  # bound here
     page.page.locator("[data-do='focus:follow']").press("Enter")
-    until(lambda: page.asked.get("view") == "follow", "the button to be pressed by a key")
+    until(lambda: page.query.get("view") == "follow", "the button to be pressed by a key")
     other = tab(width=1280, height=800)
     other.open(page.url)
     until(lambda: other.states == {"wing": "xy not valid"}, "the same moment")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Account, Times
+from nedbus.events import EventLog, Times
 from nedbus.web.event_timeline import EventTimeline
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream
@@ -86,7 +86,7 @@ def test_slow_stream_does_not_affect_the_vehicle_state(sim: SimulatedFleet) -> N
     sim.fly(20, rate=20)
     sim.fly(3, rate=5)
     assert str(sim.view().state).startswith("slow: 5.0 Hz, usually ")
-    assert sim.vehicle().state == sim.account.state("wing", sim.time)
+    assert sim.vehicle().state == sim.event_log.state("wing", sim.time)
     assert sim.vehicle().grade == "ok"
 
 
@@ -99,11 +99,11 @@ def test_overloaded_page_reports_no_vehicle_as_silent(sim: SimulatedFleet) -> No
         sim.time += 0.5
         snapshot = sim.poll(alive=[], is_behind=True, behind="slow")
     assert {row.vehicle: row.state.text for row in snapshot.vehicles} == {"quad": "xy not valid", "wing": "ok"}
-    assert sim.account.overload is not None
+    assert sim.event_log.overload is not None
     assert not [event for event in sim.timeline.events if event.kind in ("silent", "gone")]
     sim.time += 6
     sim.poll(alive=[])
-    assert sim.account.overload is None
+    assert sim.event_log.overload is None
     assert sim.vehicle(alive=[]).state.text.startswith("gone: ")
 
 
@@ -344,16 +344,16 @@ def test_error_needs_a_common_frame(sim: SimulatedFleet) -> None:
 
 def test_formatted_time_names_its_clock() -> None:
     """Live times are UTC; in a recording UTC if known, else since boot for a single vehicle, else since its start."""
-    recorded = EventTimeline(Account(), times=Times())
+    recorded = EventTimeline(EventLog(), times=Times())
     assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_clock("1", 70.0, 10.0)
     assert recorded.format_clock(75.25) == "135.2 s since boot, 75.2 s since the start of the recording"
     recorded.times = Times(offsets={"1": NOON})
     recorded.set_clock("1", 70.0, 10.0)
     assert recorded.format_clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
-    live = EventTimeline(Account())
+    live = EventTimeline(EventLog())
     assert live.format_clock(NOON) == "22:13:20.0 UTC"
-    several = Account()
+    several = EventLog()
     for name in ("1", "2"):
         several.add(Address(name, VLP), message(1_000_000), 0.0)
     recorded = EventTimeline(several, times=Times())

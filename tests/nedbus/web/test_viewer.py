@@ -389,7 +389,7 @@ def test_text_from_peers_is_escaped(sim: SimulatedFleet) -> None:
     """Rejection reasons, link faults, titles and URL arguments are escaped wherever they are shown."""
     sim.fly(3)
     for reason in ("the first", HOSTILE):
-        sim.account.reject(WING, reason, sim.time)
+        sim.event_log.reject(WING, reason, sim.time)
         sim.fleet.reject([RejectionReport(WING, reason, round(sim.time * 1e9))])
         sim.time += 20
         sim.poll()
@@ -824,7 +824,7 @@ def open_page(endpoint: str) -> Iterator[tuple[RenderedPage, Callable[[Callable[
         reading.result()
 
 
-def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """Published vehicles are in the list and on the map, and stay there when invalid or gone."""
     fields = {**VALID, "x": 5.0}
     wing, quad = (bus.publisher(VLP, vehicle=name) for name in ("wing", "quad"))
@@ -839,7 +839,7 @@ def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, raw: Se
             quad.close()
             until(lambda: page.states == {"quad": "gone", "wing": "xy not valid"}, "the end of the other")
         assert page.marks["quad"]["shape"] == "square"
-        raw.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
+        zenoh_session.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
         page.send("streams")
         until(lambda: "<td>a rule</td>" in page.panel("more"), "the report")
         until(lambda: any("rejected: a rule" in event.text for event in page.viewer._timeline.events), "its event")
@@ -866,5 +866,5 @@ def test_page_survives_a_router_restart() -> None:
         texts = [
             event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"
         ]
-        assert texts == [f"no link to {where}", "link is back"]
+        assert texts == [f"no link to {where}", "link restored"]
     router.close()

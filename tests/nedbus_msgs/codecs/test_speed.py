@@ -87,7 +87,7 @@ def test_hot_path_is_within_its_bounds(start: Start) -> None:
     """For each flight, each form stays below its ratio to the baseline and close to the fastest flight."""
     best: dict[str, dict[str, float]] = {}
     for _ in range(6):
-        process = start("-c", PROGRAM, str(FLIGHTS), measured=False, fresh=True)
+        process = start("-c", PROGRAM, str(FLIGHTS), coverage=False, fresh=True)
         assert process.wait(100.0) == 0, process.err
         for flight, forms in json.loads(process.out).items():
             known = best.setdefault(flight, forms)

@@ -370,7 +370,7 @@ def test_new_message_needs_only_its_file(tmp_path: Path, start: Start, endpoint:
     (tmp_path / "nedbus_msgs" / "messages" / "wheel_encoders.py").write_text(WHEEL_ENCODERS)
     log = write_wheels(tmp_path / "rover.ulg", 20)
     program = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{USE_IT}"
-    process = start("-c", program, str(log), endpoint, measured=False, fresh=True)
+    process = start("-c", program, str(log), endpoint, coverage=False, fresh=True)
     assert process.wait() == 0, process.err
     assert process.out == "used 20 WheelEncoders\n"
 

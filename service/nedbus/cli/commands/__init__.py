@@ -1,1 +1,1 @@
-"""The commands, a file for each or for a family of them; `nedbus.cli.app` lists them all."""
+"""The commands, one module per command or group of related commands; `nedbus.cli.app` registers them."""

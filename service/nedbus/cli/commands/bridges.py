@@ -51,9 +51,9 @@ def web(
     background: MapOption = None,
 ) -> None:
     """Serve a web page with map, faults and plots of all vehicles."""
-    host, port = _split("--http", http)
+    host, port = _split_http("--http", http)
     for name in origin or ():
-        _split("--origin", name)
+        _split_http("--origin", name)
     selection = Selection(topic_option, vehicle, instance)
     options = page.PageOptions(host, port, tuple(origin or ()), background)
 
@@ -72,11 +72,11 @@ def web(
 
 @command
 def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464") -> None:
-    """Serve metrics for Prometheus, measured by a reader, until Ctrl-C.
+    """Serve Prometheus metrics of all streams, measured by a subscriber, until Ctrl-C.
 
-    For routers without a nedbus service; a service has its own (serve --http).
+    Use it for routers without a nedbus service; a service serves its own metrics (serve --http).
     """
-    _split("--http", http)
+    _split_http("--http", http)
     with open_bus() as bus:
         exporter = monitoring.Exporter(bus, selection, version=__version__)
         with serve_pages(http, exporter.pages):
@@ -91,7 +91,7 @@ def foxglove(
 
     Foxglove can plot every field, show poses in 3D and positions on the map.
     """
-    host, port = _split("--http", http)
+    host, port = _split_http("--http", http)
     with open_bus() as bus, bridges.FoxgloveServer(bus, host=host, port=port) as server:
         write_stderr(f"open {server.url} in Foxglove: Open connection, Foxglove WebSocket")
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
@@ -109,7 +109,7 @@ def ros2(
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
     namespace: NamespaceOption = None,
     to: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Router of ROS 2 (default: the one of nedbus)")
+        str | None, typer.Option(metavar="ENDPOINT", help="Router of ROS 2 (default: the router of nedbus)")
     ] = None,
 ) -> None:
     """Publish px4_msgs on /fmu/out/... to ROS 2 with rmw_zenoh."""
@@ -140,8 +140,8 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], monitoring.Page]]) 
         yield
 
 
-def _split(option: str, where: str) -> tuple[str, int]:
+def _split_http(option: str, address: str) -> tuple[str, int]:
     try:
-        return split_http(where)
+        return split_http(address)
     except ValueError as exc:
         raise ConfigError(option, str(exc)) from exc

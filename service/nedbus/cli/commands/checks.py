@@ -14,7 +14,7 @@ from nedbus import __version__
 from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, Sample, to_age
+from nedbus.client import Bus, Sample, format_duration
 from nedbus.doctor import check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, AccountReport, Expectation, VehicleReport, faults_of
@@ -33,12 +33,12 @@ def health(
     bus: Bus,
     *,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Require an answer of this vehicle, from any publisher")
+        str | None, typer.Option("--vehicle", "-v", help="Require a message of this vehicle, from any publisher")
     ] = None,
-    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N services, on any hosts")] = None,
+    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N services, on any host")] = None,
     max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Maximum age of the newest message")] = 3.0,
-    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="Require these vehicles, on any hosts")] = None,
-    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N vehicles, on any hosts")] = None,
+    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="Require these vehicles, on any host")] = None,
+    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N vehicles, on any host")] = None,
     valid: Annotated[str | None, typer.Option(metavar="xy,z", help="Require valid estimates: xy, z, vxy, vz")] = None,
     within: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=0.0, help="Require no bad or watch event in the last SECONDS")
@@ -49,20 +49,20 @@ def health(
 
     Otherwise exits with 1, and writes one line per fault to stderr.
 
-    By default checks the services of this host by their own reports; --services, --expect and --vehicles include other
-    hosts. --vehicle queries the vehicle itself, as any reader would. --valid and --within use the history kept by the
-    services. A vehicle that has been silent for an hour is considered switched off, not faulty.
+    By default checks the status that the services of this host report; --services, --expect and --vehicles include
+    other hosts. --vehicle queries the vehicle's publisher, as any client would. --valid and --within use the event
+    history of the services. A vehicle that has been silent for an hour is considered switched off, not faulty.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
     names = _parse_names("--expect", expect)
     for name in names:
         check_vehicle(name)
-    asked = _parse_names("--valid", valid)
-    if unknown := [each for each in asked if each not in VALID]:
+    estimates = _parse_names("--valid", valid)
+    if unknown := [each for each in estimates if each not in VALID]:
         raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
-    judged = tuple(dict.fromkeys([*names, *([vehicle] if vehicle is not None else [])]))
-    check = _Check(bus, vehicle, services, max_age, Expectation(judged, vehicles, asked, within))
+    required = tuple(dict.fromkeys([*names, *([vehicle] if vehicle is not None else [])]))
+    check = _Check(bus, vehicle, services, max_age, Expectation(required, vehicles, estimates, within))
     faults = [*check.service_faults(), *check.vehicle_faults()]
     if json_output:
         counts = {"services": len(check.services), "sources": len(check.sources), "vehicles": check.ages}
@@ -72,7 +72,7 @@ def health(
             write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
         raise NedbusError(faults[-1])
     if not json_output:
-        newest = to_age(min(check.ages.values())) if check.ages else "an unknown time"
+        newest = format_duration(min(check.ages.values())) if check.ages else "an unknown time"
         found = f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
         write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest} old")
 
@@ -85,7 +85,7 @@ def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
 
 
 class _Check:
-    """Answers of services and publishers, and the faults in them; `ages`: age of each vehicle's newest message [s]."""
+    """Replies of services and publishers, and their faults; `ages`: age of each vehicle's newest message [s]."""
 
     def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
         self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
@@ -134,7 +134,7 @@ class _Check:
             yield f"{what}{_REFUSED if self._is_refused else f': {states[:300]}' if states else ''}"
         elif self.ages and min(self.ages.values()) > self._max_age:
             name = min(self.ages, key=lambda each: self.ages[each])
-            age = to_age(self.ages[name])
+            age = format_duration(self.ages[name])
             yield f"the newest message is {age} old, from vehicle {name}: the limit is {self._max_age:g} s"
 
     def vehicle_faults(self) -> Iterator[str]:
@@ -162,9 +162,9 @@ class _Check:
             if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
                 yield fault
         if expected.valid or expected.within is not None:
-            remembering = {report.service for report in self._reports}
+            with_history = {report.service for report in self._reports}
             for service in self.services:
-                if service.service not in remembering:
+                if service.service not in with_history:
                     name = to_text(service.service, 64)
                     yield f"service {name} keeps no history of its vehicles: update nedbus there"
 
@@ -209,7 +209,7 @@ def check(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="CONFIG...",
+            metavar="CONFIG",
             help="Settings (.toml) or router files (.json5); default: the settings of serve",
             show_default=False,
         ),

@@ -39,7 +39,7 @@ def echo(
     csv_output: CsvOption = False,
     interval: Annotated[float, typer.Option(min=0.0, help="Minimum time between messages of a stream, in s")] = 0.0,
     max_rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Let the publisher downsample each stream to this rate, in Hz")
+        float | None, typer.Option(metavar="HZ", help="Downsample each stream at its publisher to this rate, in Hz")
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Stop after one message, same as --count 1")] = False,
     count: CountOption = None,
@@ -71,7 +71,7 @@ def echo(
         try:
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
-            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has got its lines
+            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has read enough
                 counts = subscription.counts
                 if csv_output or counts.lost or counts.dropped or counts.invalid or counts.discarded:
                     unread = f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"

@@ -15,7 +15,7 @@ from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
-from nedbus.client import Bus, to_age
+from nedbus.client import Bus, format_duration
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import (
     CLOCKS,
@@ -31,7 +31,7 @@ from nedbus.events import (
     verdict_of,
 )
 from nedbus.monitoring import Observer
-from nedbus.sources import FileAccount, read_account
+from nedbus.sources import FileEvents, read_file_events
 from nedbus_msgs import ANY, Selection, check_vehicle
 
 _HEAD: Final = (
@@ -61,9 +61,9 @@ def events(
 ) -> None:
     """Show vehicle events and their evidence, live or from a file.
 
-    Events: PX4's own texts; and from messages validity, dead reckoning, resets, origin, GPS, fusion, failsafe, mode,
-    arming, landing, battery, reboot, silence, loss, rejected messages and the link. The evidence of an event are
-    earlier events, up to ten seconds before, that may explain it. Live events are shown until Ctrl-C.
+    Events are PX4's own texts, and those derived from messages: validity, dead reckoning, resets, origin, GPS, fusion,
+    failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. The evidence of an
+    event is the events up to ten seconds before it that may explain it. Live events are shown until Ctrl-C.
     """
     require_one({"--json": json_output, "--csv": csv_output})
     for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):
@@ -97,16 +97,16 @@ def events(
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(files)
-    _require_vehicle(_name(files), read.account.vehicles, vehicle)
+    _require_vehicle(_name(files), read.event_log.vehicles, vehicle)
     found = select(found)
     begin({read.times.clock(event) for event in found})
     show(found, read.times)
-    vehicles = sorted(each for each in read.account.vehicles.items() if vehicle in (ANY, each[0]))
+    vehicles = sorted(each for each in read.event_log.vehicles.items() if vehicle in (ANY, each[0]))
     if texts := [f"{name}: {each.held_from_start}" for name, each in vehicles if each.held_from_start]:
         write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
-        least = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
-        write_stderr(f"{_name(files)}: no events{least} in {read.end:.0f} s")
+        limit = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
+        write_stderr(f"{_name(files)}: no events{limit} in {read.end:.0f} s")
 
 
 @command
@@ -119,15 +119,15 @@ def why(
     details: Annotated[bool, typer.Option("--all", help="Show all faults with their evidence")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Give the verdict on vehicles, live or from a file: usable or not, since when, for how long, and why.
+    """Show the verdict on each vehicle, live or from a file: usable or not, since when, for how long, and why.
 
     --all shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions
-    that were active already; and topics that would help but are missing, with a hint. Live data is the history kept by
-    nedbus services. Exits with 0, with and without faults.
+    that were already active; and missing topics that might explain it, with a hint. Live verdicts use the event history
+    of the nedbus services. Exits with 0, with and without faults.
     """
     if files:
         read, found = _read(files)
-        reports, times = [report_of(read.account, "", "", read.end, within=math.inf)], read.times
+        reports, times = [report_of(read.event_log, "", "", read.end, within=math.inf)], read.times
         where, advice = _name(files), _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
     else:
         with open_bus() as bus:
@@ -182,11 +182,11 @@ def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str)
 
 
 _LIVE_ADVICE: Final = (
-    "to publish them: PX4's dds_topics.yaml or pub.csv, a source without topics=; 'nedbus info' lists the topics"
+    "to publish them, add them to PX4's dds_topics.yaml or pub.csv, and to topics= of the source if it is set"
 )
 _ADVICE: Final = {
     ".ulg": "PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)",
-    ".mcap": "to record them: 'nedbus record' without --topic, from a source that has them",
+    ".mcap": "to record them, run 'nedbus record' without --topic while a source publishes them",
 }
 
 
@@ -203,7 +203,7 @@ def _shown(event: Event) -> str:
 
 
 def _before(event: Event, time: float) -> str:
-    return f"{_shown(event)} ({to_age(max(0.0, time - event.time))} before)"
+    return f"{_shown(event)} ({format_duration(max(0.0, time - event.time))} before)"
 
 
 def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
@@ -213,10 +213,10 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
     def show_new() -> None:
         nonlocal seen
         observer.poll()
-        new, seen = observer.account.events_since(seen)
+        new, seen = observer.event_log.events_since(seen)
         show(event.later(clock.to_utc()) for event in new)
-        known.intersection_update(observer.account.vehicles)
-        for name, each in list(observer.account.vehicles.items()):
+        known.intersection_update(observer.event_log.vehicles)
+        for name, each in list(observer.event_log.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
                 if initial := each.held_from_start:
@@ -230,13 +230,13 @@ def _name(files: Sequence[Path]) -> str:
     return ", ".join(map(str, files))
 
 
-def _read(files: Sequence[Path]) -> tuple[FileAccount, list[Event]]:
-    read = read_account(*files)
-    found, told = read.account.events_since(0)
+def _read(files: Sequence[Path]) -> tuple[FileEvents, list[Event]]:
+    read = read_file_events(*files)
+    found, total = read.event_log.events_since(0)
     for warning in read.warnings:
         write_stderr(warning)
-    if told > len(found):
-        write_stderr(f"{_name(files)}: showing the last {len(found)} of {told} events")
+    if total > len(found):
+        write_stderr(f"{_name(files)}: showing the last {len(found)} of {total} events")
     return read, sorted(found, key=lambda event: event.time)
 
 
@@ -275,12 +275,12 @@ def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
         for each in verdict.stories
     ]  # fmt: skip
     begin, end = fields([verdict.begin, verdict.end])
-    told = {"text": verdict.text, "usable": verdict.usable, "begin": begin, "end": end, "cause": fields(verdict.cause)}
-    return {"verdict": told, "faults": faults}
+    head = {"text": verdict.text, "usable": verdict.usable, "begin": begin, "end": end, "cause": fields(verdict.cause)}
+    return {"verdict": head, "faults": faults}
 
 
 def _require_vehicle(where: object, names: Collection[str], vehicle: str) -> None:
-    """Raise ConfigError if the vehicle is not among them."""
+    """Raise ConfigError if `vehicle` is neither one of `names` nor "*"."""
     if vehicle != ANY and vehicle not in names:
         check_vehicle(vehicle)
         shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"

@@ -10,7 +10,7 @@ from nedbus.cli.follow import follow
 from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, command, require_one
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import live_table
-from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, stream_state, to_age
+from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, format_duration, stream_state
 from nedbus_msgs import DOUBT_FLAGS, Address, Selection
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
@@ -75,5 +75,5 @@ def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
     rate = "-" if health.rate is None else f"{health.rate:.1f}"
     jitter = "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms"
     latencies = (None if health.rate is None else each for each in (health.latency, health.latency_max))
-    ages = ("-" if each is None else to_age(each) for each in latencies)
+    ages = ("-" if each is None else format_duration(each) for each in latencies)
     return [str(address), rate, jitter, *ages, str(health.lost), describe_stream(health, state)]

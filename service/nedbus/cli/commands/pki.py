@@ -56,7 +56,7 @@ def enroll(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder to create (default: vehicle-VEHICLE)")
     ] = None,
-    source: Annotated[list[str] | None, typer.Option("--source", "-s", help="Its sources; repeatable")] = None,
+    source: Annotated[list[str] | None, typer.Option("--source", "-s", help="Source; repeatable")] = None,
     target: Annotated[Path | None, typer.Option(help="Folder on the vehicle (default: /etc/nedbus)")] = None,
     days: DaysOption = None,
 ) -> None:
@@ -102,15 +102,15 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
 @command
 def renew(
     folder: FolderArgument,
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Default: all that are due")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all expiring soon")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
     new_key: Annotated[bool, typer.Option("--new-key", help="Create new keys, too")] = False,
     days: DaysOption = None,
 ) -> None:
-    """Renew certificates; names, hosts and keys stay the same.
+    """Renew certificates; names, hosts and keys do not change.
 
-    The old certificates stay valid until they expire.
+    The old certificates remain valid until they expire.
     """
     now = clock.now()
     entries = certificates.list_certificates(folder)
@@ -121,7 +121,7 @@ def renew(
     for entry in chosen:
         _write_paths(certificates.renew_certificate(entry, replace_key=new_key, days=days))
     if chosen:
-        write_stderr("copy these over the old ones, and restart routers: they read their certificate at start")
+        write_stderr("replace the old files with these, and restart routers: they read their certificate at start")
     else:
         write_stderr(f"no certificate expires within {within} days: 'nedbus pki list' shows all")
 
@@ -129,7 +129,7 @@ def renew(
 @command
 def rules(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Router file, such as config/router-secure.json5")],
-    vehicles: Annotated[list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Vehicle ids")] = None,
+    vehicles: Annotated[list[str] | None, typer.Argument(metavar="VEHICLE", help="Vehicle ids")] = None,
     *,
     source: Annotated[Path | None, typer.Option("--from", help="File of ids, stdin (-), or PKI folder")] = None,
     add: Annotated[bool, typer.Option("--add", help="Add these vehicles to the file's")] = False,

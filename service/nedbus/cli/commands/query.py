@@ -13,8 +13,9 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
+from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
 from nedbus.errors import AddressError, ConfigError, ConnectError
+from nedbus.events import format_duration
 from nedbus.timings import TIMINGS
 from nedbus_msgs import (
     ANY,
@@ -35,15 +36,15 @@ _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
 _SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
-_MAX_ROWS: Final = 200  # of a table, and services shown: any peer may claim to be a service
+_MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 
 @command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
-    """List published streams, the age of their last message and state.
+    """List the published streams with state and age of their last message.
 
-    Exits with 1 if the list is incomplete, as the router is too slow or refuses.
+    Exits with 1 if the list is incomplete because the router is too slow or refuses the query.
     """
     selection = Selection(ANY, vehicle)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
@@ -60,7 +61,8 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
             name, reason = (state.name, state.reason) if state else (None, "no answer")
             write(json.dumps({**asdict(address), "age": age, "state": name, "reason": reason, "stored": is_stored}))
         text = describe_stream(health, state) if health and state else "no answer"
-        rows.append([str(address), "-" if age is None else to_age(age), f"stored, {text}" if is_stored else text])
+        since = "-" if age is None else format_duration(age)
+        rows.append([str(address), since, f"stored, {text}" if is_stored else text])
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
@@ -82,7 +84,7 @@ def get(
 ) -> None:
     """Show the last message of each stream with all its fields.
 
-    Messages from a storage without a publisher are marked. Exits with 1 if no publisher answers.
+    Messages that only a storage still has are marked. Exits with 1 if no publisher answers.
     """
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
@@ -97,7 +99,7 @@ def get(
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services of the network, their sources and streams."""
+    """Show the services of the network with their sources and streams."""
     services, vehicles = bus.services(), bus.vehicles()
     if json_output:
         for service in services:
@@ -178,7 +180,7 @@ def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStat
         to_text(address),
         "-" if health.rate is None else f"{health.rate:.1f}",
         f"{health.nominal:g}" if health.nominal else "-",
-        "-" if health.age is None else to_age(health.age),
+        "-" if health.age is None else format_duration(health.age),
         str(health.messages),
         "refused by the router" if is_refused else describe_stream(health, state) + suffix,
     ]

@@ -16,7 +16,7 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
-from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
+from nedbus.sources import LiveSource, parse_source, read_file_events, source_text_of_file
 from nedbus.sources import convert as convert_messages
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
@@ -36,7 +36,7 @@ def record(
 ) -> None:
     """Record messages to an MCAP file until Ctrl-C.
 
-    A power cut costs at most the last second.
+    A power failure loses at most the last second.
     """
     notice = time.monotonic() + TIMINGS.first_sample
     with bus.subscribe_to(selection, mode="every") as subscription:
@@ -63,12 +63,12 @@ def convert(
     source: FlightArgument,
     output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Recording to write", show_default=False)],
     *,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id of a log of one vehicle")] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id, for a log of one vehicle")] = None,
     topics: Annotated[str | None, typer.Option("--topics", "-t", help='Topics, separated by commas, or "*"')] = None,
 ) -> None:
     """Convert a flight log to an MCAP recording.
 
-    Validates every message, and converts all topics of messages that nedbus knows.
+    Validates every message, and converts the topics of all declared messages unless --topics selects others.
     """
     spec = parse_source(source_text_of_file(source, vehicle=vehicle, topics=topics))
     replay = spec.open_source(vehicle="1")
@@ -116,9 +116,9 @@ def plot(
         if not streams:
             raise SourceError(str(source), "nothing to plot: the selected streams have no valid message")
         target = output or source.with_suffix(".png")
-        read = read_account(source)
-        known = (each for vehicle in read.account.vehicles.values() for each in vehicle.conditions.values())
-        events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.account.events_since(0)[0]]
+        read = read_file_events(source)
+        known = (each for vehicle in read.event_log.vehicles.values() for each in vehicle.conditions.values())
+        events = [*dict.fromkeys(each.begin for each in known if each.initial), *read.event_log.events_since(0)[0]]
         draw(streams, target, title=source.name, events=events, times=read.times)
         write(str(target))
         if flight.damaged:

@@ -31,7 +31,8 @@ _SOURCES = f"Source to publish: {_KINDS}, with ?OPTION=VALUE&...; repeatable"
 
 _LISTEN = f"Endpoint to listen on; repeatable (default: {DEFAULT_ENDPOINT})"
 ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
-JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join")]
+_JOIN = "Router to join; repeatable"
+JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_JOIN)]
 
 
 @command
@@ -45,18 +46,18 @@ def serve(
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
     prefix: PrefixOption = None,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id of sources that name none")] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id for sources without one")] = None,
     http: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve metrics, health and status on this address")
     ] = None,
-    until_done: Annotated[bool | None, typer.Option("--until-done", help="Stop when finite sources have ended")] = None,
+    until_done: Annotated[bool | None, typer.Option("--until-done", help="Exit when finite sources have ended")] = None,
     config: ConfigOption = None,
     check: Annotated[bool, typer.Option("--check", help="Check the settings and exit")] = False,
 ) -> None:
     """Run a service: publish validated messages from sources.
 
     The service runs its own router unless it joins one (--connect). SIGHUP reloads the settings: it starts new sources,
-    stops removed ones, and leaves all others running. Closing the terminal of a service stops it.
+    stops removed ones and leaves all others running. Closing the terminal stops the service.
     """
     given = {name: value for name, value in locals().items() if name not in {"config", "check"}}
     if check:

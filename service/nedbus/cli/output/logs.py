@@ -24,7 +24,7 @@ PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
 _MAX_KINDS: Final = 1000  # nedbus itself has about 40
-_MAX_TRACEBACK: Final = 20_000  # characters, the last ones: they name the error
+_MAX_TRACEBACK: Final = 20_000  # characters; the end is kept, which names the error
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
 LogFormat = Literal["text", "json"]
@@ -96,15 +96,15 @@ def about_of(record: logging.LogRecord) -> About | None:
 class _TokenBucket:
     """Token bucket of one kind of line, and the number of lines suppressed since the last report."""
 
-    filled: float
+    refilled: float
     tokens: float = BURST
-    left_out: int = 0
+    suppressed: int = 0
     first: Mapping[str, object] = field(default_factory=dict)  # not the record itself, which may keep a traceback alive
 
-    def fill(self, now: float) -> bool:
+    def refill(self, now: float) -> bool:
         """Add the tokens earned since the last call; return True if a line may be logged."""
-        self.tokens = min(BURST, self.tokens + (now - self.filled) * PER_MINUTE / 60)
-        self.filled = now
+        self.tokens = min(BURST, self.tokens + (now - self.refilled) * PER_MINUTE / 60)
+        self.refilled = now
         return self.tokens >= 1
 
 
@@ -127,7 +127,7 @@ class RateLimit(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
         now = self._now()
-        self.report(lambda bucket: bucket.fill(now))
+        self.report(lambda bucket: bucket.refill(now))
         about = about_of(record)
         event = about.event if about else None
         if event is not None and not EVENTS[event].limited:
@@ -137,14 +137,14 @@ class RateLimit(logging.Filter):
             if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
                 kind = "", None, ""  # all others
             bucket = self._buckets.setdefault(kind, _TokenBucket(now))
-            if bucket.fill(now):
+            if bucket.refill(now):
                 bucket.tokens -= 1
                 return True
-            if not bucket.left_out:
+            if not bucket.suppressed:
                 text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
                 names = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname}
                 bucket.first = {**names, "msg": text}
-            bucket.left_out += 1
+            bucket.suppressed += 1
             return False
 
     def report(self, is_due: Callable[[_TokenBucket], bool] = lambda _: True) -> None:
@@ -152,10 +152,10 @@ class RateLimit(logging.Filter):
         reports = []
         with self._lock:
             for (_, event, _), bucket in self._buckets.items():
-                if bucket.left_out and is_due(bucket):
-                    about, args = About("suppressed", count=bucket.left_out, of=event), (bucket.left_out,)
+                if bucket.suppressed and is_due(bucket):
+                    about, args = About("suppressed", count=bucket.suppressed, of=event), (bucket.suppressed,)
                     reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
-                    bucket.left_out = 0
+                    bucket.suppressed = 0
         for report in reports:
             self._handle(report)
 

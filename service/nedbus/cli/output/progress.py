@@ -45,7 +45,7 @@ class ProgressLog:
         if not self._hinted:
             self._hinted = True
             if not is_log_structured() and not self._daemon.until_done:
-                write_stderr(what_to_type(self._daemon.endpoints))
+                write_stderr(suggested_commands(self._daemon.endpoints))
         elapsed = time.monotonic() - self._reported
         if elapsed < TIMINGS.reports[min(self._reports, len(TIMINGS.reports) - 1)]:
             return
@@ -77,7 +77,7 @@ def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
         yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)
 
 
-def what_to_type(endpoints: Sequence[str]) -> str:
+def suggested_commands(endpoints: Sequence[str]) -> str:
     """Return commands to try in a second terminal; a hint if all endpoints require a client certificate."""
     plain = [each for each in endpoints if not each.startswith(("tls/", "quic/"))]
     if not plain:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from nedbus.client import Sample, to_age
+from nedbus.client import Sample, format_duration
 from nedbus.errors import ConfigError
 from nedbus.timings import TIMINGS
 from nedbus_msgs import DEFAULT, Message, message_doubts
@@ -18,7 +18,6 @@ from .table import COLUMN_GAP, fit_columns, terminal_width
 _TIMES: Final = ("timestamp", "timestamp_sample")
 _DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
-
 _MIN_PAGE: Final = 10  # minimum number of lines between two headings
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
 _ADDRESS, _POSITION, _STATE = "VEHICLE/TOPIC", f"{'X m':>7} {'Y m':>7} {'Z m':>7}", "STATE"
@@ -53,14 +52,14 @@ class Lines:
     def __init__(self) -> None:
         self._widths: dict[str, int] = {}
         self._head = ""
-        self._left = 0  # lines before the next heading
+        self._lines_left = 0  # before the next heading
 
     def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
         """Return the line of a sample, preceded by a heading if one is due."""
         width, message = terminal_width(), sample.message
         if width is None:
             return to_line(sample, fields)
-        self._left -= 1
+        self._lines_left -= 1
         if not fields and message.DEFINITION is not DEFAULT:  # no columns: as much as fits into a line
             line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
             return line if len(line) <= width else f"{line[: width - 1]}…"
@@ -75,10 +74,10 @@ class Lines:
         self._widths = {name: max(len(name), len(cell), self._widths.get(name, 0)) for name, cell in cells.items()}
         shown = fit_columns(self._widths, _OPTIONAL, width)
         head, line = self._join({name: name for name in shown}), self._join({name: cells[name] for name in shown})
-        if head == self._head and self._left >= 0:
+        if head == self._head and self._lines_left >= 0:
             return line
         self._head = head
-        self._left = max(_MIN_PAGE, shutil.get_terminal_size().lines - 1) - 2
+        self._lines_left = max(_MIN_PAGE, shutil.get_terminal_size().lines - 1) - 2
         return f"{head}\n{line}"
 
     def _join(self, cells: dict[str, str]) -> str:
@@ -107,13 +106,14 @@ def _to_summary(message: Message) -> str:
 
 def _notes(sample: Sample[Any]) -> str:
     lost = f"  [{sample.lost} lost]" if sample.lost else ""
-    old = f"  [{to_age(sample.latency)} old]" if sample.latency is not None and sample.latency > TIMINGS.old else ""
+    age = sample.latency or 0.0
+    old = f"  [{format_duration(age)} old]" if age > TIMINGS.old else ""
     return f"{old}{lost}"
 
 
 def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format these fields, or all, one per line, like `ros2 topic echo`."""
-    age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
+    age = "" if sample.latency is None else f", {format_duration(sample.latency)} old"
     source = "" if sample.source is None else f", from {sample.source}"
     stored = ", only stored" if sample.stored else ""
     missing, lines = sample.missing, [f"{sample.address}{age}{source}{stored}"]

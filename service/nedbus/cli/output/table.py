@@ -13,9 +13,9 @@ from typing import Final, Literal
 from .streams import write
 
 COLUMN_GAP: Final = "  "
-_WHOLE: Final = len("disconnected: no link")  # width of the last column for which optional ones are removed
-_FOLDED: Final = 16  # minimum width of the last column; the first one is folded for it
-_MAX_ROWS: Final = 50  # of a live table
+_LAST_WIDTH: Final = len("disconnected: no link")  # optional columns are removed to make the last one this wide
+_MIN_LAST_WIDTH: Final = 16  # the first column is folded to make the last one this wide
+_MAX_ROWS: Final = 50  # rows of a live table
 _UNLIMITED: Final = 10_000  # width if stdout is not a terminal
 
 Rows = Sequence[Sequence[str]]
@@ -63,9 +63,9 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
     shown, width = rows[:max_rows], terminal_width() or _UNLIMITED
     first, last = head[0], head[-1]
     widths = {name: max(map(len, (name, *cells))) for name, *cells in zip(head, *shown, strict=True)}
-    widths[last] = min(widths[last], _WHOLE)
+    widths[last] = min(widths[last], _LAST_WIDTH)
     kept = fit_columns(widths, optional, width)
-    widths[last] = min(widths[last], _FOLDED)
+    widths[last] = min(widths[last], _MIN_LAST_WIDTH)
     folded = (last,) if _width_of(kept, widths) <= width else (first, last)
     table = Table(box=None, pad_edge=False, padding=(0, len(COLUMN_GAP), 0, 0), header_style="")
     for name in kept:
@@ -90,7 +90,7 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
     from rich.text import Text
 
     def show(rows: Rows) -> None:
-        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # minus header and the line with the rest
+        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # minus header and the line "N more"
         text = to_table(head, rows, optional=optional, max_rows=most)
         live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 

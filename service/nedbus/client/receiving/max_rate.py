@@ -51,7 +51,7 @@ class MaxRateQueue(PendingQueue):
                 stream = self._stream(self._rate_key(arrival[0].address))
                 if arrival[1] and stream.gate is None and stream.last_sent == -math.inf:
                     stream.last_sent = _sent(arrival)
-                    self.account.delivered.append(detach(arrival, retained=True))
+                    self.counters.delivered.append(detach(arrival, retained=True))
             super()._queue()
         self.wake()
 
@@ -65,7 +65,7 @@ class MaxRateQueue(PendingQueue):
         return address.rate_key(self.rate, prefix=self.decoder.prefix)
 
     def _queue(self) -> int:
-        self.account.delivered = [arrival for arrival in self.account.delivered if self._passes(arrival)]
+        self.counters.delivered = [arrival for arrival in self.counters.delivered if self._passes(arrival)]
         return super()._queue()
 
     def _passes(self, arrival: Arrival) -> bool:

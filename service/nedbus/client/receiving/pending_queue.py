@@ -26,7 +26,7 @@ from nedbus.transport import RawSample, entity_name
 from nedbus_msgs import AddressError, DecodeError, identity_of
 
 from .decoder import WAKE_UP, Arrival, Decoder, KeyState, detach, encoding_of, mark_retained
-from .writer_proxy import NUMBERS, Account, WriterProxy
+from .writer_proxy import NUMBERS, LossCounters, WriterProxy
 
 if TYPE_CHECKING:
     from .batch import Batch
@@ -91,7 +91,7 @@ class PendingQueue:
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None  # wakes a reader on an event loop; called on any thread
         self.name = name
-        self.account = Account()
+        self.counters = LossCounters()
         self._warned: set[str] = set()
         self.decoder = decoder
         self._clock = clock
@@ -109,8 +109,8 @@ class PendingQueue:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far, and forgotten keys."""
         with self._lock:
-            of, invalid = self.account, self.decoder.invalid
-            return Counts(self._received, of.lost, of.dropped, invalid, of.discarded, of.forgotten)
+            own, invalid = self.counters, self.decoder.invalid
+            return Counts(self._received, own.lost, own.dropped, invalid, own.discarded, own.forgotten)
 
     @property
     def waiting(self) -> int:
@@ -123,9 +123,9 @@ class PendingQueue:
         `overflowed`: the ring was full; gaps in this batch count as dropped and are not requested again.
         """
         with self._lock:
-            opened = self.account.opened
+            opened = self.counters.opened
             self._accept(self._admit(batch), overflowed=overflowed)
-            has_gap = self.account.opened > opened
+            has_gap = self.counters.opened > opened
         if has_gap and self.on_gap is not None:
             self.on_gap()
         if self._tokens.empty():  # as `wake` does
@@ -141,7 +141,7 @@ class PendingQueue:
         """Handle a link that broke or came back."""
         with self._lock:
             self._settling_until = self._clock() + _SETTLING
-            for writer in self.account.requesting:
+            for writer in self.counters.requesting:
                 writer.unresponsive = False  # perhaps the link was down
 
     def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
@@ -150,7 +150,7 @@ class PendingQueue:
             stream = self._stream(key)
             stream.heard = self._clock()
             writer = stream.writers.get(publisher)
-            if writer is None and len(self.account.requesting) < MAX_KEYS:
+            if writer is None and len(self.counters.requesting) < MAX_KEYS:
                 writer = self._add_writer(stream, publisher, 0 if self._settling else number, history_end=number + 1)
             if writer is not None:
                 writer.on_heartbeat(number)
@@ -172,8 +172,8 @@ class PendingQueue:
     def give_up(self, max_held: int = -1) -> None:
         """Count gaps as lost, largest reorder buffers first, until `max_held` messages are held back; -1: all gaps."""
         with self._lock:
-            for writer in sorted(self.account.requesting, key=lambda writer: -len(writer.held)):
-                if self.account.held > max_held:
+            for writer in sorted(self.counters.requesting, key=lambda writer: -len(writer.held)):
+                if self.counters.held > max_held:
                     writer.give_up()
             self._queue()
 
@@ -322,7 +322,7 @@ class PendingQueue:
             stream.writers.clear()
             stream.writer = None
             if since >= now - MAX_SILENCE:
-                self.account.forgotten += 1
+                self.counters.forgotten += 1
                 text = "those silent longest are forgotten, and their next gap is not counted"
                 self._warn_once(f"more than {MAX_KEYS:,} keys: {text}")
 
@@ -356,11 +356,11 @@ class PendingQueue:
     def _accept(self, arrivals: list[Arrival], *, overflowed: bool) -> None:
         """Order arrivals, count gaps and queue what can be delivered; `overflowed`: the ring was full."""
         if len(arrivals) >= _MIN_IN_ORDER and self._are_in_order(arrivals):
-            self.account.delivered += arrivals
+            self.counters.delivered += arrivals
             self._queue()
             return
         now, recovers = self._clock(), not (self.newest_only or overflowed)
-        delivered = self.account.delivered
+        delivered = self.counters.delivered
         for admitted in arrivals:
             stream, payload, raw, _, _ = arrival = admitted
             stream.heard = now
@@ -387,7 +387,7 @@ class PendingQueue:
                 delivered.append(arrival)
             else:
                 writer.on_sample(number, arrival, recovers=recovers, overflowed=overflowed)
-        if self.account.held > MAX_HELD:
+        if self.counters.held > MAX_HELD:
             self.give_up(MAX_HELD)
         self._queue()
 
@@ -417,20 +417,20 @@ class PendingQueue:
             if first is None:
                 return None
             del stream.writers[first.name]
-        writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, history_end=history_end)
+        writer = stream.writers[name] = WriterProxy(stream, name, expected, self.counters, history_end=history_end)
         return writer
 
     # Unread messages
 
     def _queue(self) -> int:
         """Queue the delivered messages, dropping superseded and, beyond the capacity, old ones; return their number."""
-        arrivals, self.account.delivered = self.account.delivered, []
+        arrivals, self.counters.delivered = self.counters.delivered, []
         self._arrived += len(arrivals)
         if self.newest_only:
             for arrival in arrivals:
                 stream, payload, raw, lost, received = arrival
                 if (waiting := self._newest.get(stream.key)) is not None:
-                    self.account.dropped += 1
+                    self.counters.dropped += 1
                     self._newest[stream.key] = stream, payload, raw, lost + waiting[3], received
                     continue
                 if len(self._newest) >= MAX_KEYS:
@@ -447,7 +447,7 @@ class PendingQueue:
     def _drop(self, arrival: Arrival) -> None:
         stream, _, _, lost, _ = arrival
         stream.unreported += lost
-        self.account.dropped += 1
+        self.counters.dropped += 1
 
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:

@@ -57,7 +57,7 @@ class Retransmission:
         for writer, answers in list(self._open.items()):
             recovered_key = self._take_answers(writer, answers, now) or recovered_key
         if self._queue.waiting <= _MAX_WAITING:
-            for writer in list(self._queue.account.requesting):  # copied: other threads add to it
+            for writer in list(self._queue.counters.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
                 if writer in self._open or not self._has_room(writer):

@@ -24,7 +24,7 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the las
 
 
 @dataclass(slots=True, eq=False)
-class Account:
+class LossCounters:
     """Counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
 
     lost: int = 0
@@ -59,7 +59,7 @@ class WriterProxy:
     stream: KeyState
     name: str  # `zid` and `eid` combined
     expected: int  # the next number
-    account: Account
+    counters: LossCounters
     zid: object = None  # this and the next are set by the first message
     eid: int | None = None
     history_end: int = 0  # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
@@ -76,7 +76,7 @@ class WriterProxy:
         step = (number - self.expected) % NUMBERS
         if step > MAX_GAP:
             if NUMBERS - step <= _MAX_REORDERED:
-                self.account.discarded += 1
+                self.counters.discarded += 1
                 return
             self.give_up()
             self.expected = number
@@ -109,7 +109,7 @@ class WriterProxy:
         if request.deadline is None:
             request.deadline = now if self.unresponsive else now + TIMINGS.retransmit_timeout
         request.attempts += 1
-        self.account.requesting[self] = self.account.requesting.pop(self)
+        self.counters.requesting[self] = self.counters.requesting.pop(self)
         request.requested = range(max(self.expected, last - MAX_REPLIES + 1), last + 1)
         return request.requested
 
@@ -165,25 +165,25 @@ class WriterProxy:
 
     def _hold(self, number: int, arrival: Arrival) -> None:
         if number in self.held:
-            self.account.discarded += 1
+            self.counters.discarded += 1
         else:
             self.held[number] = detach(arrival)
-            self.account.held += 1
+            self.counters.held += 1
 
     def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
-            self.account.requesting[self] = None
-            self.account.opened += 1
+            self.counters.requesting[self] = None
+            self.counters.opened += 1
         self.request.stop = max(self.request.stop, stop)
 
     def _count_gap(self, number: int, *, overflowed: bool = False) -> None:
         certain = max(self.expected, min(self.history_end, number))
         lost = (number - certain) % NUMBERS
         if overflowed:
-            self.account.dropped += lost
+            self.counters.dropped += lost
         else:
-            self.account.lost += lost
+            self.counters.lost += lost
             self.stream.gap += lost
         self.expected = number
 
@@ -192,7 +192,7 @@ class WriterProxy:
         self.history_end = 0
         stream, payload, raw, _, received = arrival
         if payload:
-            self.account.delivered.append((stream, payload, raw, stream.gap, received))
+            self.counters.delivered.append((stream, payload, raw, stream.gap, received))
             stream.gap = 0
 
     def _release(self) -> None:
@@ -200,9 +200,9 @@ class WriterProxy:
         if request is None:
             return
         while (arrival := self.held.pop(self.expected, None)) is not None:
-            self.account.held -= 1
+            self.counters.held -= 1
             self._deliver(arrival)
             request.deadline, request.attempts = None, 0
         if self.expected >= request.stop:
             self.request = None
-            del self.account.requesting[self]
+            del self.counters.requesting[self]

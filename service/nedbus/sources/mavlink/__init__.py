@@ -1,1 +1,1 @@
-"""Vehicles that speak MAVLink: `mavlink:`, over UDP, TCP or a serial port."""
+"""MAVLink vehicles: `mavlink:`, over UDP, TCP or a serial port."""

@@ -1,4 +1,4 @@
-"""Conversion of single MAVLink messages to fields of PX4's messages, without unknown values."""
+"""Conversion of individual MAVLink messages to fields of PX4's messages; unknown values are None."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ _FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: sta
 _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
-_MAX_DELAY: Final = 1000  # ms that a datagram may be late; an older one means a reboot
+_MAX_DELAY: Final = 1000  # ms by which a late datagram may be older; more means a reboot
 
 
 def is_reboot(time_boot_ms: int, newest: int | None) -> bool:
@@ -26,7 +26,7 @@ def _number(value: int, unit: float, *unknown: int) -> float | None:
 
 
 def _home(message: Any) -> dict[str, object]:
-    """Return the home position, which is sent only with a valid global position."""
+    """Convert HOME_POSITION, which PX4 sends only with a valid global position."""
     angles = quaternion_to_euler(message.q) if math.isfinite(sum(message.q)) else (None,) * 3
     local = (each if math.isfinite(each) else None for each in (message.x, message.y, message.z))
     return {
@@ -38,7 +38,7 @@ def _home(message: Any) -> dict[str, object]:
 
 def _gps(message: Any) -> dict[str, object]:
     if message.satellites_visible == 255 and message.fix_type < 2:
-        return {"fix_type": message.fix_type}  # no receiver, or a silent one
+        return {"fix_type": message.fix_type}  # no GPS receiver, or no data from it
     course = _number(message.cog, 100, _U16)
     heading = _number(message.yaw, 100, 0, _U16)
     return {
@@ -55,7 +55,7 @@ def _gps(message: Any) -> dict[str, object]:
 
 
 def _status(message: Any) -> dict[str, object]:
-    """Return the state in a heartbeat, without nav_state: custom_mode is not the same."""
+    """Convert HEARTBEAT, without nav_state, which custom_mode does not contain."""
     model = MESSAGES["VehicleStatus"].model
     is_armed = message.base_mode & _ARMED
     return {
@@ -67,7 +67,7 @@ def _status(message: Any) -> dict[str, object]:
 
 
 def _battery(message: Any) -> dict[str, object]:
-    """Return the state of a battery without its cells: if they are not measured, the first one holds the total."""
+    """Convert BATTERY_STATUS, without cell voltages: if they are not measured, the first one is the total."""
     cells = [each for each in message.voltages if each != _U16]
     cells += [each for each in message.voltages_ext if each not in (0, _U16)]
     return {
@@ -80,7 +80,7 @@ def _battery(message: Any) -> dict[str, object]:
 
 
 def _odometry(message: Any) -> dict[str, object]:
-    """Return the pose and the velocity, each only if PX4 has its frame."""
+    """Convert ODOMETRY; pose and velocity only in frames that PX4 has, too."""
     pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
     of_pose = {
         "pose_frame": pose, "position": (message.x, message.y, message.z), "q": tuple(message.q),
@@ -119,4 +119,4 @@ CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]]
     "HEARTBEAT": ("vehicle_status", _status),
     "BATTERY_STATUS": ("battery_status", _battery),
 }
-"""Topic and conversion function of each MAVLink message; None in the returned fields means unknown."""
+"""Topic and conversion function of each MAVLink message."""

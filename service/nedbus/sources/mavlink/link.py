@@ -1,4 +1,4 @@
-"""Links to MAVLink vehicles: UDP, TCP or a serial port; and their senders: autopilots, others, two with one id."""
+"""Links to MAVLink vehicles over UDP, TCP or a serial port, and checks of sender ids."""
 
 import os
 import re
@@ -12,20 +12,20 @@ from typing import Any, Final
 from nedbus.errors import ConfigError, SourceError
 
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
-Peer = Any  # address of the other side, as its socket has it
+Peer = Any  # remote address, as returned by the socket
 
-_CHANGES: Final = 5  # of the address within the window; a reconnect is one, and a packet that overtakes two more
+_CHANGES: Final = 5  # address changes within the window; a reconnect causes one, and a reordered packet two more
 _WINDOW: Final = 5.0  # s
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
-_RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: Linux's own holds 277 small datagrams
+_RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 
 
 class _UdpLink:
-    """A UDP socket; `peer` is None if the other side has to send first."""
+    """A UDP socket; `peer` is None if it listens."""
 
     stream = False
 
@@ -47,18 +47,18 @@ class _UdpLink:
         """Yield received datagrams with their senders; wait up to `timeout` seconds for the first."""
         if not _is_ready(self._socket, timeout):
             return
-        with suppress(BlockingIOError, ConnectionError):  # the other side is not listening yet
+        with suppress(BlockingIOError, ConnectionError):  # the peer is not listening yet
             for _ in range(_MAX_DATAGRAMS):
                 yield self._socket.recvfrom(_MAX_READ)
 
     def send(self, data: bytes, peer: Peer) -> None:
         """Send without blocking; drop the data if that fails."""
-        with suppress(OSError):  # a lost route comes back, or the vehicle times out
+        with suppress(OSError):  # a temporary loss; otherwise the vehicle times out
             self._socket.sendto(data, peer)
 
 
 class _StreamLink:
-    """A TCP connection or a serial port; messages may arrive in pieces."""
+    """A TCP connection or a serial port; a read may return a partial message."""
 
     stream = True
 
@@ -72,7 +72,7 @@ class _StreamLink:
         if _is_ready(self._file, timeout):
             data = self._file.read(_MAX_READ)
             if not data:
-                raise ConnectionResetError(None, "the other side closed the connection")
+                raise ConnectionResetError(None, "the peer closed the connection")
             yield data, self.peer
 
     def send(self, data: bytes, _: Peer) -> None:
@@ -102,7 +102,7 @@ def open_link(text: str, *, baud: int) -> Link:
             return _StreamLink(Serial(host, baud, timeout=0, write_timeout=1.0), host)
         if kind == "tcp":
             with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
-                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps it open
+                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps the socket open
         return _UdpLink(host, port, listens=kind == "udpin")
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
@@ -117,22 +117,22 @@ def _is_ready(file: Any, timeout: float) -> bool:
     return bool(poll.poll(timeout * 1000))
 
 
-def why_ignored(system: int, component: int) -> str:
-    """Return the reason why the messages of a sender are ignored, "" for those of an autopilot."""
+def ignore_reason(system: int, component: int) -> str:
+    """Return why the messages of a sender are ignored; "" for an autopilot."""
     if not (system and component):
-        return "id 0 addresses all and is no sender's; an autopilot has system id 1 to 255 and component id 1"
+        return "id 0 is for broadcast only; an autopilot has system id 1 to 255 and component id 1"
     return "" if component == AUTOPILOT else f"not an autopilot, which has component id {AUTOPILOT}"
 
 
-class Senders:
-    """Finds system ids that two senders use, as their messages come from both addresses in turn."""
+class DuplicateIds:
+    """Detects system ids with two senders, whose messages arrive from two addresses in turn."""
 
     def __init__(self) -> None:
         self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(lambda: deque(maxlen=_CHANGES))
         self._found: set[int] = set()
 
     def add(self, system: int, peer: Peer, now: float) -> str:
-        """Add a message at monotonic time `now` [s]; return a description of two senders, once for each system."""
+        """Add a message at monotonic time `now` [s]; return a description of two senders, once per system."""
         changes = self._changes[system]
         if changes and changes[-1][0] == peer:
             return ""

@@ -1,4 +1,4 @@
-"""Client of one vehicle's ULog stream, a state machine: events in, commands out; no I/O, times of the caller [s]."""
+"""State machine for one vehicle's ULog stream: events in, commands out; no I/O, callers pass the time [s]."""
 
 import math
 from collections.abc import Mapping, Set
@@ -10,12 +10,12 @@ from nedbus.timings import TIMINGS
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
 
-_TRIES: Final = 3  # of a command without an answer
-_RESTARTS: Final = 2  # after a START that was accepted without data
-_JUDGED: Final = 32  # messages of a header after which its duration is estimated
-_EXPECTED: Final = 400  # messages of a header; 274 to 410 were seen
-_STOP_TAIL: Final = 10  # LOGGING_DATA_ACKED in a row, after which silence is a STOP; PX4 sends 44, else 2 at most
-_DECAY: Final = 0.98  # of the longest interval between messages, with each message
+_TRIES: Final = 3  # per unanswered command
+_RESTARTS: Final = 2  # after START was accepted, but no data arrived
+_ESTIMATED: Final = 32  # messages of a header after which its duration is estimated
+_EXPECTED: Final = 400  # messages of a header; 274 to 410 were measured
+_STOP_TAIL: Final = 10  # LOGGING_DATA_ACKED in a row; silence after them means STOP. PX4 sends 44 then, else at most 2
+_DECAY: Final = 0.98  # per message, of the longest interval between messages
 
 
 LogReason = Literal[
@@ -31,8 +31,8 @@ _TEXTS: Final[Mapping[LogReason, str]] = {
     " option -r of `mavlink start`",
     "unsupported": "PX4 does not support the ULog stream on this link; update its firmware",
     "failed": "PX4 answered MAV_CMD_LOGGING_START with {}",
-    "no_answer": "PX4 does not answer MAV_CMD_LOGGING_START: its logger does not run; set SDLOG_BACKEND to 3 and reboot"
-    " the vehicle",
+    "no_answer": "PX4 does not answer MAV_CMD_LOGGING_START: its logger is not running; set SDLOG_BACKEND to 3 and"
+    " reboot the vehicle",
     "no_data": "PX4 accepted MAV_CMD_LOGGING_START, but sends no data: another link may have the stream; stop it there,"
     " or reboot the vehicle",
     "slow_link": "the header of the ULog stream would take {:.0f} s, at {:.0f} ms for each acknowledged message, and"
@@ -55,8 +55,8 @@ LogState = Literal[
 class LogStatus(NamedTuple):
     """State of the stream, its cause, and a text for the log.
 
-    `idle`: before the first heartbeat. `starting`: commands are under way. `header`, `streaming`: data arrive.
-    `waiting_for_disarm`, `refused`, `ended`: START is sent again when it may be. `stopping`, `stopped`: by `stop`.
+    `idle`: before the first heartbeat. `starting`: a command is pending. `header`, `streaming`: data arrives.
+    `waiting_for_disarm`, `refused`, `ended`: START is retried when allowed. `stopping`, `stopped`: after `stop`.
     """
 
     state: LogState
@@ -72,15 +72,15 @@ class Command(NamedTuple):
 
 
 class LogStreamClient:
-    """Requests the stream, acknowledges it, and notices its end, which PX4 does not announce.
+    """Requests the stream, acknowledges it, and detects its end, which PX4 does not announce.
 
     Pass every event to its method, call `tick` several times a second, and send the returned commands at once.
     Log `status` when it changes; repeated attempts with the same outcome do not change it.
 
     `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
-    Without "take", a rejected client stops only a stream that arrives for its own ids: that of an earlier process.
+    Without "take", a rejected client stops only a stream addressed to its own ids: that of an earlier process.
     `system`, `component`: the MAVLink ids of this client.
-    `header_seconds`: duration of the last header; None before its end.
+    `header_seconds`: duration of the last header; None until it is complete.
     """
 
     def __init__(self, log: Set[Literal["1", "armed", "take"]], *, system: int, component: int) -> None:
@@ -93,13 +93,13 @@ class LogStreamClient:
     def _reset(self) -> None:
         self.status = LogStatus("idle")
         self._awaited: Literal["start", "stop", "data"] | None = None
-        self._due = 0.0  # end of that wait, or else time of the next START
+        self._due = 0.0  # timeout of that wait, or else time of the next START
         self._tries = self._restarts = 0
-        self._asked = self._took_over = False
+        self._has_sent_command = self._took_over = False
         self._has_header = False  # of the current stream, at least in part: its data can be decoded
         self._header_messages = self._acked_in_row = 0
-        self._header_start = self._interval = 0.0  # `_interval`: the longest of late
-        self._header_pause = 0.0  # the longest in the header: one burst of losses says nothing about the round trip
+        self._header_start = self._interval = 0.0  # `_interval`: the longest recent one
+        self._header_pause = 0.0  # longest in the header; excluded from the round trip, as it may be a burst of losses
         self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 
@@ -110,24 +110,24 @@ class LogStreamClient:
             self._owner = f"system {target_system} component {target_component}"
             if self.status.reason == "taken":
                 self.status = self.status._replace(text=_TEXTS["taken"].format(self._owner))
-        return self._asked and is_for_us
+        return self._has_sent_command and is_for_us
 
     def on_heartbeat(self, autopilot: int, now: float, *, armed: bool) -> list[Command]:
-        """Take a HEARTBEAT of the autopilot: MAV_AUTOPILOT, and whether base_mode is armed."""
+        """Handle a HEARTBEAT of the autopilot; `autopilot`: MAV_AUTOPILOT."""
         self._is_px4, self._armed, self._last_heartbeat = autopilot == dialect.MAV_AUTOPILOT_PX4, armed, now
         if not self._is_px4 and self.status.state == "idle":
             self._enter("refused", "not_px4", now, _name("MAV_AUTOPILOT", autopilot))
         elif self.status.reason == "link_lost":
-            self._resume(now)  # PX4 streams on without a client
+            self._resume(now)  # PX4 continues to stream without a client
         return self.tick(now)
 
     def on_reboot(self) -> None:
-        """Take a reboot of the vehicle: its stream is gone."""
+        """Handle a reboot of the vehicle, which ends the stream."""
         if self.status.state not in ("stopping", "stopped"):
             self._reset()
 
     def on_data(self, sequence: int, now: float, *, acked: bool, begins: bool) -> list[Command]:
-        """Take a message that `accepts` accepted; `acked`: LOGGING_DATA_ACKED; `begins`: `Piece.begins`."""
+        """Handle a message that `accepts` accepted; `acked`: LOGGING_DATA_ACKED; `begins`: `Chunk.begins`."""
         state, reason, _ = self.status
         is_new, self._sequence = sequence != self._sequence, sequence
         self._interval = max(now - self._last_data, _DECAY * self._interval)
@@ -148,7 +148,7 @@ class LogStreamClient:
         elif state == "header" and is_new:
             self._header_pause = max(now - self._last_acked, self._header_pause)
             self._last_acked, self._header_messages = now, self._header_messages + 1
-            return self._judge_link(now) or commands
+            return self._check_header(now) or commands
         elif state in ("refused", "ended") and self._has_header:
             self._awaited = None
             self._enter("streaming", None, now)
@@ -159,8 +159,8 @@ class LogStreamClient:
     def on_command_ack(
         self, command: int, result: int, target_system: int, target_component: int, now: float
     ) -> list[Command]:
-        """Take a COMMAND_ACK of the autopilot; others than those to this client's commands are ignored."""
-        is_for_us = (target_system, target_component) in (self._ids, (0, 0))  # zeros: without ids
+        """Handle a COMMAND_ACK of the autopilot; ignore it unless it answers this client's command."""
+        is_for_us = (target_system, target_component) in (self._ids, (0, 0))  # 0, 0: without target ids
         if not is_for_us or self._awaited is None or command != COMMANDS.get(self._awaited):
             return []
         if result == dialect.MAV_RESULT_IN_PROGRESS:
@@ -193,7 +193,7 @@ class LogStreamClient:
         return []
 
     def stop(self, now: float) -> list[Command]:
-        """End this client's stream; go on with `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
+        """End this client's stream; call `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
         is_ours = self.status.state in ("header", "streaming") or self._awaited == "data"
         self._enter("stopping" if is_ours or self._awaited else "stopped", None, now)
         return self._send("stop", now) if is_ours else []
@@ -212,7 +212,7 @@ class LogStreamClient:
             self._due = now + (TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0)
 
     def _send(self, kind: Literal["start", "stop"], now: float, *, tries: int = 0) -> list[Command]:
-        self._awaited, self._tries, self._asked = kind, tries + 1, True
+        self._awaited, self._tries, self._has_sent_command = kind, tries + 1, True
         self._due = now + TIMINGS.log_answer * (2**tries if kind == "start" else 1)
         return [Command(kind)]
 
@@ -233,7 +233,7 @@ class LogStreamClient:
         return self._restart(now)
 
     def _resume(self, now: float) -> None:
-        """Consider a silent stream alive, until `_check_silence` finds that it is not."""
+        """Assume that a silent stream continues, until `_check_silence` finds that it does not."""
         self._last_data, self._acked_in_row = now, 0
         self._enter("streaming", None, now)
 
@@ -241,12 +241,12 @@ class LogStreamClient:
         self.header_seconds, self._acked_in_row = self._last_acked - self._header_start, 0
         self._enter("streaming", None, now)
 
-    def _judge_link(self, now: float) -> list[Command]:
-        """Stop a stream whose header takes too long, or would."""
+    def _check_header(self, now: float) -> list[Command]:
+        """Stop a stream whose header takes too long, or is expected to."""
         elapsed, count = now - self._header_start, self._header_messages
         round_trip = (elapsed - self._header_pause) / max(1, count - 2)
         expected = elapsed + round_trip * max(0, _EXPECTED - count)
-        if (expected if count >= _JUDGED else elapsed) <= TIMINGS.log_header:
+        if (expected if count >= _ESTIMATED else elapsed) <= TIMINGS.log_header:
             return []
         self._has_header = False
         self._enter("refused", "slow_link", now, expected, 1e3 * round_trip)
@@ -259,17 +259,17 @@ class LogStreamClient:
                 return self._send("stop", now)
             if state in ("header", "streaming"):
                 self._enter("starting", "silent", now, now - self._last_data)
-            elif self.status.reason != "no_data":  # whose attempts go on
+            elif self.status.reason != "no_data":  # which is kept while START is retried
                 self._enter("starting", None, now)
             self._awaited, self._has_header, self._due = "data", False, now + TIMINGS.log_answer
         elif state == "stopping":
             self._enter("stopped", None, now)
-        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:  # the stream exists: it is slow
+        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:  # the stream exists, but is slow
             if state == "header":
                 self._end_header(now)
             elif state != "streaming":
                 self._resume(now)
-            self._due = now + self._patience()
+            self._due = now + self._silence_limit()
         elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and "take" in self._log and not self._took_over:
             return self._take_over(now)
         else:
@@ -283,7 +283,7 @@ class LogStreamClient:
             if is_repeated:
                 return self._send("stop", now, tries=self._tries)
             self._end_stop(now)
-        elif state == "stopping":  # START was not answered: there is nothing to stop
+        elif state == "stopping":  # START was not answered: no stream to stop
             self._enter("stopped", None, now)
         elif awaited == "data" and not is_lost:
             self._restarts += 1
@@ -302,28 +302,28 @@ class LogStreamClient:
             self._enter("refused", "no_answer", now)
         return []
 
-    def _patience(self) -> float:
+    def _silence_limit(self) -> float:
         """Return the silence after which the stream may have ended [s]."""
         return min(max(TIMINGS.log_silence, 3 * self._interval), TIMINGS.log_longest_silence / 2)
 
     def _check_silence(self, now: float) -> list[Command]:
-        """Ask for a silent stream with START: PX4 rejects it and goes on, or begins a new stream."""
-        state, patience = self.status.state, self._patience()
+        """Probe a silent stream with START: PX4 rejects it and continues, or begins a new stream."""
+        state, limit = self.status.state, self._silence_limit()
         silence, since_acked = now - self._last_data, now - self._last_acked
         if state == "header" and since_acked > TIMINGS.log_timeout and since_acked - silence > TIMINGS.log_silence:
-            self._has_header = False  # only repetitions arrived
+            self._has_header = False  # only retransmissions arrived
             self._enter("ended", "stalled", now, since_acked)
         elif state == "streaming" and self._acked_in_row >= _STOP_TAIL and silence > TIMINGS.log_silence:
             self._has_header = False
             self._enter("ended", "stopped_elsewhere", now)
         elif not self._may_start():
-            if silence > max(TIMINGS.log_timeout, 2 * patience):
+            if silence > max(TIMINGS.log_timeout, 2 * limit):
                 self._enter("ended", "silent", now, silence)
                 self._due = now
         elif silence > TIMINGS.log_longest_silence:
             self._has_header = False
             self._enter("refused", "taken", now)
-        elif silence > patience and self._last_heartbeat > self._last_data and now >= self._due:
+        elif silence > limit and self._last_heartbeat > self._last_data and now >= self._due:
             return self._send("start", now)
         return []
 

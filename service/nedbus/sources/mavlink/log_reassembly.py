@@ -7,27 +7,27 @@ _MAGIC: Final = b"ULog\x01\x12\x35"  # the first bytes of a ULog file
 _MAX_LENGTH: Final = 249  # bytes of `data` in a message
 _NO_RECORD_BEGINS: Final = 255  # first_message_offset
 _MODULUS: Final = 2**16  # of the sequence
-_MAX_STEP: Final = 2**15  # a larger step of the sequence is a duplicate
-_OLD_RUN: Final = 256  # consecutive old sequence numbers after which the sequence is taken to have moved on unseen
+_MAX_STEP: Final = 2**15  # a larger sequence step means a duplicate
+_OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _MAX_STEP
 
 Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
-"""Use of a message.
+"""Classification of a message.
 
-`delivered`: its bytes, or those from its first record on after a gap, are in the stream.
-`duplicate`: repeated, or late: a late one was counted as lost, and its bytes are not used.
+`delivered`: its bytes are part of the stream; after a gap, those from its first record on.
+`duplicate`: retransmitted or late; a late one was counted as lost, and its bytes are discarded.
 `malformed`: `length` is above 249, or first_message_offset beyond the data; the gap that it leaves is counted as lost.
 `unsynchronised`: no record begins in it, after a gap.
-`no_definitions`: its stream was joined in the middle, so it cannot be decoded; losses of that stream are not counted.
+`no_definitions`: the stream was joined midway, so it cannot be decoded; its losses are not counted.
 """
 
 
-class Piece(NamedTuple):
-    """Result of one message.
+class Chunk(NamedTuple):
+    """Result of one LOGGING_DATA or LOGGING_DATA_ACKED.
 
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
     `begins`: a new stream begins with `data`: it needs a new parser.
-    `lost`: number of messages lost before this one: the parser discards its incomplete record, before it takes `data`.
-    It is exact unless 65,536 or more are lost in one gap: a lower bound then.
+    `lost`: number of messages lost before this one: the parser must discard its partial record before `data`. It is
+    exact for gaps of less than 65,536 messages, and a lower bound otherwise.
     """
 
     verdict: Verdict
@@ -37,9 +37,9 @@ class Piece(NamedTuple):
 
 
 class Reassembly:
-    """The ULog streams of one vehicle, one after the other.
+    """Reassembles the successive ULog streams of one vehicle.
 
-    At most 249 bytes are lost with a message. The number of ULog records lost is at least one for each gap.
+    A lost message contains at most 249 bytes; each gap loses at least one ULog record.
     """
 
     def __init__(self) -> None:
@@ -47,33 +47,33 @@ class Reassembly:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream after a reboot of the vehicle: the next one may begin with the same bytes."""
-        self._first = b""  # data of the first message, which tells its repetition from a new stream
+        """Reset after a reboot of the vehicle: the next stream may begin with the same bytes."""
+        self._first = b""  # data of the first message, to distinguish its retransmission from a new stream
         self._last: int | None = None  # sequence; None before the first stream
         self._synchronised = False
 
-    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Piece:
-        """Take the fields of the next message; `data` may lack trailing zeros, which MAVLink 2 does not transmit."""
+    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:
+        """Add the next message; `data` may lack trailing zeros, which MAVLink 2 does not transmit."""
         content = bytes(data[:length]).ljust(length, b"\0")
         if length > _MAX_LENGTH or (first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS):
-            return Piece("malformed")
+            return Chunk("malformed")
         if sequence == 0 and content.startswith(_MAGIC) and content != self._first:
             self._first, self._last, self._synchronised, self._old_run = content, 0, True, 0
-            return Piece("delivered", content, begins=True)
+            return Chunk("delivered", content, begins=True)
         if self._last is None:
-            return Piece("no_definitions")
+            return Chunk("no_definitions")
         step = (sequence - self._last) % _MODULUS
         if step == 0 or (step > _MAX_STEP and not self._is_ahead(sequence)):
-            return Piece("duplicate")
+            return Chunk("duplicate")
         self._last, self._old_run, lost = sequence, 0, step - 1
         is_contiguous = self._synchronised and not lost
         self._synchronised = is_contiguous or first_message_offset != _NO_RECORD_BEGINS
         skipped = 0 if is_contiguous else min(first_message_offset, len(content))
         verdict: Verdict = "delivered" if self._synchronised else "unsynchronised"
-        return Piece(verdict, content[skipped:], lost=lost)
+        return Chunk(verdict, content[skipped:], lost=lost)
 
     def _is_ahead(self, sequence: int) -> bool:
-        """Return whether a long run of old numbers ends here: more than 32,768 messages were lost at once."""
+        """Return whether a run of old sequence numbers shows a gap of more than 32,768 messages."""
         self._old_run = self._old_run + 1 if sequence == self._old_next else 1
         self._old_next = (sequence + 1) % _MODULUS
         return self._old_run >= _OLD_RUN

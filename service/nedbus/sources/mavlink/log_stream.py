@@ -1,4 +1,4 @@
-"""The ULog stream of one vehicle: reassembled bytes in, messages out, with its losses, its delay and its file."""
+"""Decoder of one vehicle's ULog stream: chunks in, messages out; measures losses and delay, and saves the stream."""
 
 import logging
 import math
@@ -17,13 +17,13 @@ from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .log_client import LogStatus, LogStreamClient
-from .log_reassembly import Piece
+from .log_reassembly import Chunk
 
 _log = logging.getLogger(__name__)
 
 _SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; that of converted ones is `mavlink`
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
-_PIECE: Final = 249  # bytes of a LOGGING_DATA
+_CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
 _FILE_HEADER: Final = 16  # bytes
@@ -34,7 +34,7 @@ _MAX_SAME_NAME: Final = 100
 
 
 class LogStream:
-    """The stream of one vehicle, in the thread of the source; `client`: its requests, in that of the link."""
+    """The stream of one vehicle, on the thread of the source; `client` runs on that of the link."""
 
     def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
         self._name, self._client = name, client
@@ -42,11 +42,11 @@ class LogStream:
         self._folder = Path(options.save).expanduser() if options.save else None
         self._file: LogFile | None = None
         self._logged = LogStatus("idle")
-        self._carried: set[Address] = set()
+        self._streamed: set[Address] = set()
         self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
-        self._last_piece: float | None = None
-        self._owed = 0  # losses that the next message reports
-        self._clock: tuple[float, float] | None = None  # the vehicle's minus ours [s], and when it was measured
+        self._last_chunk: float | None = None
+        self._unreported = 0  # losses to report with the next message
+        self._clock: tuple[float, float] | None = None  # vehicle's minus host's [s], and time of measurement
         self._round_trip = math.inf
         self._window_start = self._rate = self._delays = 0.0
         self._window_bytes = self._delayed = 0
@@ -54,39 +54,39 @@ class LogStream:
         self._restart()
 
     def _restart(self) -> None:
-        """Forget the definitions: those of the next stream may differ."""
-        self._parser, self._texts = ulog.UlogParser(verify=False), ulog.Texts()
+        """Discard the definitions: those of the next stream may differ."""
+        self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[int, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
 
     @property
     def is_streaming(self) -> bool:
-        """True while messages come from the stream."""
+        """True while the stream delivers messages."""
         return self._client.status.state == "streaming"
 
-    def carries(self, address: Address) -> bool:
-        """Return whether messages of an address come from the stream, so that none are converted."""
-        return self.is_streaming and (address in self._carried or address.topic == ulog.SPOKEN.name)
+    def delivers(self, address: Address) -> bool:
+        """Return whether the stream has messages of an address, which replace converted ones."""
+        return self.is_streaming and (address in self._streamed or address.topic == ulog.LOG_MESSAGE.name)
 
-    def add(self, piece: Piece, now: float) -> Iterator[SourceMessage | Rejection]:
-        """Yield the messages that a piece completes."""
-        if piece.begins:
+    def add(self, chunk: Chunk, now: float) -> Iterator[SourceMessage | Rejection]:
+        """Yield the messages that a chunk completes."""
+        if chunk.begins:
             self._restart()
             self.close()
-        if piece.lost:
-            self._count_gap(piece.lost)
-        if piece.verdict == "unsynchronised":
-            self._at_most += math.ceil(_PIECE / self._record_sizes()[0])
-        self._save(piece, now)
-        self._last_piece = now
-        if not piece.data:
+        if chunk.lost:
+            self._count_gap(chunk.lost)
+        if chunk.verdict == "unsynchronised":
+            self._at_most += math.ceil(_CHUNK_SIZE / self._record_sizes()[0])
+        self._save(chunk, now)
+        self._last_chunk = now
+        if not chunk.data:
             return
-        self._received += len(piece.data)
-        self._window_bytes += len(piece.data)
+        self._received += len(chunk.data)
+        self._window_bytes += len(chunk.data)
         known, before, omitted = self._parser, self._parser.undecodable, self._texts.limit.omitted
         try:
-            records = known.feed(piece.data)
+            records = known.feed(chunk.data)
         except ulog.UlogError as exc:
             yield Rejection(f"{self._name} ULog stream", str(exc))
             return
@@ -97,9 +97,9 @@ class LogStream:
                 if stream is None or stream.subscription is not record.subscription:
                     stream = yield from self._open_stream(record.subscription)
                 if stream is not None:
-                    told = len(stream.unfit)
+                    reported = len(stream.omitted)
                     fields = stream.decode(record.payload)
-                    for name, reason in [*stream.unfit.items()][told:]:
+                    for name, reason in [*stream.omitted.items()][reported:]:
                         yield Rejection(f"{self._name} {name}", reason, count=0)
                     yield self._message(stream, fields, now)
             elif isinstance(record, ulog.Dropout):
@@ -107,34 +107,34 @@ class LogStream:
             elif isinstance(record, ulog.Damage) and record.reason not in self._damages and len(self._damages) < 100:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
-        count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.SPOKEN.name}"
+        count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
         yield from [Rejection(where, "more than 100 texts a second", count=count)] * (count > 0)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
-        """Take the answer to a TIMESYNC request that was sent at `sent`; the shortest round trip is the best one."""
+        """Use the answer to a TIMESYNC request sent at `sent`, if its round trip is the shortest so far."""
         is_old = self._clock is None or now - self._clock[1] > _MAX_OFFSET_AGE
         if 0 <= now - sent <= self._round_trip or is_old:
             self._round_trip = now - sent
             self._clock = vehicle_time - (sent + now) / 2, now
 
     def log_changes(self, now: float) -> None:
-        """Log the state of the stream if it has changed, and forget what it carried when it has ended."""
+        """Log changes of the stream's state; clear the list of streamed addresses at its end."""
         status, address = self._client.status, Address(self._name, DEFAULT_TOPIC)
         if not self.is_streaming:
-            self._carried.clear()
+            self._streamed.clear()
         if status[:2] == self._logged[:2]:
             return
         self._logged = status
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
-            text = f"streaming; the header took {header:.1f} s, a gap in the vehicle's own log"
+            text = f"streaming; the header took {header:.1f} s, which is a gap in the vehicle's own log"
             _log.info("%s: ULog stream: %s", address, text, extra=about("log_stream", address))
         elif status.reason is not None:
             extra = about("log_stream", address, reason=status.text)
             _log.warning("%s: no ULog stream: %s", address, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
-        """Return the status; measures rate and delay since the last call."""
+        """Return the status, with rate and delay measured since the last call."""
         seconds = now - self._window_start
         if seconds >= _WINDOW:
             self._rate = self._window_bytes / seconds
@@ -155,7 +155,7 @@ class LogStream:
             self._file = None
 
     def _open_stream(self, subscription: ulog.Subscription) -> Generator[Rejection, None, ulog.LoggedStream | None]:
-        """Return the stream of a subscription; None if it is not selected, or cannot be published."""
+        """Return the stream of a subscription; None if it is not selected or not publishable."""
         stream: ulog.LoggedStream | None = None
         if self._topics is None or subscription.name in self._topics:
             try:
@@ -170,44 +170,44 @@ class LogStream:
         if self._clock is not None and isinstance(timestamp, int):
             self._delays += now + self._clock[0] - timestamp / 1e6
             self._delayed += 1
-        self._carried.add(stream.address)
-        lost, self._owed, dropout, self._dropout = self._owed, 0, self._dropout, 0.0
+        self._streamed.add(stream.address)
+        lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
         definition = stream.definition
         return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
-        """Count a gap; bounds are those of records of all kinds, by their least and greatest size."""
+        """Count a gap; the bounds of lost records follow from the smallest and largest record."""
         self._gaps += 1
         self._lost += lost
         smallest, largest = self._record_sizes()
-        least = max(1, math.ceil(_PIECE * lost / largest))
+        least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
         self._at_least += least
-        self._owed += least
-        # The end of the gap, and the record that it cut.
-        self._at_most += math.ceil(_PIECE * (lost + 1) / smallest) + 1
+        self._unreported += least
+        # Includes the message that ends the gap, and the record that it cut.
+        self._at_most += math.ceil(_CHUNK_SIZE * (lost + 1) / smallest) + 1
         self._parser.gap()
 
     def _record_sizes(self) -> tuple[int, int]:
         sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
-        return min(sizes, default=_DATA_HEADER), max(sizes, default=_PIECE)
+        return min(sizes, default=_DATA_HEADER), max(sizes, default=_CHUNK_SIZE)
 
-    def _save(self, piece: Piece, now: float) -> None:
-        """Save a piece of the stream; after an error its rest is not saved, while publishing goes on."""
+    def _save(self, chunk: Chunk, now: float) -> None:
+        """Save a chunk; after an error stop saving, but continue publishing."""
         try:
-            if piece.begins and self._folder is not None:
+            if chunk.begins and self._folder is not None:
                 self._file = LogFile(self._folder, self._name)
                 _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log_stream"))
             if self._file is not None:
-                if piece.lost:
-                    self._file.mark_gap(now - (self._last_piece or now))
-                self._file.write(piece.data)
+                if chunk.lost:
+                    self._file.mark_gap(now - (self._last_chunk or now))
+                self._file.write(chunk.data)
         except OutputError as exc:
             self.close()
             _log.error("%s: the ULog stream is no longer saved: %s", self._name, exc, extra=about("log_stream"))
 
 
 class LogFile:
-    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, such as for a full disk."""
+    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, as on a full disk."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)
@@ -229,7 +229,7 @@ class LogFile:
         del self._partial[:end]
 
     def mark_gap(self, seconds: float) -> None:
-        """Discard the record that the gap cut, and record a dropout of this duration."""
+        """Discard the record that the gap cut, and write a dropout of this duration."""
         self._partial.clear()
         if not self._begins:
             self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))

@@ -1,4 +1,4 @@
-"""Readers of a link: messages of autopilots with their sender; with `log=`, in a thread that requests ULog streams."""
+"""Readers of a link: messages of autopilots and their senders; with `log=`, on a thread that requests ULog streams."""
 
 import threading
 import time
@@ -14,9 +14,9 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection
 
 from .fields import is_reboot
-from .link import AUTOPILOT, Link, Peer, why_ignored
+from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
-from .log_reassembly import Piece, Reassembly
+from .log_reassembly import Chunk, Reassembly
 
 _MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
 _KINDS: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
@@ -27,18 +27,18 @@ _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
 class Received(NamedTuple):
-    """A message of an autopilot. `time`: of its arrival, monotonic [s]; `sequence`: of MAVLink; `piece`: its ULog."""
+    """A message of an autopilot. `time`: arrival, monotonic [s]; `sequence`: MAVLink's; `chunk`: its ULog data."""
 
     message: Any
     system: int
     sequence: int
     peer: Peer
     time: float
-    piece: Piece | None = None
+    chunk: Chunk | None = None
 
 
 class LinkReader:
-    """Parses what arrives on a link."""
+    """Parses the MAVLink messages of a link."""
 
     def __init__(self, link: Link, *, name: str) -> None:
         self._link, self.name = link, name
@@ -49,7 +49,7 @@ class LinkReader:
         for data, peer in self._link.read(timeout):
             now = time.monotonic()
             if not self._link.stream or len(self._parser.buf) > _MAX_BUFFER:
-                # Half a message in one datagram must not consume the next one, which may have another sender.
+                # A truncated message must not consume the next datagram, which may have another sender.
                 self._parser = new_parser()
             yield from parse(self._parser, data, self.name, peer, now)
             if not self._link.stream and self._parser.buf_len():
@@ -57,23 +57,23 @@ class LinkReader:
 
 
 def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterator[Received | Rejection]:
-    """Yield the messages of autopilots in these bytes, received from a peer at a time."""
+    """Yield the messages of autopilots in bytes that `peer` sent; `now`: time of arrival."""
     for message in parser.parse_buffer(data) or []:
         raw = bytes(message.get_msgbuf())
         if message.get_type() == "BAD_DATA":
             yield Rejection(name, f"{len(raw)} bytes that are not MAVLink")
             continue
-        # If the dialect does not have the message, only its header can be parsed.
+        # For a message that the dialect lacks, only the header can be parsed.
         sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
-        reason = why_ignored(system, component)
+        reason = ignore_reason(system, component)
         if not reason:
             yield Received(message, system, sequence, peer, now)
-        elif not ((system and component) or message.get_type().startswith("UNKNOWN")):  # cameras are expected
+        elif not ((system and component) or message.get_type().startswith("UNKNOWN")):  # others, as cameras, are normal
             yield Rejection(f"{name} system {system} component {component}", reason)
 
 
 def new_parser() -> Any:
-    """Return a parser that reports what is not MAVLink as BAD_DATA."""
+    """Return a parser that reports bytes that are not MAVLink as BAD_DATA."""
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
     return parser
@@ -89,9 +89,9 @@ class _Vehicle:
 
 
 class LogReceiver:
-    """Reads a link in a thread of its own, so that PX4's log stream is acknowledged while publishing waits.
+    """Reads a link on a dedicated thread, which acknowledges PX4's log stream even while publishing blocks.
 
-    `send`: sends a MAVLink message to a peer; it must not wait. `vehicles`: those with a heartbeat so far.
+    `send`: sends a MAVLink message to a peer, without blocking. `vehicles`: those that have sent a heartbeat.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class LogReceiver:
         self._thread.start()
 
     def read(self, timeout: float) -> Iterator[Received | Rejection]:
-        """Yield what was read; wait up to `timeout` seconds for the first. Raises the error that ended the thread."""
+        """Yield messages; wait up to `timeout` seconds for the first. Raises the error that ended the thread."""
         with suppress(Empty):
             for number in range(_MAX_READ):
                 item = self._waiting.get_nowait() if number else self._waiting.get(timeout=timeout)
@@ -121,35 +121,35 @@ class LogReceiver:
                 yield item
 
     def close(self) -> None:
-        """End the streams and the thread; wait until the vehicles have confirmed it, or do not answer."""
+        """Stop the streams and the thread; wait until the vehicles confirm, or a timeout expires."""
         self._stop.set()
         self._thread.join()
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                self._turn()
+                self._step()
             end = time.monotonic() + _STOP_TIMEOUT
             for vehicle in self.vehicles.values():
-                self._act(vehicle, vehicle.client.stop(time.monotonic()))
+                self._execute(vehicle, vehicle.client.stop(time.monotonic()))
             while time.monotonic() < end and any(
                 vehicle.client.status.state == "stopping" for vehicle in self.vehicles.values()
             ):
-                self._turn()
-        except Exception as exc:  # noqa: BLE001 - raised again by `read`, in the thread of the source
+                self._step()
+        except Exception as exc:  # noqa: BLE001 - re-raised by `read`, on the thread of the source
             self._waiting.put(exc)
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         for item in self._reader.read(_TICK):
             has_room = self._waiting.qsize() < _MAX_WAITING
-            seen = self._take(item, has_room=has_room) if isinstance(item, Received) else item
+            received = self._process(item, has_room=has_room) if isinstance(item, Received) else item
             if has_room:
-                self._waiting.put(seen)
+                self._waiting.put(received)
         for vehicle in self.vehicles.values():
-            self._act(vehicle, vehicle.client.tick(time.monotonic()))
+            self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
-    def _take(self, received: Received, *, has_room: bool) -> Received | Rejection:
-        """Acknowledge a message and reassemble its data; without room it is lost, as if the link had lost it."""
+    def _process(self, received: Received, *, has_room: bool) -> Received | Rejection:
+        """Acknowledge a message and reassemble its data; if the queue is full, drop it as if the link had lost it."""
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self.vehicles.get(received.system)
         if kind in _KINDS:
@@ -162,10 +162,10 @@ class LogReceiver:
             begins = False
             if has_room:
                 fields = message.sequence, message.length, message.first_message_offset, message.data
-                piece = vehicle.reassembly.add(*fields)
-                received, begins = received._replace(piece=piece), piece.begins
+                chunk = vehicle.reassembly.add(*fields)
+                received, begins = received._replace(chunk=chunk), chunk.begins
             is_acked = kind == _KINDS[0]
-            self._act(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
+            self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
         elif kind == "HEARTBEAT":
             if vehicle is None:
                 system, component = self._ids
@@ -173,10 +173,10 @@ class LogReceiver:
                 vehicle = self.vehicles[received.system] = _Vehicle(received.system, client, received.peer)
             vehicle.peer = received.peer
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
-            self._act(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
+            self._execute(vehicle, vehicle.client.on_heartbeat(message.autopilot, now, armed=armed))
         elif vehicle is not None and kind == "COMMAND_ACK":
             target = message.target_system, message.target_component
-            self._act(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
+            self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
         elif vehicle is not None and (ms := getattr(message, "time_boot_ms", None)) is not None:
             if is_reboot(ms, vehicle.newest):
                 vehicle.client.on_reboot()
@@ -184,7 +184,7 @@ class LogReceiver:
             vehicle.newest = max(ms, vehicle.newest)
         return received
 
-    def _act(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
+    def _execute(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:
         for command in commands:
             if command.kind == "acknowledge":
                 message: Any = dialect.MAVLink_logging_ack_message(vehicle.system, AUTOPILOT, command.sequence)

@@ -16,11 +16,11 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session
-from nedbus.ulog import SPOKEN
+from nedbus.ulog import LOG_MESSAGE
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
-from .link import AUTOPILOT, Link, Peer, Senders, open_link, parse_link
+from .link import AUTOPILOT, DuplicateIds, Link, Peer, open_link, parse_link
 from .log_stream import LogStream
 from .reader import LinkReader, LogReceiver, Received
 from .vehicle import Vehicle
@@ -28,8 +28,8 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
-_STATUS_INTERVAL: Final = 1.0  # s between reports on ULog streams
-# Of a companion computer: unlike a ground station, its loss triggers no failsafe.
+_STATUS_INTERVAL: Final = 1.0  # s between status reports of ULog streams
+# Ids of a companion computer: its loss, unlike that of a ground station, triggers no failsafe.
 _SYSTEM: Final = 245
 _COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
@@ -37,14 +37,14 @@ _COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 class MavlinkSource:
     """A link to one or several vehicles.
 
-    Fields that MAVLink does not transmit are not provided, and not derived from others: resets, variances of heading
-    and tilt, accelerations and limits of VehicleLocalPosition, and the mode of VehicleStatus.
+    Fields that MAVLink does not transmit are left out, not derived from others: resets, variances of heading and tilt,
+    accelerations and limits of VehicleLocalPosition, and the mode of VehicleStatus.
     Validity is approximated from ESTIMATOR_STATUS, as LOCAL_POSITION_NED is sent even while it is invalid.
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
         parse_link(link)
-        known = {SPOKEN.name, *(topic for topic, _ in CONVERSIONS.values())}
+        known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
@@ -71,7 +71,7 @@ class _LinkSession:
         self._sending = threading.Lock()
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
-        self._senders = Senders()
+        self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
         reader = LinkReader(link, name=name)
         self._receiver: LogReceiver | None = None
@@ -85,10 +85,10 @@ class _LinkSession:
             for item in self._read(TIMINGS.source_tick):
                 if isinstance(item, Rejection):
                     yield item
-                elif item.piece is not None:
+                elif item.chunk is not None:
                     if (log := self._log_of(item.system)) is not None:
-                        yield from log.add(item.piece, item.time)
-                    self._handle(item)  # for its sequence number
+                        yield from log.add(item.chunk, item.time)
+                    self._handle(item)  # to track its sequence number
                 else:
                     yield self._handle(item)
             yield None
@@ -100,7 +100,7 @@ class _LinkSession:
                     log.log_changes(now)
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
-                # Routers and vehicles send only to components that they know.
+                # Routers and vehicles send only to components that have announced themselves.
                 kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
                 heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
                 for peer in {self._link.peer} - {None} or set(self._peers.values()):
@@ -126,7 +126,7 @@ class _LinkSession:
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
-        vehicle.track_sequence(received.sequence, now, counted=received.piece.lost if received.piece else 0)
+        vehicle.track_sequence(received.sequence, now, counted=received.chunk.lost if received.chunk else 0)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
             log.add_timesync(message.tc1 / 1e9, message.ts1 / 1e9, now)
@@ -134,7 +134,7 @@ class _LinkSession:
         if isinstance(converted, SourceMessage) and converted.rebooted:
             address = Address(converted.address.vehicle, DEFAULT_TOPIC)
             _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
-        if log is None or converted is None or converted.address is None or not log.carries(converted.address):
+        if log is None or converted is None or converted.address is None or not log.delivers(converted.address):
             return converted
         return None
 
@@ -159,6 +159,6 @@ class _LinkSession:
                 self._send(message, self._peers[system])
 
     def _send(self, message: Any, peer: Peer) -> None:
-        with self._sending:  # the thread that reads the link acknowledges its data
+        with self._sending:  # the reading thread sends acknowledgements
             self._link.send(message.pack(self._sender), peer)
             self._sender.seq = (self._sender.seq + 1) % 256

@@ -1,4 +1,4 @@
-"""Replay a .tlog, MAVLink as QGroundControl or MAVProxy received it: each frame behind the host's time in 8 bytes."""
+"""Replay a .tlog of QGroundControl or MAVProxy: MAVLink frames, each preceded by the host's time in 8 bytes."""
 
 import struct
 from collections.abc import Collection, Iterator
@@ -18,9 +18,9 @@ from nedbus_msgs import BY_TOPIC, Address, Definition
 from .reader import new_parser, parse
 from .vehicle import Vehicle
 
-_AHEAD: Final = 1000  # messages read when a file is opened: their addresses are known from the start
+_LOOKAHEAD: Final = 1000  # messages read when a file is opened, for the initial list of addresses
 _MAX_GAP: Final = 60_000_000  # us; a longer step is a pause or a damaged time, and is skipped
-_HEAD: Final = struct.Struct(">Q2s")  # time [us], begin of a frame: marker and length
+_HEAD: Final = struct.Struct(">Q2s")  # time [us], start of a frame: marker and length
 _LONGEST: Final = _HEAD.size + 290  # bytes of a record
 _OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}  # bytes of a frame without payload
 _SIGNATURE: Final = 13  # bytes
@@ -73,7 +73,7 @@ class TlogReader:
             raise SourceError(str(self._path), "; ".join([reason, *self.warnings]))
 
     def _frames(self) -> Iterator[tuple[int, bytes]]:
-        """Yield each frame with its time [us]; behind damage, search for one that another one follows."""
+        """Yield each frame with its time [us]; after damage, search for two consecutive ones."""
         with open_flight(self._path) as file:
             data, is_found = b"", True
             while data := data + file.read(2 * _LONGEST - len(data)):
@@ -88,12 +88,12 @@ class TlogReader:
 
 
 def open_tlog(file: str, options: RecordedOptions, _: str) -> ReplayRun:
-    """Read the beginning; raise SourceError if it has none of the requested topics."""
+    """Read the start of a file; raise SourceError if it has none of the requested topics."""
     path = Path(file).expanduser()
     reader = TlogReader(path, options.topics, vehicle=options.vehicle)
     run = ReplayRun(iter(()), reader.definitions, None, "", position=0)
     messages = _read(reader, run, path, options)
-    ahead = list(islice(messages, _AHEAD))
+    ahead = list(islice(messages, _LOOKAHEAD))
     vehicles = sorted({address.vehicle for address in reader.definitions})
     run.messages = (message for part in (ahead, messages) for message in part)
     run.total = path.stat().st_size
@@ -112,7 +112,7 @@ def _read(reader: TlogReader, run: ReplayRun, path: Path, options: RecordedOptio
 
 
 def _length(data: bytes) -> int:
-    """Return the length of the record at the begin of these bytes, 0 if there is none."""
+    """Return the length of the record at the start of these bytes, 0 if there is none."""
     if len(data) < _HEAD.size + 1:
         return 0
     marker, payload, flags = data[8:11]

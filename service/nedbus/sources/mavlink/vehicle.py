@@ -1,4 +1,4 @@
-"""State of one MAVLink vehicle: MAVLink in, PX4 messages and requests out; no I/O, monotonic times of a caller [s]."""
+"""State of a MAVLink vehicle: MAVLink in, PX4 messages and requests out; no I/O, callers pass monotonic time [s]."""
 
 import logging
 import math
@@ -11,17 +11,17 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import SPOKEN, TextLimit, to_statement
+from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
 
 from .fields import CONVERSIONS, is_reboot
 
 _log = logging.getLogger(__name__)
 
-_VALUE_TIMEOUT: Final = 2.0  # s for which a received value is part of the estimate
+_VALUE_TIMEOUT: Final = 2.0  # s for which a received value is merged into the estimate
 _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS once a second
 _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
-_FIRST_ROUNDS: Final = 3  # times that each request is sent at first, as links lose some
+_FIRST_ROUNDS: Final = 3  # initial transmissions of each request, as links lose some
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
@@ -86,8 +86,8 @@ class Vehicle:
         self._last_message = 0.0
         self.lost = 0
         self._rebooted = False
-        self._text_limit = TextLimit()
-        self._reported: set[int] = set()  # requested messages that were logged as missing
+        self._text_limit = RateLimit()
+        self._reported: set[int] = set()  # requested messages that were logged as not sent
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
@@ -102,7 +102,7 @@ class Vehicle:
         self._next_round = now + _REQUEST_INTERVAL
 
     def track_sequence(self, sequence: int, now: float, *, counted: int = 0) -> None:
-        """Count the messages lost before this one, of any type, without those that the ULog stream has counted."""
+        """Count the messages of any type lost before this one; `counted`: those that the ULog stream has counted."""
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
@@ -114,9 +114,9 @@ class Vehicle:
             self._sequence = sequence
 
     def next_request(self, now: float) -> tuple[int, float] | None:
-        """Return the id of the next message to request and its rate [Hz], 0 for once; None if there is none.
+        """Return id and rate [Hz] of the next message to request, rate 0 for a single one; None if none is due.
 
-        Each message is requested three times at first, then for as long as it does not arrive.
+        Each message is requested three times, and then again until it arrives.
         """
         if now - self._last_message > _SILENCE_TIMEOUT:
             return None
@@ -135,7 +135,7 @@ class Vehicle:
         return number, self._rates[number]
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
-        """Convert a message; return None if it has nothing for the chosen topics, a Rejection if it is late."""
+        """Convert a message; return None if no chosen topic needs it, a Rejection if it is out of order."""
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
@@ -143,13 +143,13 @@ class Vehicle:
             self._arrivals[number] = now
         is_double = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
         self._remember(kind, message, timestamp, now)
-        if kind == "STATUSTEXT" and SPOKEN.name in self._topics:
+        if kind == "STATUSTEXT" and LOG_MESSAGE.name in self._topics:
             if not self._text_limit.admits(round(now * 1e6)):
-                address = Address(self._name, SPOKEN.name)
+                address = Address(self._name, LOG_MESSAGE.name)
                 return Rejection(str(address), "more than 100 texts a second", address)
             self._texts.add(message, now)
         if fields_of is None and self._newest is not None:
-            topic, timestamp, fields_of = SPOKEN.name, self._newest * 1000, lambda _: self._texts.take(now)
+            topic, timestamp, fields_of = LOG_MESSAGE.name, self._newest * 1000, lambda _: self._texts.take(now)
         if fields_of is None or topic not in self._topics or is_double or timestamp is None:
             return None
         fields = {name: value for name, value in fields_of(message).items() if value is not None}
@@ -229,7 +229,7 @@ class Vehicle:
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 
     def _track_time(self, message: Any, now: float) -> int | None:
-        """Return the time of a message [us since boot]; without a time of its own, it gets the newest one received."""
+        """Return the time of a message [us since boot]; that of the newest message if it has none."""
         microseconds: int = getattr(message, "time_usec", 0)
         if 0 < microseconds < YEAR_2000:
             return microseconds
@@ -262,31 +262,31 @@ def _validity(bits: int) -> dict[str, object]:
 
 
 class _StatusTexts:
-    """The texts of one vehicle, joined from the chunks of STATUSTEXT, as severity and text."""
+    """Joins the STATUSTEXT chunks of one vehicle."""
 
     def __init__(self) -> None:
-        self._of = (0, 0)  # severity and id of the text that is not complete
+        self._current = (0, 0)  # severity and id of the incomplete text
         self._data, self._next, self._time = b"", 0, 0.0
         self._waiting: deque[dict[str, object]] = deque(maxlen=_MAX_WAITING)
 
     def add(self, message: Any, now: float) -> None:
-        """Take a STATUSTEXT; chunks that are missing leave "..."."""
+        """Add a STATUSTEXT; a missing chunk becomes "..."."""
         data, sequence = message._text_raw, message.chunk_seq  # noqa: SLF001 - `text` is ASCII only
-        of = min(message.severity, _DEBUG), message.id
-        if self._next and (self._of != of or sequence < self._next):
+        current = min(message.severity, _DEBUG), message.id
+        if self._next and (self._current != current or sequence < self._next):
             self._finish("...")
         gap = b"..." if sequence > self._next else b""
         self._data = (self._data + gap + data.partition(b"\0")[0])[:_MAX_BYTES]
-        self._of, self._next, self._time = of, sequence + 1, now
+        self._current, self._next, self._time = current, sequence + 1, now
         if not message.id or len(data) < _CHUNK or b"\0" in data:
             self._finish()
 
     def take(self, now: float) -> dict[str, object]:
-        """Return severity and text of the next statement; nothing if none is complete or timed out."""
+        """Return the fields of the next text that is complete or has timed out, else {}."""
         if self._next and now - self._time > _CHUNK_TIMEOUT:
             self._finish("...")
         return self._waiting.popleft() if self._waiting else {}
 
     def _finish(self, end: str = "") -> None:
-        self._waiting.append({"severity": self._of[0], "text": to_statement(decode_text(self._data) + end)})
+        self._waiting.append({"severity": self._current[0], "text": to_log_text(decode_text(self._data) + end)})
         self._data, self._next = b"", 0

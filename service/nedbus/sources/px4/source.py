@@ -1,4 +1,4 @@
-"""Receive from PX4's Zenoh module, and from any other publisher of px4_msgs over rmw_zenoh, as a node of ROS 2."""
+"""Receive from PX4's Zenoh module, or any other publisher of px4_msgs over rmw_zenoh, as a ROS 2 node."""
 
 import logging
 import os
@@ -16,7 +16,7 @@ import zenoh
 from nedbus.errors import AddressError, ConfigError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.source import Absence, Rejection, SourceMessage
+from nedbus.sources.source import Rejection, SourceMessage, UnavailableTopics
 from nedbus.timings import TIMINGS
 from nedbus.transport import (
     BRIDGED_ENCODING,
@@ -41,10 +41,10 @@ from .streams import Definitions, NotAcceptedError, StreamRegistry
 _log = logging.getLogger(__name__)
 
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service must be able to stop within 1 s, and it retries
-_REPORT_INTERVAL: Final = 1.0  # s between reports of absent topics
+_REPORT_INTERVAL: Final = 1.0  # s between reports of unavailable topics
 _MAX_PENDING: Final = 4096  # samples waiting to be decoded
 _MAX_PENDING_BYTES: Final = 4096  # per payload
-_RING_SIZE: Final = 16_384  # samples waiting for the thread
+_RING_SIZE: Final = 16_384  # samples waiting for the receiving thread
 _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
 _INPUT: Final = "px4-zenoh-input"  # `sample.source` of messages to a vehicle
@@ -53,7 +53,7 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohSource:
-    """All publishers of px4_msgs at a router: the service's own, which has the endpoints `routers`, or another one."""
+    """All publishers of px4_msgs on a router: the service's own, at the endpoints `routers`, or another one."""
 
     def __init__(
         self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
@@ -67,30 +67,30 @@ class Px4ZenohSource:
         self._given = _read_definitions(options.msg)
         self._vehicle = options.vehicle or vehicle
 
-    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
         """Receive; raise SourceError if no router answers."""
         with ExitStack() as closing:
             if router is not None and self._is_own:
-                # A separate client would lose the messages that do not fit the queue of its link.
+                # A separate client would lose messages whenever the queue of its link is full.
                 session = router
             else:
                 try:
                     session = open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
                 except ConnectError as exc:
-                    reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
+                    reason = "no Zenoh router answers: start one, or set another one with px4-zenoh:tcp/HOST:7447"
                     raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
             node = Px4ZenohNode(session, streams, domain=self._options.domain)
             closing.callback(node.close)
-            yield from node.run()  # a session that loses its router reconnects by itself
+            yield from node.run()  # the session reconnects automatically
 
 
 class Px4ZenohNode:
-    """Receive from all publishers, convert samples to messages or rejections, and appear in ROS 2, until closed.
+    """Receive from all publishers as a ROS 2 node, and convert samples to messages or rejections, until closed.
 
-    Samples wait in a channel in Rust, which a thread of this node drains: a callback would make Zenoh wait for the
-    GIL. Its liveliness tokens make ROS 2 list this source, and publishers in ROS 2 see a subscriber.
+    Samples are queued in a Rust channel, which a dedicated thread drains: a callback would make Zenoh wait for the
+    GIL. Liveliness tokens announce the node and its subscriptions to ROS 2.
     """
 
     def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
@@ -110,10 +110,10 @@ class Px4ZenohNode:
         self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
         self._thread.start()
 
-    def run(self) -> Iterator[SourceMessage | Rejection | Absence | None]:
+    def run(self) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
         """Yield events until the iterator is closed."""
         yield None
-        last: Absence | None = None
+        last: UnavailableTopics | None = None
         next_report = 0.0
         while True:
             new = self._dropped - self._reported
@@ -123,16 +123,16 @@ class Px4ZenohNode:
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=TIMINGS.source_tick)
-            for token, alive in self._tokens.take():  # older than the sample
+            for token, alive in self._tokens.take():  # declared before the sample was sent
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
             if (now := time.monotonic()) >= next_report:
                 next_report = now + _REPORT_INTERVAL
-                if (absence := self._streams.report(now)) != last:
-                    yield (last := absence)
+                if (unavailable := self._streams.report(now)) != last:
+                    yield (last := unavailable)
 
     def close(self) -> None:
-        """Leave ROS 2, and end the thread."""
+        """Undeclare the tokens and the subscriber, and end the thread."""
         with suppress(zenoh.ZError):  # the session may be closed already
             for token in (*self._subscriptions.values(), *self._nodes.values()):
                 token.undeclare()
@@ -147,13 +147,13 @@ class Px4ZenohNode:
         is_bridged = str(sample.encoding) == BRIDGED_ENCODING
         address: Address | None = None
         try:
-            stream = self._streams.hear(key, now)
-            if stream.not_carried is not None:
-                is_unexpected = stream.not_carried and not stream.tokens and not is_bridged  # else an absence, or none
-                reason = f"{stream.not_carried}: not selected by topics= or msg="
-                return Rejection(key, reason) if is_unexpected else None
-            if (form := stream.form) is None:
-                form = self._streams.form_of(stream)
+            stream = self._streams.on_message(key, now)
+            if stream.unsupported is not None:
+                is_unannounced = stream.unsupported and not stream.tokens  # announced ones are in the report
+                reason = f"{stream.unsupported}: not selected by topics= or msg="
+                return Rejection(key, reason) if is_unannounced and not is_bridged else None
+            if (form := stream.wire_format) is None:
+                form = self._streams.wire_format_of(stream)
                 if form.unknown:
                     extra = about("newer_layout", stream.address, source="px4-zenoh")
                     _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
@@ -174,7 +174,7 @@ class Px4ZenohNode:
             del fields[name]
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
-            _log.warning("%s: the publisher restarted, as the vehicle rebooted", key, extra=extra)
+            _log.warning("%s: the publisher restarted: the vehicle rebooted", key, extra=extra)
         source = _INPUT if stream.is_input else None
         return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
 
@@ -185,7 +185,7 @@ class Px4ZenohNode:
             if alive:
                 self._streams.add_publisher(token, now)
         except (AddressError, DecodeError, NotAcceptedError):
-            return  # its messages are rejected
+            return  # messages on its key are rejected
         if alive and not token.node.startswith("nedbus_"):
             key = token.key
             if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
@@ -217,37 +217,37 @@ class Px4ZenohNode:
 def _read_definitions(paths: str) -> Definitions:
     """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
 
-    Messages in a folder that cannot be carried are skipped and logged.
+    Unsupported messages in a folder are skipped and logged.
 
-    Raises ConfigError for a file that is not a message, with line and column, or cannot be read.
+    Raises ConfigError for a file that is unreadable, or invalid, with line and column.
     """
     found: dict[str, dict[str, Definition[Any]]] = {}
-    left_out: list[str] = []
+    skipped: list[str] = []
     for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
         files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
         if not files and path.is_dir():
-            reason = "there is no .msg file in this folder or its subfolders: give PX4's folder msg"
+            reason = "no .msg file in this folder or its subfolders: use PX4's msg folder"
             raise ConfigError(str(path), reason, key="msg")
         for file in files or [path]:
             try:
-                text = _with_messages_within(file)
+                text = _with_nested_messages(file)
                 definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
             except OSError as exc:
                 raise ConfigError(str(file), exc.strerror or str(exc), key="msg") from None
             except ValueError as exc:  # such as MsgError
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None
-                left_out.append(f"{file.stem} ({exc})")
+                skipped.append(f"{file.stem} ({exc})")
                 continue
             found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
-    if left_out:
+    if skipped:
         extra = about("damaged", source="px4-zenoh")
-        _log.info("px4-zenoh: messages in %s that cannot be carried: %.2000s", paths, ", ".join(left_out), extra=extra)
+        _log.info("px4-zenoh: unsupported messages in %s: %.2000s", paths, ", ".join(skipped), extra=extra)
     return found
 
 
-def _with_messages_within(file: Path) -> str:
-    """Return a .msg file followed by the nested messages that lie beside it, in the format of ROS 2."""
+def _with_nested_messages(file: Path) -> str:
+    """Return a .msg file followed by its nested messages from the same folder, in ROS 2's format."""
     text = new = _read_text(file)
     added = set[str]()
     while missing := {base for base in bases_of_msg(new) - added if file.with_name(f"{base}.msg").is_file()}:
@@ -259,7 +259,7 @@ def _with_messages_within(file: Path) -> str:
 
 
 def _read_text(file: Path) -> str:
-    """Return a text in UTF-8, with or without a byte order mark, or in Latin-1."""
+    """Read a text in UTF-8, with or without a byte order mark, or else in Latin-1."""
     content = file.read_bytes()
     try:
         return content.decode("utf-8-sig")

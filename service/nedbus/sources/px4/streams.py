@@ -1,4 +1,4 @@
-"""Assign messages of rmw_zenoh to addresses, and detect absent topics; no I/O, monotonic times of the caller [s]."""
+"""Map keys of rmw_zenoh to addresses, and detect unavailable topics; no I/O, callers pass monotonic time [s]."""
 
 import math
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.source import Absence
+from nedbus.sources.source import UnavailableTopics
 from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
 from nedbus_msgs import (
     BY_TOPIC,
@@ -25,24 +25,24 @@ from nedbus_msgs import (
 _MAX_STREAMS: Final = 10_000  # keys; a vehicle has a few dozen
 _MAX_PUBLISHERS: Final = 64  # per key
 _MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a gap
-_TIMEOUT: Final = 3.0  # s without messages after which another publisher may take the address
-_FORGOTTEN: Final = 60.0  # s without messages after which a key without a publisher is forgotten
-_SETTLE_TIME: Final = 1.0  # s in which messages may still arrive from a publisher whose token is gone
+_TIMEOUT: Final = 3.0  # s without messages after which another publisher may use the address
+_EXPIRY: Final = 60.0  # s without messages after which a key without a publisher is removed
+_SETTLE_TIME: Final = 1.0  # s during which messages may still arrive after a publisher's token is gone
 _SILENCE: Final = 5.0  # s without messages, or periods of the nominal rate if that is longer
 _MAX_NAMES: Final = 100  # per report
-_HINT: Final = "give each a namespace or a domain of its own"
+_HINT: Final = "give each its own namespace or domain"
 
 
 Definitions = Mapping[str, Mapping[str, Definition[Any]]]
-"""Definitions given by the user, by DDS type and ROS 2 type hash."""
+"""Definitions supplied by the user, by DDS type and ROS 2 type hash."""
 
 
 class NotAcceptedError(Exception):
-    """Raised for a message that may be valid, but whose vehicle or layout is not certain."""
+    """Raised for a message that may be valid, but whose vehicle or layout is ambiguous."""
 
 
-class Form(NamedTuple):
-    """Format of a stream's messages; `unknown`: fields of a newer layout, by name or type."""
+class WireFormat(NamedTuple):
+    """Definition and layout of a stream's messages; `unknown`: fields of a newer layout, by name or type."""
 
     definition: Definition[Any]
     layout: Layout
@@ -51,28 +51,28 @@ class Form(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Px4Stream:
-    """One key: the address and format of its messages, its publishers, and the last sequence number.
+    """State of one key: address and format of its messages, publishers, and last sequence number.
 
-    `not_carried`: None if its messages are carried, else their name, or "" if no option selects them.
-    `form`: None until the first message.
-    `tokens`: announced publishers by the text of their tokens; `since`: time of the first one.
-    `alike_until`: time until which two publishers may be indistinguishable.
-    `heard`, `received`: times of the last message, and of the last accepted one.
-    `restarted`: another publisher took over, and its first message is not counted yet.
-    `reboots`: number of reboots of its vehicle that it has been through.
-    `is_bridged`: messages from `nedbus ros2` arrived on it.
+    `unsupported`: None if its messages are delivered, else their name, or "" if no option selects them.
+    `wire_format`: None until the first message.
+    `tokens`: announced publishers by token text; `since`: time of the first one.
+    `ambiguous_until`: time until which messages of two publishers may be indistinguishable.
+    `last_message`, `last_accepted`: arrival times.
+    `restarted`: another publisher took over, whose first message is still to come.
+    `reboots`: number of its vehicle's reboots seen on this key.
+    `is_bridged`: messages from `nedbus ros2` have arrived.
     `is_input`: its messages go to the vehicle, from a node that does not reboot with it.
     """
 
     key: TopicKey
     address: Address
-    not_carried: str | None
-    form: Form | None = None
+    unsupported: str | None
+    wire_format: WireFormat | None = None
     tokens: dict[str, PublisherToken] = field(default_factory=dict)
     since: float = -math.inf
-    alike_until: float = -math.inf
-    heard: float = -math.inf
-    received: float = -math.inf
+    ambiguous_until: float = -math.inf
+    last_message: float = -math.inf
+    last_accepted: float = -math.inf
     publisher: PublisherToken | None = None
     gid: bytes | None = None
     sequence: int | None = None
@@ -82,24 +82,24 @@ class Px4Stream:
     is_bridged: bool = False
     is_input: bool = False
 
-    def has_alike(self) -> bool:
-        """Return whether several sessions publish with the same gid, which makes their messages indistinguishable."""
+    def is_ambiguous(self) -> bool:
+        """Return whether several sessions publish with the same gid."""
         sessions = {(token.gid, token.session) for token in self.tokens.values() if token.gid is not None}
         return len({gid for gid, _ in sessions}) < len(sessions)
 
     def nodes(self) -> set[tuple[str, str]]:
-        """Return the nodes that publish on it, without nedbus's own, which bridge several vehicles."""
+        """Return the nodes that publish on this key, except nedbus's bridges, which serve several vehicles."""
         every = {(token.session, token.node) for token in self.tokens.values()}
         return {(session, node) for session, node in every if not node.startswith("nedbus_")}
 
     def is_silent(self, now: float) -> bool:
-        """Return whether its messages are overdue; topics without a rate are sent on events, and never are."""
-        rate = get_topic(self.address.topic).rate if self.not_carried is None else 0.0
-        return rate > 0 and now - max(self.since, self.heard) >= max(_SILENCE, _SILENCE / rate)
+        """Return whether messages are overdue; never for topics without a nominal rate, which are sent on events."""
+        rate = get_topic(self.address.topic).rate if self.unsupported is None else 0.0
+        return rate > 0 and now - max(self.since, self.last_message) >= max(_SILENCE, _SILENCE / rate)
 
 
 class StreamRegistry:
-    """All keys that are announced or have messages, and the stream that owns each address."""
+    """All keys with publishers or messages, and the stream that owns each address."""
 
     def __init__(self, options: Px4ZenohOptions, *, vehicle: str, given: Definitions | None = None) -> None:
         self._options = options
@@ -110,17 +110,17 @@ class StreamRegistry:
         self._reboots: dict[str, int] = {}  # by vehicle
 
     def add_publisher(self, token: PublisherToken, now: float) -> None:
-        """Add the publisher of a new liveliness token; raises like `hear` for a key without an address."""
+        """Add the publisher of a new liveliness token; raises like `on_message` for a key without an address."""
         stream = self._find(token.key)
-        if _TIMEOUT <= now - stream.received < math.inf:
+        if _TIMEOUT <= now - stream.last_accepted < math.inf:
             # The previous publisher is silent: it lost its connection, which a router takes longer to notice.
             stream.tokens.clear()
-            stream.alike_until = -math.inf
+            stream.ambiguous_until = -math.inf
         if not stream.tokens:
             stream.since = now
         if len(stream.tokens) < _MAX_PUBLISHERS:
             stream.tokens[token.text] = token
-            stream.alike_until = math.inf if stream.has_alike() else stream.alike_until
+            stream.ambiguous_until = math.inf if stream.is_ambiguous() else stream.ambiguous_until
 
     def remove_publisher(self, token: PublisherToken, now: float) -> bool:
         """Remove a publisher; return whether it was the last one of its key."""
@@ -128,33 +128,33 @@ class StreamRegistry:
         if stream is None:
             return True
         stream.tokens.pop(token.text, None)
-        if stream.alike_until == math.inf and not stream.has_alike():
-            stream.alike_until = now + _SETTLE_TIME
+        if stream.ambiguous_until == math.inf and not stream.is_ambiguous():
+            stream.ambiguous_until = now + _SETTLE_TIME
         return not stream.tokens
 
-    def hear(self, key: str, now: float) -> Px4Stream:
-        """Return the stream of a key with a new message; raise DecodeError, AddressError or NotAcceptedError."""
+    def on_message(self, key: str, now: float) -> Px4Stream:
+        """Return the stream of a message's key; raise DecodeError, AddressError or NotAcceptedError."""
         stream = self._streams.get(key) or self._find(TopicKey.parse(key))
-        stream.heard = now
+        stream.last_message = now
         return stream
 
-    def form_of(self, stream: Px4Stream) -> Form:
+    def wire_format_of(self, stream: Px4Stream) -> WireFormat:
         """Return the format of a stream's messages; raise NotAcceptedError if it is unknown."""
         definition, layout = self._layout_of(stream.key, stream.address.topic)
         known = definition.known_types
         unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
-        stream.form = Form(definition, layout, unknown)
+        stream.wire_format = WireFormat(definition, layout, unknown)
         stream.reboots = self._reboots.get(stream.address.vehicle, 0)
-        return stream.form
+        return stream.wire_format
 
     def accept(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
-        """Account for a message; return the number lost just before it, and whether its vehicle rebooted.
+        """Return the number of messages lost just before this one, and whether its vehicle rebooted.
 
-        Its stream and publisher become the owner of the address.
+        Its stream and publisher become the owners of the address.
 
         Raises NotAcceptedError while another key, or another publisher on the same key, owns the address; while two
-        publishers have the same gid; for a duplicate; and for a sequence that goes back repeatedly, as it does if two
-        vehicles have the same gid.
+        publishers have the same gid; for a duplicate; and for a sequence that goes back repeatedly, as with two
+        vehicles of the same gid.
         """
         self._claim(stream, attachment, now)
         lost, restarted = 0, stream.restarted
@@ -170,7 +170,7 @@ class StreamRegistry:
             elif step <= _MAX_LOSS:
                 lost = step - 1
             stream.sequence = attachment.sequence
-        stream.received, stream.restarted = now, False
+        stream.last_accepted, stream.restarted = now, False
         if stream.is_input or not restarted:
             return lost, False
         known = self._reboots.get(stream.address.vehicle, 0)
@@ -178,12 +178,12 @@ class StreamRegistry:
         self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
         return lost, is_first
 
-    def report(self, now: float) -> Absence:
-        """Return messages that are not carried, and topics that are silent while others of the same node arrive."""
+    def report(self, now: float) -> UnavailableTopics:
+        """Return unsupported messages, and topics that are silent while others of the same node arrive."""
         self._streams = {
             key: each
             for key, each in self._streams.items()
-            if each.tokens or (each.form and now - each.heard < _FORGOTTEN) or now < each.alike_until
+            if each.tokens or (each.wire_format and now - each.last_message < _EXPIRY) or now < each.ambiguous_until
         }
         known = {each.address.vehicle for each in self._streams.values()}
         self._owners = {
@@ -191,11 +191,11 @@ class StreamRegistry:
         }
         self._reboots = {vehicle: count for vehicle, count in self._reboots.items() if vehicle in known}
         nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
-        # If no topic of a node arrives, its link is down.
-        sending = {node for stream, own in nodes if now - stream.heard < _TIMEOUT for node in own}
+        # A node without any message has a broken link, not silent topics.
+        sending = {node for stream, own in nodes if now - stream.last_message < _TIMEOUT for node in own}
         silent = {str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)}
-        not_carried = {stream.not_carried for stream, own in nodes if own and stream.not_carried}
-        return Absence(tuple(sorted(not_carried)[:_MAX_NAMES]), tuple(sorted(silent)[:_MAX_NAMES]))
+        unsupported = {stream.unsupported for stream, own in nodes if own and stream.unsupported}
+        return UnavailableTopics(tuple(sorted(unsupported)[:_MAX_NAMES]), tuple(sorted(silent)[:_MAX_NAMES]))
 
     def _find(self, key: TopicKey) -> Px4Stream:
         stream = self._streams.get(str(key))
@@ -204,30 +204,29 @@ class StreamRegistry:
                 raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: choose a domain, as in px4-zenoh:?domain=0")
             namespace, topic, instance = split_ros2_topic(key.topic)
             address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
-            stream = Px4Stream(key, address, self._why_not_carried(key, topic), is_input=is_vehicle_input(key.topic))
+            stream = Px4Stream(key, address, self._unsupported_name(key, topic), is_input=is_vehicle_input(key.topic))
             self._streams[str(key)] = stream
         return stream
 
     def _claim(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> None:
-        if now < stream.alike_until:
+        if now < stream.ambiguous_until:
             stream.publisher = stream.gid = stream.sequence = None
-            stream.received = now
+            stream.last_accepted = now
             raise NotAcceptedError(f"two vehicles publish on this key with the same gid: {_HINT}")
         owner = self._owners.setdefault(stream.address, stream)
         if owner is not stream:
-            if now - owner.received < _TIMEOUT:
-                reason = f"{owner.key} is {stream.address} already: rename one of them with vehicles="
+            if now - owner.last_accepted < _TIMEOUT:
+                reason = f"{owner.key} already has the address {stream.address}: rename one of them with vehicles="
                 raise NotAcceptedError(reason)
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
             stream.restarted = stream.publisher is not None and stream.publisher.text not in stream.tokens
-            if stream.gid is not None and not stream.restarted and now - stream.received < _TIMEOUT:
+            if stream.gid is not None and not stream.restarted and now - stream.last_accepted < _TIMEOUT:
                 raise NotAcceptedError(f"two publishers share this key: {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
             stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
 
-    def _why_not_carried(self, key: TopicKey, topic: str) -> str | None:
-        """Return None if the messages of a key are carried, else the value for `not_carried`."""
+    def _unsupported_name(self, key: TopicKey, topic: str) -> str | None:
         options, name = self._options, _message_name(key)
         is_known = key.dds_type in _by_dds_type() or key.dds_type in self._given
         if options.chosen_topics is None:
@@ -237,7 +236,7 @@ class StreamRegistry:
         return "" if options.topics else f"{name} on {topic}" if is_known else name
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
-        """Return the configured vehicle, else one named by the namespace, and any domain but the expected one."""
+        """Return the configured vehicle, else a name made of an unexpected domain and the namespace."""
         vehicles = self._options.vehicles
         if namespace in vehicles:
             return vehicles[namespace]
@@ -246,7 +245,7 @@ class StreamRegistry:
         return "-".join(filter(None, [of_domain, namespace.replace("/", "-")])) or self._vehicle
 
     def _layout_of(self, key: TopicKey, topic: str) -> tuple[Definition[Any], Layout]:
-        """Return message and layout for the type hash of a key, else from the definition given for it."""
+        """Return definition and layout for the type hash of a key, else those that the user supplied."""
         name, known, given = _message_name(key), _by_dds_type().get(key.dds_type), self._given.get(key.dds_type, {})
         expected = BY_TOPIC.get(topic)
         if expected is not None and expected is not known:
@@ -259,10 +258,10 @@ class StreamRegistry:
             [own] = given.values()
         if own is not None:
             return known or own, own.current
-        hint = f"give PX4's definition of it, as in px4-zenoh:?msg={name}.msg"
+        hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
         if given:
             hashes = " or ".join(given)
-            reason = f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: give the vehicle's file"
+            reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}: use the file of this PX4"
         elif known is None:
             reason = f"{name} with the type hash {key.type_hash} is unknown: {hint}"
         elif key.type_hash != NO_HASH:

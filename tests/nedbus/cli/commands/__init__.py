@@ -1,1 +1,1 @@
-"""Commands of the command line."""
+"""Tests of the commands: output and exit codes."""

@@ -1,4 +1,4 @@
-"""Checking settings and router files: every mistake at once, each with its place."""
+"""`nedbus check`: all mistakes in settings and router files at once, each with line and column."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ ROOT = Path(__file__).parents[4]
 
 
 def check(*arguments: object, command: tuple[str, ...] = ("check",)) -> list[str]:
-    """Return the lines of a check that finds something."""
+    """Return the lines of a check that finds mistakes."""
     checked = run_command(*command, *map(str, arguments))
     assert (checked.exit_code, checked.out) == (2, "")
     return [line.removeprefix("nedbus: ") for line in checked.err.splitlines()]
 
 
 def passes(*arguments: object) -> bool:
-    """Return whether a check finds nothing."""
+    """Return whether a check finds no mistake."""
     checked = run_command(*map(str, arguments))
     return (checked.exit_code, checked.out, checked.err) == (0, "no mistakes found\n", "")
 
 
-def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
-    """Each setting and each item of a list is checked, whatever is wrong elsewhere; of a source the first mistake."""
+def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
+    """Each setting and list item is checked even if others are wrong; a source reports its first mistake."""
     file, closed = tmp_path / "nedbus.toml", free_endpoint()
     file.write_text(
         'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\n'
@@ -46,7 +46,7 @@ def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
         (5, 1, "tcp/nowhere.invalid:1: cannot resolve host name nowhere.invalid"),
-        (5, 1, f"{closed}: connection refused: no program listens on this port"),
+        (5, 1, f"{closed}: connection refused: nothing listens on this port"),
         (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
         (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"),
         (7, 1, "until_done: "),
@@ -63,8 +63,8 @@ def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
         assert len(lines) == len(expected)
 
 
-def test_file_that_cannot_be_read_hides_nothing(tmp_path: Path) -> None:
-    """Flags and variables are checked all the same; what the file may have said is not called missing."""
+def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
+    """Options and environment variables are still checked; settings that the file may have are not called missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
     for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
@@ -75,8 +75,8 @@ def test_file_that_cannot_be_read_hides_nothing(tmp_path: Path) -> None:
         assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host")
 
 
-def test_two_sources_of_one_vehicle(tmp_path: Path) -> None:
-    """Sources that publish the same address keep each other from it: replays, and live ones that name a vehicle."""
+def test_two_sources_of_one_address_are_a_mistake(tmp_path: Path) -> None:
+    """Two sources must not publish the same address; found for replays and for live sources that name a vehicle."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
@@ -84,20 +84,20 @@ def test_two_sources_of_one_vehicle(tmp_path: Path) -> None:
         f' "sim:?vehicle=wing", "sim:?vehicle=8", "px4-zenoh:"]\n'
     )
     reasons = [line.partition(": ")[2] for line in check(file)]
-    advice = "give one of them another vehicle"
+    advice = "set another vehicle for one of them"
     sims = [
-        f"source 'sim:?seed=2': publishes 1/vehicle_local_position, like source 'sim:': {advice}",
-        f"source 'sim:': publishes 1/vehicle_local_position, like source 'sim:': {advice}",
-        f"source 'sim:?vehicle=wing': publishes wing/vehicle_local_position, like source '{named}': {advice}",
+        f"source 'sim:?seed=2': publishes 1/vehicle_local_position, as does source 'sim:': {advice}",
+        f"source 'sim:': publishes 1/vehicle_local_position, as does source 'sim:': {advice}",
+        f"source 'sim:?vehicle=wing': publishes wing/vehicle_local_position, as does source '{named}': {advice}",
     ]
-    first = f"like source 'ulog:{log}?vehicle=7': {advice}"
+    first = f"as does source 'ulog:{log}?vehicle=7': {advice}"
     logs = f"source 'ulog:{log}?vehicle=7&speed=2': publishes 7/vehicle_local_position, {first}"
     assert reasons == [sims[0], logs, *sims[1:]]
     assert [line.partition(": ")[2] for line in check("--offline", file)] == sims
 
 
-def test_router_file_that_settings_name(tmp_path: Path) -> None:
-    """It is checked with them, but for the endpoints that they replace."""
+def test_router_config_of_settings_is_checked(tmp_path: Path) -> None:
+    """The file of `router_config` is checked with the settings, except endpoints that the settings replace."""
     file, router = tmp_path / "nedbus.toml", tmp_path / "router.json5"
     router.write_text(
         '{ listen: { endpoints: ["tls/192.0.2.1:7447"] },\n transport: { link: { tls: {\n'
@@ -112,8 +112,8 @@ def test_router_file_that_settings_name(tmp_path: Path) -> None:
     assert len(check(file)) == 3
 
 
-def test_tables_have_their_places(tmp_path: Path) -> None:
-    """An option that there is not, at its own line; a missing log, at its table, but not offline."""
+def test_mistakes_in_source_tables_have_a_position(tmp_path: Path) -> None:
+    """An unknown option is reported at its line; a missing log at its table, but not with --offline."""
     file = tmp_path / "nedbus.toml"
     file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
     wrong = f"{file}, line 3, column 1: source 'sim:?sed=1': there is no option 'sed'"
@@ -133,8 +133,8 @@ def test_tables_have_their_places(tmp_path: Path) -> None:
         ("udp/gcs:mavlink", ["is not an endpoint: write PROTOCOL/HOST:PORT"] * 2),
     ],
 )
-def test_endpoint_that_is_none(tmp_path: Path, endpoint: str, reasons: list[str]) -> None:
-    """A router's file may name anything as an endpoint: it is a mistake with its place, whatever it is."""
+def test_invalid_endpoint_in_router_file_has_a_position(tmp_path: Path, endpoint: str, reasons: list[str]) -> None:
+    """Every invalid endpoint of a router file is reported with line and column."""
     file = tmp_path / "router.json5"
     file.write_text(
         f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, connect: {{ endpoints: ["{endpoint}"] }} }}'
@@ -144,8 +144,8 @@ def test_endpoint_that_is_none(tmp_path: Path, endpoint: str, reasons: list[str]
     assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [True, True], mistakes
 
 
-def test_router_files(tmp_path: Path, endpoint: str) -> None:
-    """A file for zenohd is read as zenohd reads it; what is shipped, or runs, has no mistake in its text."""
+def test_router_files_are_parsed_like_zenohd(tmp_path: Path, endpoint: str) -> None:
+    """Syntax errors, unknown keys and missing files are found; the shipped files and a valid setup have no mistake."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
     broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')
     unknown.write_text('{ mode: "router",\n  lisen: {} }\n')
@@ -160,8 +160,8 @@ def test_router_files(tmp_path: Path, endpoint: str) -> None:
     assert passes("serve", "--check", "--connect", endpoint, "-s", "sim:")
 
 
-def test_certificates_that_expire_are_named(tmp_path: Path) -> None:
-    """Expired, and within 30 days: of a client, and of a router's file; what is valid for longer is not mentioned."""
+def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
+    """Certificates of clients and router files that expire within 30 days are reported, later ones are not."""
     make_authority(tmp_path / "pki")
     for name, days in (("soon", 20), ("late", 200)):
         make_certificate(tmp_path / "pki", name, days=days)
@@ -178,18 +178,18 @@ def test_certificates_that_expire_are_named(tmp_path: Path) -> None:
         f"{settings}, line 3, column 1: this client is",
         f"{router}, line 2, column 24: listen_certificate: it is",
     ]
-    assert all(re.search(r"\d+ days from now: renew it", line) for line in lines), lines
+    assert all(re.search(r"\d+ days left\): renew it", line) for line in lines), lines
     settings.write_text(settings.read_text().replace("soon", "late"))
     assert passes("check", settings)
 
 
-def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path: Path) -> None:
-    """A package that is not installed is no mistake in the settings: a warning says what is not checked, and why."""
+def test_missing_cryptography_package_is_a_warning(start: Start, tmp_path: Path) -> None:
+    """Without `cryptography` the expiry is not checked: a warning, not a mistake in the settings."""
     make_authority(tmp_path / "pki")
     settings = tmp_path / "nedbus.toml"
     settings.write_text(f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n')
     program = "import sys; sys.modules['cryptography'] = None; from nedbus.cli import main; main()"
     checked = start("-c", program, "check", str(settings))
     assert (checked.wait(), checked.out) == (0, "no mistakes found\n"), checked.err
-    reason = "the expiry of the certificate is not checked: cryptography: not installed"
+    reason = "certificate expiry not checked: cryptography: not installed"
     assert f"{tmp_path}/pki/ca.crt: {reason}" in checked.err

@@ -1,4 +1,4 @@
-"""`nedbus echo`: what it prints, how it ends, and what a paused one costs a replay."""
+"""`nedbus echo`: its output, its exit codes, and the effect of a blocked one on a replay."""
 
 from __future__ import annotations
 
@@ -26,49 +26,51 @@ from nedbus.transport import Session
 from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import open_replay
-from tests.nedbus.cli.output.test_terminal import flying as standing
-from tests.peers.command_line import Ended, fork_command, run_command
-from tests.peers.processes import Forked, Start, Zygote
+from tests.nedbus.cli.output.test_terminal import publishing
+from tests.peers.command_line import CommandResult, fork_command, run_command
+from tests.peers.processes import ForkedProcess, ForkServer, Start
 from tests.waits import DEADLINE, wait_for
 
-from .test_query import flying
+from .test_query import simulation
 
-__all__ = ["flying"]  # a fixture
+__all__ = ["simulation"]  # a fixture
 
 pytestmark = pytest.mark.process
 
-# 4,000 messages: more than a lossless publisher is ahead of a paused reader
+# 4,000 messages, more than the window of a lossless publisher
 REPLAY = f"sim:?duration=40&speed=max&topics={VLP}"
-LINE = 1000  # bytes that a line of JSON has at least
+LINE = 1000  # minimum length of a line of JSON [bytes]
 
 
-def echo(endpoint: str, *options: str) -> Ended:
-    """Run `nedbus echo` with options that end it."""
+def echo(endpoint: str, *options: str) -> CommandResult:
+    """Run `nedbus echo` with options that make it exit."""
     ended = run_command("echo", "-c", endpoint, *options)
     assert ended.exit_code == 0, ended.err
     return ended
 
 
 class Paused(NamedTuple):
-    """`nedbus echo` whose stdout is a full pipe that nobody reads, until `resume`."""
+    """`nedbus echo` with a full pipe as stdout, which is not read before `resume`."""
 
-    process: Forked
+    process: ForkedProcess
     is_full: Callable[[], bool]
     resume: Callable[[], None]
 
 
 @pytest.fixture
-def pause_echo(zygote: Zygote, endpoint: str, bus: nedbus.Bus) -> Callable[..., AbstractContextManager[Paused]]:
-    """Return what starts `nedbus echo --json` with more options, and publishes until its output blocks."""
+def pause_echo(
+    fork_server: ForkServer, endpoint: str, bus: nedbus.Bus
+) -> Callable[..., AbstractContextManager[Paused]]:
+    """Return a context manager that starts `nedbus echo --json` and publishes until its output blocks."""
 
     @contextmanager
     def pause(*options: str) -> Iterator[Paused]:
         output, write_end = os.pipe()
         capacity = fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
-        process = fork_command(zygote, "echo", "-c", endpoint, "--json", *options, out=write_end)
+        process = fork_command(fork_server, "echo", "-c", endpoint, "--json", *options, out=write_end)
         os.close(write_end)
 
-        def is_full() -> bool:  # so that the next line blocks the process
+        def is_full() -> bool:  # the next line blocks the process
             unread = struct.unpack("i", fcntl.ioctl(output, termios.FIONREAD, bytes(4)))[0]
             return bool(unread > capacity - LINE)
 
@@ -96,16 +98,16 @@ def pause_echo(zygote: Zygote, endpoint: str, bus: nedbus.Bus) -> Callable[..., 
 
 
 @pytest.mark.parametrize("arguments", [["--topic", VLP], [VLP], ["/" + VLP], ["1/" + VLP], []])
-def test_echo_prints_a_line_each(flying: str, arguments: list[str]) -> None:
-    """--topic, --vehicle and --count choose; the topic, which is the position by default, may be an argument too."""
-    lines = echo(flying, "--count", "5", *arguments).out.splitlines()
+def test_echo_prints_one_line_per_message(simulation: str, arguments: list[str]) -> None:
+    """The topic is an option or an argument, by default vehicle_local_position; --count limits the lines."""
+    lines = echo(simulation, "--count", "5", *arguments).out.splitlines()
     assert len(lines) == 5
     assert all(line.startswith("1/vehicle_local_position ") and " ned " in line for line in lines)
 
 
-def test_echo_json_is_the_message(flying: str) -> None:
-    """Each line is JSON that the model reads back, "Infinity" included; the topic "*" is all topics."""
-    rows = [json.loads(line) for line in echo(flying, "--json", "-n", "50", "*").out.splitlines()]
+def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
+    """Each line is JSON that the model validates, "Infinity" included; the topic "*" selects all topics."""
+    rows = [json.loads(line) for line in echo(simulation, "--json", "-n", "50", "*").out.splitlines()]
     has = {each.address.topic: each.fields.keys() for each in open_replay("sim:?duration=15&speed=max").messages}
     assert len(rows) == 50
     for row in rows:
@@ -117,49 +119,49 @@ def test_echo_json_is_the_message(flying: str) -> None:
     assert len({row["topic"] for row in rows}) > 1
 
 
-def test_echo_full_prints_every_field(flying: str) -> None:
-    """--full has all 53 fields, each on its line."""
-    blocks = echo(flying, "--full", "-n", "2", VLP).out.split("---\n")
+def test_echo_full_prints_every_field(simulation: str) -> None:
+    """--full prints all 53 fields, one per line."""
+    blocks = echo(simulation, "--full", "-n", "2", VLP).out.split("---\n")
     assert len(blocks) == 3
     names = [line.split(":")[0].strip() for line in blocks[0].splitlines()[1:]]
     assert names == list(VehicleLocalPosition.model_fields)
 
 
-def test_interrupt_is_130(run_nedbus: Start, flying: str) -> None:
-    """Ctrl-C ends echo at once and quietly."""
-    process = run_nedbus("echo", "-c", flying, measured=False)
+def test_interrupt_exits_with_130(run_nedbus: Start, simulation: str) -> None:
+    """Ctrl-C ends `nedbus echo` at once, without a traceback."""
+    process = run_nedbus("echo", "-c", simulation, coverage=False)
     wait_for(lambda: process.out, what="a line")
     process.signal(signal.SIGINT)
     assert process.wait() == 130
     assert "Traceback" not in process.err
 
 
-def test_closed_pipe_is_no_error(flying: str, zygote: Zygote) -> None:
-    """`nedbus echo | head` ends without a message."""
+def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> None:
+    """`nedbus echo | head` ends without an error message."""
     read_end, write_end = os.pipe()
     with Path("err").open("wb") as err, os.fdopen(read_end) as head:
-        process = fork_command(zygote, "echo", "-c", flying, out=write_end, err=err.fileno())
+        process = fork_command(fork_server, "echo", "-c", simulation, out=write_end, err=err.fileno())
         os.close(write_end)
         assert all(head.readline().startswith(f"1/{VLP} ") for _ in range(3))
     assert process.wait(DEADLINE) == 0
     assert Path("err").read_text() == ""
 
 
-def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
-    """Losses and invalid payloads are counted on stderr at the end."""
+def test_echo_prints_counts_at_exit(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """Lost messages and invalid payloads are counted on stderr at exit."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     process = run_nedbus("echo", "-c", endpoint, "-n", "2")
     wait_for(lambda: process.out, what="the first line")
-    raw.put(publisher.key, b"garbage")
+    zenoh_session.put(publisher.key, b"garbage")
     wait_for(lambda: "not a VehicleLocalPosition" in process.err, what="the warning")
     publisher.publish(message(2))
     assert process.wait() == 0
     assert "2 received, 0 lost, 0 skipped (--every prints all), 1 invalid" in process.err
 
 
-def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, timings: Timings) -> None:
-    """A last value is marked as old by echo, and hz does not measure it."""
+def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Timings) -> None:
+    """`echo` marks an old last message as old, and `hz` does not measure it."""
     timings.old = 0.01
     bus.publisher(VLP, vehicle="1").publish(message(1))
     wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
@@ -169,12 +171,12 @@ def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, ti
     assert "nothing arrived" in hz.err
 
 
-def test_paused_echo_does_not_hold_up_a_replay(
+def test_blocked_echo_does_not_delay_a_replay(
     run_nedbus: Start, endpoint: str, pause_echo: Callable[..., AbstractContextManager[Paused]]
 ) -> None:
-    """A replay as fast as its readers take it ends, though the output of an echo is blocked: it is of mode "latest".
+    """A replay at speed=max ends while the output of an echo is blocked, as echo subscribes with mode "latest".
 
-    With --every it waits, and ends when that output is read.
+    With --every the replay waits until that output is read.
     """
     replay = ("serve", "--connect", endpoint, "--until-done", "-s", REPLAY)
     with pause_echo() as paused:
@@ -191,8 +193,8 @@ def test_paused_echo_does_not_hold_up_a_replay(
         assert service.wait() == 0, service.err
 
 
-def test_echo_every_skips_nothing(run_nedbus: Start, endpoint: str) -> None:
-    """--every prints each message of a replay, in order, however fast it comes; its help warns that a replay waits."""
+def test_echo_every_prints_all_messages(run_nedbus: Start, endpoint: str) -> None:
+    """--every prints all messages of a replay in order, at any speed; its help warns that the replay waits."""
     assert "a replay at speed=max waits" in run_command("echo", "--help", COLUMNS="300").out
     run_nedbus("serve", "--connect", endpoint, "-s", f"sim:?duration=10&speed=max&wait=1&topics={VLP}")
     lines = echo(endpoint, "--json", "--every", "-n", "1000").out.splitlines()
@@ -201,9 +203,9 @@ def test_echo_every_skips_nothing(run_nedbus: Start, endpoint: str) -> None:
     assert {later - earlier for earlier, later in pairwise(timestamps)} == {10_000}
 
 
-def test_echo_csv_of_two_vehicles(endpoint: str, bus: nedbus.Bus) -> None:
-    """--csv --field x,y,z writes names, then a row for each message of all vehicles; NaN and pairs included."""
-    with standing(bus, "1", "2"):
+def test_echo_csv_has_a_row_per_message(endpoint: str, bus: nedbus.Bus) -> None:
+    """--csv writes a header line and one row per message of all vehicles; arrays have one column per element."""
+    with publishing(bus, "1", "2"):
         lines = echo(endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "10").out.splitlines()
         head, row = csv.reader(echo(endpoint, "--csv", "--once").out.splitlines())
     assert len(head) == len(row) == 5 + len(VehicleLocalPosition.model_fields) + 2 + 1
@@ -219,18 +221,18 @@ def test_echo_csv_of_two_vehicles(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
-    """A position has its state whatever fields are chosen, and the end of a CSV tells what is not in it."""
+    """Every row of a position has its state, whatever fields are selected; stderr counts the missing messages."""
     bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
-    shown = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
-    [row] = csv.DictReader(shown.out.splitlines())
+    result = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
+    [row] = csv.DictReader(result.out.splitlines())
     assert row["state"] == "xy invalid"
-    assert shown.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
+    assert result.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
 
 
-def test_echo_shows_chosen_fields(flying: str) -> None:
-    """--field chooses in every form; --once ends after one message."""
+def test_echo_field_selects_fields(simulation: str) -> None:
+    """--field selects fields in every format; --once exits after one message."""
     for form, text in (([], "  x "), (["--full"], "\n  x: "), (["--json"], '"message": {"x":')):
-        out = echo(flying, "--once", "--field", "x,z", *form).out
+        out = echo(simulation, "--once", "--field", "x,z", *form).out
         assert text in out
         assert "vx" not in out
         assert out.count("vehicle_local_position") == 1

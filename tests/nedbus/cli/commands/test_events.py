@@ -1,6 +1,6 @@
-"""`nedbus events` and `nedbus why`: of files, and live; the peers are a service and scripts in other processes.
+"""`nedbus events` and `nedbus why` on files and live data, with services and scripts in other processes as peers.
 
-The logs are small ones in PX4's format, and where it is said so a real one of PX4 1.17.
+The logs are small generated ULogs, and one real log of PX4 1.17.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import pytest
 import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
-from nedbus.sources import read_account, source_text_of_file
+from nedbus.sources import read_file_events, source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
-from tests.flights.ulogs import LOGS, UlogWriter, account_of
-from tests.peers.command_line import Ended, run_command
+from tests.flights.ulogs import LOGS, UlogWriter, cached_events
+from tests.peers.command_line import CommandResult, run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
-from tests.waits import repeating, wait_for, wait_for_reader
+from tests.waits import repeating, wait_for, wait_for_matching
 
 REAL = LOGS.parent / "px4" / "twelve_messages.ulg"
-TOLD = [
+EXPECTED_EVENTS = [
     ("5.000", "WATCH", "dead reckoning"),
     ("8.000", "BAD", "xy not valid  <- dead reckoning (3.0 s before)"),
     ("8.000", "BAD", "vxy not valid  <- dead reckoning (3.0 s before)"),
     ("12.000", "", "xy valid again after 4.0 s"),
     ("12.000", "", "vxy valid again after 4.0 s"),
-    ("12.000", "", "dead reckoning ends after 7.0 s"),
+    ("12.000", "", "dead reckoning ended after 7.0 s"),
 ]
 MISSING = "vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags"
 VERDICT = f"""\
@@ -48,7 +48,7 @@ WHY = f"""\
   before it
     5.000  dead reckoning (3.0 s before)
   ended at 12.000 with
-    12.000  dead reckoning ends after 7.0 s
+    12.000  dead reckoning ended after 7.0 s
   missing topics that may explain it: {MISSING}; \
 PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)
 """
@@ -56,7 +56,7 @@ AT = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the re
 
 
 def write_flight(path: Path, *, fault: bool = True) -> Path:
-    """Write a log of 20 s at 10 Hz, of which four seconds are not valid, after three of dead reckoning."""
+    """Write a log of 20 s at 10 Hz; with `fault`, 3 s of dead reckoning and then 4 s of invalid position."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 210):
@@ -75,48 +75,48 @@ def log(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have all commands read the real log once: what they say of it is what is tested."""
-    where = "nedbus.cli.commands.events.read_account"
-    monkeypatch.setattr(where, lambda path: (account_of if path == REAL else read_account)(path))
+    """Cache the parsed real log for all tests: only the output of the commands is tested."""
+    target = "nedbus.cli.commands.events.read_file_events"
+    monkeypatch.setattr(target, lambda path: (cached_events if path == REAL else read_file_events)(path))
 
 
-def lines_of(shown: Ended) -> list[tuple[str, str, str]]:
+def lines_of(result: CommandResult) -> list[tuple[str, str, str]]:
     """Return time, severity and text of each line."""
-    found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in shown.out.splitlines()]
+    found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in result.out.splitlines()]
     return [(match[1], match[2] or "", match[3]) for match in found if match]
 
 
-def test_events_of_a_file(log: Path) -> None:
-    """A line each, with the evidence; stderr says what the times are."""
-    shown = run_command("events", str(log))
-    assert (shown.exit_code, shown.err) == (0, "times: seconds since boot, no message contains UTC\n")
-    assert lines_of(shown) == TOLD
-    assert len(shown.out.splitlines()) == len(TOLD)
+def test_events_of_a_file_have_evidence(log: Path) -> None:
+    """One line per event with its evidence; stderr names the clock of the times."""
+    result = run_command("events", str(log))
+    assert (result.exit_code, result.err) == (0, "times: seconds since boot, no message contains UTC\n")
+    assert lines_of(result) == EXPECTED_EVENTS
+    assert len(result.out.splitlines()) == len(EXPECTED_EVENTS)
 
 
 @pytest.mark.parametrize(("severity", "count"), [("bad", 2), ("watch", 3), ("info", 6)])
-def test_events_by_severity(log: Path, severity: str, count: int) -> None:
-    """These, and worse ones."""
+def test_severity_selects_events(log: Path, severity: str, count: int) -> None:
+    """--severity selects events of this severity and worse ones."""
     assert len(run_command("events", str(log), "--severity", severity).out.splitlines()) == count
 
 
 @pytest.mark.parametrize(("origin", "count"), [("nedbus", 6), ("px4", 0), ("*", 6)])
-def test_events_by_origin(log: Path, origin: str, count: int) -> None:
-    """PX4's own texts, or what nedbus derives; the log has none of the former."""
+def test_origin_selects_events(log: Path, origin: str, count: int) -> None:
+    """--origin selects PX4's own texts, none in this log, or the events that nedbus derives."""
     assert len(run_command("events", str(log), "--origin", origin).out.splitlines()) == count
 
 
-def test_events_as_json_and_csv(log: Path) -> None:
-    """Both have every field; JSON is valid without NaN, CSV has evidence and numbers in a cell each."""
+def test_json_and_csv_events_have_every_field(log: Path) -> None:
+    """Both formats have every field; JSON contains no NaN, and CSV has one cell each for evidence and numbers."""
 
     def refuse(constant: str) -> None:
-        pytest.fail(f"{constant} is no JSON")
+        pytest.fail(f"{constant} is not valid JSON")
 
     events = [
         json.loads(line, parse_constant=refuse) for line in run_command("events", str(log), "--json").out.splitlines()
     ]
     assert [(each["boot"], each["text"]) for each in events] == [
-        (float(at), text.partition("  <- ")[0]) for at, _, text in TOLD
+        (float(at), text.partition("  <- ")[0]) for at, _, text in EXPECTED_EVENTS
     ]
     assert events[1] == {
         "time": None, "clock": "boot", "vehicle": "1", "kind": "xy_invalid", "change": "begin", "severity": "bad",
@@ -130,47 +130,48 @@ def test_events_as_json_and_csv(log: Path) -> None:
     assert rows[1]["evidence"] == "dead_reckoning 3.0 s"
 
 
-def test_events_of_a_recording_are_those_of_its_log(log: Path, tmp_path: Path) -> None:
-    """Converted to MCAP the flight tells the same."""
+def test_converted_log_has_the_same_events(log: Path, tmp_path: Path) -> None:
+    """A log converted to MCAP has the same events."""
     assert run_command("convert", str(log), "flight.mcap").exit_code == 0
-    assert lines_of(run_command("events", "flight.mcap")) == TOLD
+    assert lines_of(run_command("events", "flight.mcap")) == EXPECTED_EVENTS
     assert "'nedbus record' without --topic" in run_command("why", "flight.mcap", "--all").out
 
 
 @pytest.mark.logs
-@pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} is not there")
+@pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.slow
 @pytest.mark.usefixtures("read_once")
-def test_events_of_a_real_flight() -> None:
-    """A log of PX4 1.17 with twelve messages, and the MCAP that was converted from it."""
+def test_real_flight_has_expected_events() -> None:
+    """A log of PX4 1.17 and the MCAP converted from it have the same events, with causes."""
     assert run_command("convert", str(REAL), "flight.mcap", "--topics", "*").exit_code == 0
 
     def events_of(file: str) -> list[tuple[str, str, str]]:
-        told = [json.loads(line) for line in run_command("events", file, "--json").out.splitlines()]
-        return sorted((each["time"], each["text"], each["topic"]) for each in told)
+        events = [json.loads(line) for line in run_command("events", file, "--json").out.splitlines()]
+        return sorted((each["time"], each["text"], each["topic"]) for each in events)
 
-    told = events_of(str(REAL))
-    assert len([topic for _, _, topic in told if topic != "log_message"]) == 63
-    assert events_of("flight.mcap") == told
-    assert "23:09:04.9  1        BAD    xy not valid  <- GPS fix 3D to none, 10 satellites to 0 (5.1 s before)" in (
-        run_command("events", str(REAL)).out
+    events = events_of(str(REAL))
+    assert len([topic for _, _, topic in events if topic != "log_message"]) == 63
+    assert events_of("flight.mcap") == events
+    assert (
+        "23:09:04.9  1        BAD    xy not valid  <- GPS fix lost: 3D to none, satellites 10 to 0 (5.1 s before)"
+        in (run_command("events", str(REAL)).out)
     )
     story = run_command("why", str(REAL), "--all").out
     fault = "xy and vxy not valid from 23:09:04.9 to 23:09:20.8 UTC (15.9 s)"
-    begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix 3D to none, 10 satellites to 0"
+    begin = f"1: not usable: {fault}. Evidence: 23:08:59.8 GPS fix lost: 3D to none, satellites 10 to 0"
     assert story.startswith(begin)
     assert f"\n\n1: {fault}\n  before it\n    23:08:59.8  GPS fix" in story
     assert "missing topics" not in story
 
 
-def test_why_of_a_file(log: Path) -> None:
-    """The verdict; with --all each fault with what precedes it, and the topics that the log does not have."""
-    shown = run_command("why", str(log))
-    assert (shown.exit_code, shown.out, shown.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
-    shown = run_command("why", str(log), "--all")
-    assert (shown.exit_code, shown.out, shown.err) == (0, WHY, "")
-    told = json.loads(run_command("why", str(log), "--json").out)
-    verdict, (story,) = told["verdict"], told["faults"]
+def test_why_prints_verdict_and_faults(log: Path) -> None:
+    """`why` prints the verdict; --all also each fault with the preceding events and the topics missing in the log."""
+    result = run_command("why", str(log))
+    assert (result.exit_code, result.out, result.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
+    result = run_command("why", str(log), "--all")
+    assert (result.exit_code, result.out, result.err) == (0, WHY, "")
+    report = json.loads(run_command("why", str(log), "--json").out)
+    verdict, (story,) = report["verdict"], report["faults"]
     assert (verdict["text"], verdict["usable"]) == (VERDICT[3:-1], False)
     assert [verdict[name]["boot"] for name in ("begin", "end")] == [8.0, 12.0]
     assert [each["kind"] for each in verdict["cause"]] == ["dead_reckoning"]
@@ -179,63 +180,63 @@ def test_why_of_a_file(log: Path) -> None:
     assert story["lacking"][0] == "vehicle_gps_position"
 
 
-def test_why_of_a_moment(log: Path) -> None:
-    """--at names a moment, since boot or since the start of the recording, where nothing tells UTC."""
+def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
+    """Without UTC in the log, --at takes seconds since boot or since the start of the recording."""
     for moment in ("10", "+9"):
         assert run_command("why", str(log), "--at", moment, "--all").out == WHY
-    shown = run_command("why", str(log), "--at", "6.5").out
-    assert shown.startswith(
+    result = run_command("why", str(log), "--at", "6.5").out
+    assert result.startswith(
         "1: position valid throughout, but dead reckoning from 5.000 to 12.000 s since boot (7.0 s)."
     )
-    shown = run_command("why", str(log), "--at", "19").out
-    assert shown.startswith("1: no fault then; the nearest: xy and vxy not valid from 8.000 to 12.000 s")
+    result = run_command("why", str(log), "--at", "19").out
+    assert result.startswith("1: no fault at that time; nearest: xy and vxy not valid from 8.000 to 12.000 s")
 
 
 @pytest.mark.logs
-@pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} is not there")
+@pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.usefixtures("read_once")
-def test_why_of_a_moment_in_both_clocks() -> None:
-    """UTC, as the real log's messages tell it, and seconds since boot are the same moment."""
+def test_why_at_accepts_utc_and_seconds() -> None:
+    """--at with UTC, and with the same time since boot, print the same."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
-    assert "GPS fix 3D to none, 10 satellites to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
+    assert "GPS fix lost: 3D to none, satellites 10 to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
     for moment in ("27.557", "+27.325"):
         assert run_command("why", str(REAL), "--at", moment).out == by_utc
 
 
-def test_nothing_was_wrong(tmp_path: Path) -> None:
-    """A flight without a fault: neither command is silent, and both say how long it was."""
+def test_flight_without_faults_reports_its_duration(tmp_path: Path) -> None:
+    """Without faults both commands report the duration of the flight."""
     log = str(write_flight(tmp_path / "good.ulg", fault=False))
-    shown = run_command("events", log)
-    assert (shown.exit_code, shown.out) == (0, "")
-    assert shown.err == f"{log}: no events in 20 s\n"
+    result = run_command("events", log)
+    assert (result.exit_code, result.out) == (0, "")
+    assert result.err == f"{log}: no events in 20 s\n"
     assert run_command("events", log, "--severity", "bad").err == f"{log}: no events of severity bad in 20 s\n"
-    shown = run_command("why", log)
-    assert (shown.exit_code, shown.out, shown.err) == (0, "1: no faults in 20 s\n", "")
+    result = run_command("why", log)
+    assert (result.exit_code, result.out, result.err) == (0, "1: no faults in 20 s\n", "")
 
 
-def test_what_never_was_valid_is_said(tmp_path: Path) -> None:
-    """It is no event, as nothing changed."""
+def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
+    """An estimate that is invalid throughout causes no event, so stderr and the verdict report it."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(1, 50):
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = str(writer.write(tmp_path / "never.ulg"))
     assert run_command("events", log).err == "throughout the file: 1: xy not valid\n"
-    begin = "1: not usable: xy not valid from the first message on, until the end (4.8 s)."
+    begin = "1: not usable: xy not valid from the first message until the end (4.8 s)."
     assert run_command("why", log).out.startswith(begin)
 
 
-def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of more than an account keeps the last are told, and that there were more."""
-    monkeypatch.setattr("nedbus.sources.account.KEPT_OF_FILE", 2000)
+def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more events than the limit, the last ones are shown, and stderr has the total."""
+    monkeypatch.setattr("nedbus.sources.file_events.MAX_FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
     for second in range(2200):
         writer.add(VLP, message((second + 1) * 1_000_000, **VALID | {"xy_reset_counter": second % 256}))
     log = str(writer.write(tmp_path / "long.ulg"))
-    shown = run_command("events", log)
-    assert len(shown.out.splitlines()) == 2000
-    assert f"{log}: showing the last 2000 of 2199 events\n" in shown.err
+    result = run_command("events", log)
+    assert len(result.out.splitlines()) == 2000
+    assert f"{log}: showing the last 2000 of 2199 events\n" in result.err
 
 
 @pytest.mark.parametrize(
@@ -246,7 +247,7 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (("why", "LOG", "--at", "noon"), 2, "nedbus: --at: 'noon': not a time: EXPECTED\n"),
         (("why", "LOG", "--at", "nan"), 2, "nedbus: --at: 'nan': not a time: EXPECTED\n"),
         (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': not a time: EXPECTED\n"),
-        (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle gives UTC: EXPECTED\n"),
+        (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle has UTC: EXPECTED\n"),
         (("events", "LOG", "--severity", "dire"), 2, "nedbus: --severity: 'dire': expected bad or watch or info\n"),
         (("events", "LOG", "--origin", "gcs"), 2, "nedbus: --origin: 'gcs': expected px4 or nedbus or *\n"),
         (("events", "LOG", "--within", "60"), 2, "nedbus: --within: needs live vehicles, not a file\n"),
@@ -258,31 +259,31 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (("why", "not.ulg"), 1, "nedbus: "),
     ],
 )  # fmt: skip
-def test_mistake_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ...], code: int, text: str) -> None:
-    """A mistyped command is answered in one line, with what to do; 2 is a wrong call, 1 a failure."""
+def test_error_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ...], code: int, text: str) -> None:
+    """An error is one line with a remedy; the exit code is 2 for wrong usage and 1 for a failure."""
     (tmp_path / "note.txt").write_text("no log")
     (tmp_path / "not.ulg").write_text("no log")
-    shown = run_command(*(str(log) if each == "LOG" else each for each in arguments))
+    result = run_command(*(str(log) if each == "LOG" else each for each in arguments))
     text = text.replace("LOG", str(log)).replace("EXPECTED", f"expected {AT}")
-    assert shown.err.startswith(text)
-    assert (shown.exit_code, shown.out) == (code, "")
-    assert len(shown.err.splitlines()) == 1
+    assert result.err.startswith(text)
+    assert (result.exit_code, result.out) == (code, "")
+    assert len(result.err.splitlines()) == 1
 
 
-def test_no_router_and_no_service(endpoint: str) -> None:
-    """Without a router, and without a service that remembers anything, why says what is missing."""
+def test_why_without_router_or_service_fails(endpoint: str) -> None:
+    """Without a router, or without a service with a history, `why` names what is missing."""
     closed = free_endpoint()
-    shown = run_command("why", "-c", closed)
-    assert shown.exit_code == 1
-    assert len(shown.err.splitlines()) == 1
-    shown = run_command("why", "-c", endpoint)
-    assert (shown.exit_code, shown.err) == (
+    result = run_command("why", "-c", closed)
+    assert result.exit_code == 1
+    assert len(result.err.splitlines()) == 1
+    result = run_command("why", "-c", endpoint)
+    assert (result.exit_code, result.err) == (
         1, f"nedbus: no nedbus service at {endpoint} has data of a vehicle: start one with 'nedbus serve'\n"
     )  # fmt: skip
 
 
 def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: str) -> None:
-    """Start a service in another process, and wait until all vehicles have flown."""
+    """Start a service in another process, and wait until all replays have ended."""
     options = [part for source in sources for part in ("-s", source)]
     run_nedbus("serve", "-c", endpoint, *options)
     wait_for(lambda: sum(len(each.vehicles) for each in bus.accounts()) == len(sources), what="the vehicles")
@@ -294,67 +295,69 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
     wait_for(has_ended, what="the end of the flights")
 
 
-def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path) -> None:
-    """A service in another process tells what it saw of all vehicles or of one, but not of one of a script."""
+def test_why_live_uses_service_history(
+    run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path
+) -> None:
+    """`why` uses the history of a service for all or one vehicle; a vehicle of a script has no history."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
-    shown = run_command("why", "-c", endpoint)
-    assert (shown.exit_code, shown.err) == (0, "--all shows 1 fault in detail\n")
-    assert shown.out.startswith("1: not usable: xy and vxy not valid from ")
-    assert shown.out.endswith("\n2: no faults in the history of the services\n")
+    result = run_command("why", "-c", endpoint)
+    assert (result.exit_code, result.err) == (0, "--all shows 1 fault in detail\n")
+    assert result.out.startswith("1: not usable: xy and vxy not valid from ")
+    assert result.out.endswith("\n2: no faults in the services' history\n")
     bus.publisher(VLP, vehicle="mocap1").publish(message(1))
-    shown = run_command("why", "-c", endpoint, "-v", "mocap1")
+    result = run_command("why", "-c", endpoint, "-v", "mocap1")
     reason = "vehicle mocap1 is published, but no nedbus service keeps its history"
     hint = "follow it with 'nedbus events --vehicle mocap1'"
-    assert (shown.exit_code, shown.err) == (1, f"nedbus: {reason}: {hint}\n")
-    assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the history of the services\n"
-    shown = run_command("why", "-c", endpoint, "-v", "1", "--all")
+    assert (result.exit_code, result.err) == (1, f"nedbus: {reason}: {hint}\n")
+    assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the services' history\n"
+    result = run_command("why", "-c", endpoint, "-v", "1", "--all")
     clock = r"\d\d:\d\d:\d\d\.\d"
     fault = rf"xy and vxy not valid from {clock} to {clock} UTC \(\d+ ms\)"
     begin = rf"1: not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
-    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", shown.out)
-    assert "to publish them: PX4's dds_topics.yaml" in shown.out
+    assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", result.out)
+    assert "to publish them, add them to PX4's dds_topics.yaml" in result.out
     since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
-    assert set(shown.out.splitlines()) <= set(since_boot.out.splitlines())
+    assert set(result.out.splitlines()) <= set(since_boot.out.splitlines())
     refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")
-    assert (refused.exit_code, "--at: '+3': live data has no start to count from" in refused.err) == (2, True)
-    at = re.search(r"\d\d:\d\d:\d\d\.\d", shown.out)
+    assert (refused.exit_code, "--at: '+3': live data has no start" in refused.err) == (2, True)
+    at = re.search(r"\d\d:\d\d:\d\d\.\d", result.out)
     assert at
     assert run_command("why", "-c", endpoint, "-v", "1", "--at", at[0]).out.startswith("1: ")
-    shown = run_command("why", "-c", endpoint, "-v", "7")
-    assert (shown.exit_code, shown.err) == (
+    result = run_command("why", "-c", endpoint, "-v", "7")
+    assert (result.exit_code, result.err) == (
         2,
         "nedbus: --vehicle: no vehicle 7 in the network: choose one of 1, 2\n",
     )
 
 
-def test_why_live_of_what_held_before(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
-    """A vehicle that was never valid since the service began is not told to be well."""
+def test_why_live_reports_initial_faults(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+    """A vehicle that has been invalid since the service started is reported as not usable."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(1, 50):
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = writer.write(tmp_path / "never.ulg")
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
-    begin = "1: not usable: xy not valid from the first message on, until now ("
+    begin = "1: not usable: xy not valid from the first message until now ("
     assert run_command("why", "-c", endpoint).out.startswith(begin)
 
 
-def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
-    """--within shows them first, from a service in another process, and then what happens."""
+def test_events_within_shows_the_history(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+    """--within first shows past events from the history of a service."""
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
     follower = run_nedbus("events", "-c", endpoint, "--within", "600", "--json", "-v", "1")
-    wait_for(lambda: len(follower.out.splitlines()) == len(TOLD), what="what happened")
-    told: list[dict[str, Any]] = [json.loads(line) for line in follower.out.splitlines()]
-    assert [each["text"].partition(" after")[0] for each in told] == [
-        text.partition("  <- ")[0].partition(" after")[0] for _, _, text in TOLD
+    wait_for(lambda: len(follower.out.splitlines()) == len(EXPECTED_EVENTS), what="the history")
+    events: list[dict[str, Any]] = [json.loads(line) for line in follower.out.splitlines()]
+    assert [each["text"].partition(" after")[0] for each in events] == [
+        text.partition("  <- ")[0].partition(" after")[0] for _, _, text in EXPECTED_EVENTS
     ]
-    assert {each["clock"] for each in told} == {"host"}
-    assert [each["kind"] for each in told[1]["evidence"]] == ["dead_reckoning"]
+    assert {each["clock"] for each in events} == {"host"}
+    assert [each["kind"] for each in events[1]["evidence"]] == ["dead_reckoning"]
 
 
-def test_texts_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
-    """A service keeps PX4's own texts, and `events --within` and `why` show them as they do from a file."""
+def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+    """A service keeps PX4's own texts; `events --within` and `why` show them as from a file."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 60):
@@ -366,16 +369,18 @@ def test_texts_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endp
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
     follower = run_nedbus("events", "-c", endpoint, "--within", "600", "--origin", "px4")
     wait_for(lambda: len(follower.out.splitlines()) == 2, what="the texts")
-    for shown in (follower.out, run_command("events", str(log), "--origin", "px4").out):
-        first, second = shown.splitlines()
+    for result in (follower.out, run_command("events", str(log), "--origin", "px4").out):
+        first, second = result.splitlines()
         assert first.endswith('1        WATCH  PX4: "[ekf2] reset"')
         assert second.endswith('PX4: "[failsafe] Failsafe activated"')
-    for shown in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
-        assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in shown
+    for result in (run_command("why", "-c", endpoint).out, run_command("why", str(log)).out):
+        assert 'PX4: "[ekf2] reset", PX4: "[failsafe] Failsafe activated"' in result
 
 
-def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
-    """Events of a script's vehicle are told as they happen, and conditions from before are said."""
+def test_events_live_are_printed_as_they_happen(
+    run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
+) -> None:
+    """Events of a script's vehicle are shown as they happen; stderr names conditions that were active before."""
     fields: dict[str, object] = VALID | {"z_valid": False}
     with bus.publisher(VLP, vehicle="7") as publisher:
 
@@ -384,9 +389,9 @@ def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint:
 
         publish()
         follower = run_nedbus("events", "-c", endpoint)
-        wait_for_reader(raw, "nedbus/7/vehicle_local_position")
+        wait_for_matching(zenoh_session, "nedbus/7/vehicle_local_position")
         with repeating(publish):
-            wait_for(lambda: "7: z not valid, from the start\n" in follower.err, what="what held before")
+            wait_for(lambda: "7: z not valid, from the start\n" in follower.err, what="the initial condition")
             assert follower.out == ""
             fields["xy_valid"] = False
             wait_for(lambda: "xy not valid" in follower.out, what="the event")
@@ -399,8 +404,10 @@ def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint:
     assert lines[0][1].startswith("BAD    xy not valid")
 
 
-def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
-    """--vehicle leaves out the others, --severity what is not as bad."""
+def test_events_live_filter_by_vehicle_and_severity(
+    run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
+) -> None:
+    """--vehicle hides other vehicles, and --severity hides less severe events."""
     fields: dict[str, object] = dict(VALID)
     with bus.publisher(VLP, vehicle="7") as seven, bus.publisher(VLP, vehicle="8") as eight:
 
@@ -409,61 +416,64 @@ def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Ses
                 publisher.publish(message(time.monotonic_ns() // 1000, **fields))
 
         follower = run_nedbus("events", "-c", endpoint, "--vehicle", "8", "--severity", "bad")
-        wait_for_reader(raw, "nedbus/8/vehicle_local_position")
+        wait_for_matching(zenoh_session, "nedbus/8/vehicle_local_position")
         with repeating(publish):
-            heard = bus.subscribe(VLP, vehicle="8")
-            heard.receive(30)
+            subscription = bus.subscribe(VLP, vehicle="8")
+            subscription.receive(30)
             wait_for(lambda: Address("8", VLP) in {each for all_ in bus.vehicles().values() for each in all_}, what="8")
             for _ in range(2):
                 fields["xy_valid"] = False
                 wait_for(lambda: follower.out.count("xy not valid") > 0, what="the event")
                 fields["xy_valid"] = True
-            heard.close()
+            subscription.close()
         assert "valid again" not in follower.out
         assert {line.split()[1] for line in follower.out.splitlines()} == {"8"}
 
 
 PAGE = Path(__file__).parents[4] / "docs" / "events.md"
 BASH = re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
-SHOWN = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
+DOCUMENTED = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
 
 
-@pytest.mark.parametrize("command", SHOWN)
-def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
-    """Each command of the page does what is said there, of a flight of that name, or of that vehicle, live."""
+@pytest.mark.parametrize("command", DOCUMENTED)
+def test_documented_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+    """Each command of docs/events.md works, on a file or on a live vehicle."""
     assert log.name == "flight.ulg"
     arguments = [str(log) if part == log.name else part for part in command.split()]
     if "flight.ulg" in command:
-        shown = run_command(*arguments)
-        assert shown.exit_code == 0
-        assert "xy" in shown.out or "--at" in command
+        result = run_command(*arguments)
+        assert result.exit_code == 0
+        assert "xy" in result.out or "--at" in command
         return
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=7")
     wait_for(lambda: [each for each in bus.accounts() if "7" in each.vehicles], what="the vehicle")
     if "health" in command:
-        shown = run_command(*arguments, "-c", endpoint)
-        assert (shown.exit_code, shown.err) == (
+        result = run_command(*arguments, "-c", endpoint)
+        assert (result.exit_code, result.err) == (
             1, "nedbus: vehicle 1 is missing: it has no publisher\nnedbus: vehicle 2 is missing: it has no publisher\n"
         )  # fmt: skip
     else:
-        shown = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
-        assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n" * ("events" in command))
+        result = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
+        assert (result.exit_code, result.err) == (
+            0,
+            "times: UTC, from the clocks of the hosts\n" * ("events" in command),
+        )
 
 
-def test_every_kind_is_on_the_page() -> None:
-    """The table of docs/events.md has all kinds, and no other."""
+def test_every_event_kind_is_documented() -> None:
+    """The table of docs/events.md lists exactly the existing kinds of events."""
     rows = re.findall(r"^\| (`.*?) \| .*(?:bad|watch|info)", PAGE.read_text(), re.MULTILINE)
     kinds = [kind for row in rows for kind in re.findall(r"`(\w+)`", row)]
     assert sorted(kinds) == sorted(KINDS)
 
 
-def test_suffix_in_capitals_is_read_by_every_command(log: Path, tmp_path: Path) -> None:
-    """A card formatted as FAT has FLIGHT.ULG, and a converted file may be FLIGHT.MCAP."""
+def test_file_suffix_is_case_insensitive(log: Path, tmp_path: Path) -> None:
+    """Every command reads FLIGHT.ULG, as on an SD card formatted as FAT, and FLIGHT.MCAP."""
     flight, converted = tmp_path / "FLIGHT.ULG", tmp_path / "FLIGHT.MCAP"
     flight.write_bytes(log.read_bytes())
     for arguments in (["convert", flight, converted], ["plot", flight, "-o", tmp_path / "A.PNG"], ["plot", converted]):
-        shown = run_command(*map(str, arguments))
-        assert shown.exit_code == 0, shown.err
+        result = run_command(*map(str, arguments))
+        assert result.exit_code == 0, result.err
     for path in (flight, converted):
         assert run_command("events", str(path)).out == run_command("events", str(log)).out
         assert run_command("why", str(path)).exit_code == 0

@@ -1,4 +1,4 @@
-"""`nedbus health`: green only when services answer, their sources work, and messages flow."""
+"""`nedbus health`: exits with 0 only if services answer, their sources work, and messages arrive."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import UlogWriter
-from tests.peers.answering import answering, reply_with
-from tests.peers.command_line import Ended, run_command
+from tests.peers.command_line import CommandResult, run_command
 from tests.peers.ports import free_port
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
 
-Judge = Callable[..., Ended]
+Health = Callable[..., CommandResult]
 
 
 @pytest.fixture
-def health(endpoint: str) -> Judge:
+def health(endpoint: str) -> Health:
     """Run `nedbus health` with options."""
     return lambda *options: run_command("health", "-c", endpoint, *options)
 
@@ -54,45 +54,45 @@ def wait_for_state(daemon: Daemon, state: str) -> None:
     wait_for(lambda: daemon.sources[0].state == state, what=f"the source to be {state}")
 
 
-def test_nothing_that_flies_is_not_healthy(endpoint: str, health: Judge) -> None:
-    """A service whose sources all work, and of which no vehicle was ever heard."""
+def test_service_without_vehicles_is_not_healthy(endpoint: str, health: Health) -> None:
+    """A service whose sources work but have received no vehicle is not healthy."""
     source = f"mavlink:udpin:127.0.0.1:{free_port()}"
     with serving(endpoint, source) as daemon:
         wait_for_state(daemon, "waiting")
-        shown = health()
-    assert (shown.exit_code, shown.err) == (1, f"nedbus: no vehicle is published: {source} is waiting\n")
+        result = health()
+    assert (result.exit_code, result.err) == (1, f"nedbus: no vehicle is published: {source} is waiting\n")
 
 
-def test_finished_replay_is_not_healthy(endpoint: str, health: Judge, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The newest message must be fresh, whatever the state of the source; --max-age says how fresh."""
-    passed = [0.0]
-    monkeypatch.setattr("nedbus.daemon.worker.Clock.now", staticmethod(lambda: time.monotonic() + passed[0]))
+def test_finished_replay_is_not_healthy(endpoint: str, health: Health, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The newest message must not be older than --max-age, whatever the state of the source."""
+    offset = [0.0]
+    monkeypatch.setattr("nedbus.daemon.worker.Clock.now", staticmethod(lambda: time.monotonic() + offset[0]))
     with serving(endpoint, "sim:?duration=0.1") as daemon:
         wait_for_state(daemon, "done")
-        passed[0] = 100.0
-        shown = health()
-        assert shown.exit_code == 1
-        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", shown.err)
+        offset[0] = 100.0
+        result = health()
+        assert result.exit_code == 1
+        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", result.err)
         assert health("--max-age", "3600").exit_code == 0
 
 
-def test_frozen_service_is_missed(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
-    """With --services 2 both must answer; one that is stopped does not."""
+def test_frozen_service_is_not_healthy(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+    """--services 2 fails if one of two services is frozen (SIGSTOP)."""
     other = run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=2")
     with serving(endpoint, "sim:"):
         wait_for(lambda: len(bus.services(timeout=0.3)) == 2, what="both services")
         wait_for(lambda: health("--services", "2").exit_code == 0, what="health")
         other.signal(signal.SIGSTOP)
         try:
-            shown = health("--services", "2")
+            result = health("--services", "2")
         finally:
             other.signal(signal.SIGCONT)
-    assert shown.exit_code == 1
-    assert "1 of 2 services answer" in shown.err
+    assert result.exit_code == 1
+    assert "1 of 2 services answer" in result.err
 
 
-def test_one_vehicle_is_judged(endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
-    """--vehicle is of that vehicle alone, also of one that a script publishes; one that is not there is missed."""
+def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+    """--vehicle checks only that vehicle, also one that a script publishes, and fails if it is not published."""
     with serving(endpoint, "ulog:/gone.ulg", "sim:") as daemon, bus.publisher(VLP, vehicle="script") as publisher:
         wait_for_state(daemon, "retrying")
         wait_for(lambda: len(bus.vehicles()) == 2, what="both vehicles")
@@ -104,8 +104,8 @@ def test_one_vehicle_is_judged(endpoint: str, bus: nedbus.Bus, health: Judge) ->
         assert health("--vehicle", "a/b").exit_code == 2
 
 
-def test_report_is_json(endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
-    """--json has the verdict, the reason, and the age of each vehicle's newest message, whatever the verdict."""
+def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+    """--json writes the result, the reason and the ages of the newest messages, healthy or not."""
     with serving(endpoint, "sim:"):
         wait_for(lambda: bus.latest() and health().exit_code == 0, what="health")
         report = json.loads(health("--json", "--max-age", "60").out)
@@ -116,29 +116,29 @@ def test_report_is_json(endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
     assert json.loads(missed.out)["reason"].startswith("1 of 5 services answer")
 
 
-def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
-    """--expect names vehicles, --vehicles counts them, on all hosts: also those that a script publishes."""
+def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
+    """--expect requires vehicles by id and --vehicles by number, on any host, including those of scripts."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
         wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
-        shown = health("--expect", "1,7, 8", "--vehicles", "3")
-        assert (shown.exit_code, shown.out) == (1, "")
-        assert shown.err.splitlines() == [
+        result = health("--expect", "1,7, 8", "--vehicles", "3")
+        assert (result.exit_code, result.out) == (1, "")
+        assert result.err.splitlines() == [
             "nedbus: vehicle 7 is missing: it has no publisher",
             "nedbus: vehicle 8 is missing: it has no publisher",
-            "nedbus: 1 of 3 vehicles are heard: 1",
+            "nedbus: messages arrive from 1 of 3 vehicles: 1",
         ]
         publisher.publish(message(1, xy_valid=False))
         options = "--expect", "1,script", "--vehicles", "2", "--max-age", "60"
         wait_for(lambda: health(*options).exit_code == 0, what="both vehicles")
-        shown = health(*options, "--valid", "xy,z")
-        assert shown.err.splitlines() == [
+        result = health(*options, "--valid", "xy,z")
+        assert result.err.splitlines() == [
             "nedbus: vehicle script: xy not valid",
-            "nedbus: vehicle script: the validity of z is unknown, as the vehicle does not send it",
+            "nedbus: vehicle script: validity of z is unknown: the vehicle does not send it",
         ]
 
 
-def test_validity_and_what_happened(endpoint: str, tmp_path: Path, health: Judge) -> None:
-    """--valid judges what is now, --within what was: a line on stderr for each fault, and all of them in --json."""
+def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
+    """--valid checks the current flags, --within past events; stderr has a line per fault, --json has all."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 60):
@@ -149,32 +149,32 @@ def test_validity_and_what_happened(endpoint: str, tmp_path: Path, health: Judge
         wait_for_state(daemon, "done")
         assert health("--max-age", "600").exit_code == 0
         assert health("--max-age", "600", "--valid", "z,vz").exit_code == 0
-        shown = health("--max-age", "600", "--valid", "xy,z")
-        assert shown.exit_code == 1
-        assert re.fullmatch(r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", shown.err)
-        shown = health("--max-age", "600", "--valid", "xy", "--within", "600", "--json")
-        report = json.loads(shown.out)
-        assert (shown.exit_code, report["healthy"], report["reason"]) == (1, False, report["faults"][0])
+        result = health("--max-age", "600", "--valid", "xy,z")
+        assert result.exit_code == 1
+        assert re.fullmatch(r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", result.err)
+        result = health("--max-age", "600", "--valid", "xy", "--within", "600", "--json")
+        report = json.loads(result.out)
+        assert (result.exit_code, report["healthy"], report["reason"]) == (1, False, report["faults"][0])
         texts = [re.sub(r"\d\d:\d\d:\d\d\.\d UTC|[\d.]+ m?s", "T", fault) for fault in report["faults"]]
         assert texts == [
             "vehicle 1: xy not valid, since T (T)",
             "vehicle 1: dead reckoning, at T, T ago",
             "vehicle 1: xy not valid, at T, T ago",
         ]
-        assert len(shown.err.splitlines()) == 3
+        assert len(result.err.splitlines()) == 3
         assert health("--max-age", "600", "--expect", "1", "--within", "0").exit_code == 0
 
 
-def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
-    """A vehicle that its service no longer hears is one, without any option; others are judged beside it."""
+def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
+    """A silent vehicle is a fault without any option; --expect and --vehicle can select others."""
     with serving(endpoint, "sim:") as daemon:
         wait_for(lambda: health().exit_code == 0, what="health")
-        daemon.account.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
-        wait_for(lambda: daemon.account.state("2", time.time()).severity == "bad", what="silence")
-        shown = health()
-        assert shown.exit_code == 1
+        daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
+        wait_for(lambda: daemon.event_log.state("2", time.time()).severity == "bad", what="silence")
+        result = health()
+        assert result.exit_code == 1
         assert re.fullmatch(
-            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n", shown.err
+            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n", result.err
         )
         assert health("--expect", "1").exit_code == 0
         assert health("--vehicle", "1").exit_code == 0
@@ -189,31 +189,33 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
         (("--valid", "xy,heading"), "nedbus: --valid: 'heading': expected a list of xy, z, vxy, vz\n"),
     ],
 )
-def test_wrong_expectation_is_explained(health: Judge, arguments: tuple[str, ...], text: str) -> None:
-    """In one line, before anything is asked, with exit code 2."""
-    shown = health(*arguments)
-    assert shown.exit_code == 2
-    assert shown.err.startswith(text)
-    assert len(shown.err.splitlines()) == 1
+def test_invalid_option_value_exits_with_2(health: Health, arguments: tuple[str, ...], text: str) -> None:
+    """An invalid value is reported in one line before any query, with exit code 2."""
+    result = health(*arguments)
+    assert result.exit_code == 2
+    assert result.err.startswith(text)
+    assert len(result.err.splitlines()) == 1
 
 
-def test_old_replay_is_no_silence_of_now(endpoint: str, bus: nedbus.Bus) -> None:
-    """A follower of a service whose replay ended long ago hears its last message, and tells nothing."""
+def test_ended_replay_causes_no_silence_event(endpoint: str, bus: nedbus.Bus) -> None:
+    """`nedbus events` shows nothing for the last message of a replay that ended long ago."""
     with serving(endpoint, "sim:?duration=0.1"):
 
         def is_old() -> bool:
             return any(sample.latency is not None and sample.latency > 3.5 for sample in bus.latest("*"))
 
         wait_for(is_old, what="the last message to be old")
-        shown = run_command("events", "-c", endpoint, "--duration", "4")
-        assert shown.out == ""
+        result = run_command("events", "-c", endpoint, "--duration", "4")
+        assert result.out == ""
 
 
-def test_service_that_keeps_no_account_is_a_fault(endpoint: str, raw: Session, health: Judge) -> None:
-    """An older service answers its status whatever is asked: what is expected of its vehicles is not known to hold."""
+def test_service_without_history_is_a_fault(endpoint: str, zenoh_session: Session, health: Health) -> None:
+    """--valid and --within fail for an older service, which keeps no history of its vehicles."""
     key, status = "nedbus/@service/old/status", {"service": "old", "host": socket.gethostname(), "sources": []}
-    with answering(raw, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")):
+    with answer_queries(
+        zenoh_session, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")
+    ):
         for option in ("--valid", "xy"), ("--within", "60"):
-            shown = health("--services", "1", *option)
-            assert shown.exit_code == 1
-            assert "service old keeps no history of its vehicles: update nedbus there" in shown.err
+            result = health("--services", "1", *option)
+            assert result.exit_code == 1
+            assert "service old keeps no history of its vehicles: update nedbus there" in result.err

@@ -1,4 +1,4 @@
-"""The commands as typed: their output and their exit codes."""
+"""The commands list, get, info, schema and hz, and options common to all: output and exit codes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.flights.local_position import LAYOUTS, json_schema
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import fork_command, run_command
 from tests.peers.ports import free_endpoint
-from tests.peers.processes import Process, Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Process, Start, without_coverage
 from tests.waits import DEADLINE, wait_for
 
 COMMANDS = [str(each.name) for each in app.registered_commands]
@@ -32,13 +32,13 @@ COMMANDS += [f"pki {each.name or getattr(each.callback, '__name__', None)}" for 
 
 
 @pytest.fixture(scope="module")
-def flying(zygote: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Run a router with a service and its simulated vehicle, for all tests that only look at it."""
+def simulation(fork_server: ForkServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Run a router and a service with a simulated vehicle, for tests that only read."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, "-s", "sim:")
-    environment = {name: value for name, value in unmeasured().items() if not name.startswith("NEDBUS_")}
-    service = Process(command, tmp_path_factory.mktemp("flying"), environment, zygote)
+    environment = {name: value for name, value in without_coverage().items() if not name.startswith("NEDBUS_")}
+    service = Process(command, tmp_path_factory.mktemp("simulation"), environment, fork_server)
     with nedbus.connect(endpoint) as bus:
         wait_for(lambda: len(bus.latest(ANY)) == 12, what="twelve streams")
     yield endpoint
@@ -49,16 +49,16 @@ def flying(zygote: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 @pytest.mark.parametrize("fresh", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "fresh"])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_starts(run_nedbus: Start, command: str, *, fresh: bool) -> None:
-    """Each command is one of a process of its own, and imports all that it needs; most other tests run it in theirs."""
-    shown = run_nedbus(*command.split(), "--help", fresh=fresh)
-    assert shown.wait() == 0, shown.err
-    assert f" nedbus {command} [OPTIONS]" in shown.out
+    """Each command starts in a separate process and imports all it needs; most other tests run in-process."""
+    result = run_nedbus(*command.split(), "--help", fresh=fresh)
+    assert result.wait() == 0, result.err
+    assert f" nedbus {command} [OPTIONS]" in result.out
 
 
 @pytest.mark.process
-def test_list_shows_what_is_published(flying: str) -> None:
-    """A row for each vehicle and topic: its age, and whether to trust it."""
-    listed = run_command("list", "-c", flying)
+def test_list_shows_published_streams(simulation: str) -> None:
+    """`list` prints a row per stream with the age and state of its last message."""
+    listed = run_command("list", "-c", simulation)
     assert listed.exit_code == 0, listed.err
     head, *lines = listed.out.splitlines()
     assert head.split() == ["VEHICLE/TOPIC", "AGE", "STATE"]
@@ -71,13 +71,13 @@ def test_list_shows_what_is_published(flying: str) -> None:
     ]
     assert len(lines) == 12
     assert all(line.endswith("ok") for line in lines)
-    rows = [json.loads(line) for line in run_command("list", "-c", flying, "--json").out.splitlines()]
+    rows = [json.loads(line) for line in run_command("list", "-c", simulation, "--json").out.splitlines()]
     assert [row["instance"] for row in rows if "local" in row["topic"]] == [0, 1, None, None, None]
     assert all(row["vehicle"] == "1" and row["age"] >= 0 for row in rows)
 
 
-def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
-    """--vehicle lists one vehicle, also one of which nobody answers, and says when it is not there."""
+def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
+    """--vehicle lists one vehicle, also one without a message yet, and fails for one that is not published."""
     for vehicle, topic in (("1", VLP), ("1", f"{VLP}_groundtruth"), ("2", VLP)):
         bus.publisher(topic, vehicle=vehicle).publish(message(1))
     bus.publisher(VLP, vehicle="silent")
@@ -86,11 +86,11 @@ def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
         assert listed.exit_code == (vehicle == "3"), listed.err
         assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [vehicle] * count
         assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
-        assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), "nothing of permissions"
+        assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), "no hint about permissions"
 
 
-def test_incomplete_list_fails(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A list that lacks a vehicle shows the others, a warning, and exits with 1."""
+def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If replies are missing, the list shows the others with a warning and exits with 1."""
     monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
@@ -99,10 +99,10 @@ def test_incomplete_list_fails(bus: nedbus.Bus, endpoint: str, monkeypatch: pyte
     assert sum(str(each.address) in listed.out for each in publishers) == 1
 
 
-def test_list_that_has_not_arrived_is_no_empty_list(
+def test_late_list_is_not_reported_as_empty(
     bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """While the router has not listed the vehicles, the command does not claim that there are none."""
+    """Before the router has replied, `list` does not claim that no vehicle is published."""
     monkeypatch.setattr(alive_tokens.AliveTokens, "take", lambda _: [])
     timings.list_timeout = 0.01
     listed = run_command("list", "-c", endpoint)
@@ -112,16 +112,16 @@ def test_list_that_has_not_arrived_is_no_empty_list(
     assert "is published" not in listed.err
 
 
-def test_hz_measures(run_nedbus: Start, flying: str) -> None:
-    """Rate, jitter, latency and loss of each stream, as a table, JSON or CSV; that of the estimate is near 100 Hz."""
-    table, csv_form = (run_nedbus("hz", "-c", flying, "-t", VLP, *form, measured=False) for form in ([], ["--csv"]))
+def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
+    """`hz` prints rate, jitter, latency and loss per stream, as a table, JSON or CSV; positions have about 100 Hz."""
+    table, csv_form = (run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
     measured: list[dict[str, Any]] = []
 
     def is_near() -> bool:
-        """Measure; return whether a rate is near that of the estimate, as it is unless the machine is too busy."""
-        shown = run_command("hz", "-c", flying, "-d", "2.1", "--json", "-t", VLP)
-        assert shown.exit_code == 0, shown.err
-        measured[:] = [json.loads(line) for line in shown.out.splitlines()]
+        """Measure; return whether a rate is near 100 Hz, which takes several attempts on a busy machine."""
+        result = run_command("hz", "-c", simulation, "-d", "2.1", "--json", "-t", VLP)
+        assert result.exit_code == 0, result.err
+        measured[:] = [json.loads(line) for line in result.out.splitlines()]
         return any(row["rate"] is not None and 20 < row["rate"] < 500 for row in measured)
 
     wait_for(is_near, what="a rate near 100 Hz")
@@ -136,17 +136,17 @@ def test_hz_measures(run_nedbus: Start, flying: str) -> None:
     assert table.out.splitlines()[0].split() == ["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE"]
     rows = list(csv.DictReader(csv_form.out.splitlines()))
     assert {(row["vehicle"], row["topic"]) for row in rows} == {("1", VLP)}
-    assert {row["state"] for row in rows} <= {"ok", "slow"}  # slow on a machine that is busy
+    assert {row["state"] for row in rows} <= {"ok", "slow"}  # slow on a busy machine
     assert float(rows[-1]["rate"]) > 1
     assert float(rows[0]["time"]) < float(rows[-1]["time"])
 
 
 @pytest.mark.process
-def test_get_shows_the_last_message(flying: str) -> None:
-    """All fields of the last message, of vehicle_local_position unless a topic is given; exit 1 when there is none."""
+def test_get_shows_the_last_message(simulation: str) -> None:
+    """`get` prints all fields of the last message, by default vehicle_local_position; without one it exits with 1."""
 
     def get(*arguments: str) -> str:
-        got = run_command("get", "-c", flying, *arguments)
+        got = run_command("get", "-c", simulation, *arguments)
         assert got.exit_code == 0, got.err
         return got.out
 
@@ -157,23 +157,23 @@ def test_get_shows_the_last_message(flying: str) -> None:
     assert [json.loads(line)["topic"] for line in get("--json").splitlines()] == [VLP]
     assert [line.split(":")[0] for line in get("--field", "x,eph").splitlines()[1:]] == ["  x", "  eph", "---"]
     assert json.loads(get("--json", "--field", "x"))["message"].keys() == {"x"}
-    nothing = run_command("get", "-c", flying, "--vehicle", "99")
+    nothing = run_command("get", "-c", simulation, "--vehicle", "99")
     assert nothing.exit_code == 1
     assert f"nothing is published on nedbus/99/{VLP}" in nothing.err
 
 
 @pytest.mark.process
-def test_info_shows_the_services(flying: str) -> None:
-    """The services, what their sources do, and what was rejected."""
-    info = run_command("info", "-c", flying)
+def test_info_shows_the_services(simulation: str) -> None:
+    """`info` prints the router, the vehicles, and the services with their sources."""
+    info = run_command("info", "-c", simulation)
     assert info.exit_code == 0, info.err
-    assert all(text in info.out for text in (f"router    {flying}", "vehicles  1", "SOURCE", "running"))
-    machine = run_command("info", "-c", flying, "--json")
+    assert all(text in info.out for text in (f"router    {simulation}", "vehicles  1", "SOURCE", "running"))
+    machine = run_command("info", "-c", simulation, "--json")
     assert json.loads(machine.out)["sources"][0]["source"] == "sim:"
 
 
 def test_schema_needs_no_network() -> None:
-    """The JSON Schema, and the layouts, as JSON."""
+    """`schema` prints JSON Schema and layouts without a router."""
     assert json.loads(run_command("schema").out) == json_schema()
     assert [layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)] == list(LAYOUTS)
 
@@ -181,7 +181,7 @@ def test_schema_needs_no_network() -> None:
 def test_no_data_yet_is_reported(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """With a router but no vehicle: list says so, echo says so and waits."""
+    """Without a vehicle `list` reports it and exits, `echo` reports it and waits."""
     listed = run_command("list", "-c", endpoint)
     assert (listed.exit_code, listed.out, "no vehicle is published" in listed.err) == (0, "", True)
     notice = follow.write_notice
@@ -199,16 +199,16 @@ def test_no_data_yet_is_reported(
 
 
 @pytest.mark.parametrize(("command", "key_expr"), [("echo", f"nedbus/*/{VLP}"), ("hz", "nedbus/*/**")])
-def test_duration_without_data_fails(endpoint: str, command: str, key_expr: str) -> None:
-    """A script that follows for a while learns from the exit code that nothing came."""
+def test_duration_without_data_exits_with_1(endpoint: str, command: str, key_expr: str) -> None:
+    """A command with --duration exits with 1 if no message arrived."""
     watch = run_command(command, "-c", endpoint, "--duration", "0.1")
     assert watch.exit_code == 1
     assert f"nothing arrived on {key_expr} within 0.1 s" in watch.err
 
 
 @pytest.mark.parametrize("command", ["list", "echo", "hz", "get", "info"])
-def test_no_router_is_one_clear_line(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exit 1, one line: where, for how long, what to do; a traceback only with --debug."""
+def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a router a command exits with 1 and one line: endpoint, time waited, remedy."""
 
     def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
         return nedbus.Bus(settings, timeout=timeout / 10)
@@ -222,7 +222,7 @@ def test_no_router_is_one_clear_line(command: str, monkeypatch: pytest.MonkeyPat
 
 
 def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
-    """--wait is for whoever starts everything at once."""
+    """--wait makes a command wait until a router is started."""
     where = free_endpoint()
     echo = run_nedbus("echo", "-c", where, "--wait", "-n", "3")
     wait_for(lambda: "waiting" in echo.err, what="echo to report that it waits")
@@ -258,8 +258,8 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
         (["echo", "--wait", "--connect", "tcp/127.0.0.1:1", "--max-rate", "nan"], "max_rate nan is not valid"),
     ],
 )
-def test_invalid_option_is_a_usage_error(endpoint: str, arguments: list[str], text: str) -> None:
-    """Exit 2, one line with what is expected, or what to write instead."""
+def test_invalid_option_exits_with_2(endpoint: str, arguments: list[str], text: str) -> None:
+    """A usage error is one line with the expected value or a suggestion, and exit code 2."""
     ended = run_command(*arguments, NEDBUS_CONNECT=endpoint)
     assert ended.exit_code == 2
     assert text in ended.err
@@ -272,8 +272,8 @@ def test_invalid_option_is_a_usage_error(endpoint: str, arguments: list[str], te
     [["web", "--listen", "127.0.0.1:0"], ["export", "--listen", "127.0.0.1:0"], ["foxglove", "--port", "0"]],
     ids=" ".join,
 )
-def test_address_of_http_has_one_name(endpoint: str, arguments: list[str]) -> None:
-    """Each command that serves HTTP or a WebSocket listens at --http, which is checked before it connects anywhere."""
+def test_http_option_is_the_same_for_all_commands(endpoint: str, arguments: list[str]) -> None:
+    """Every command that serves HTTP or a WebSocket has --http, and validates it before it connects."""
     assert run_command(*arguments, NEDBUS_CONNECT=endpoint).exit_code == 2
     wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=free_endpoint())
     assert wrong.exit_code == 2
@@ -281,7 +281,7 @@ def test_address_of_http_has_one_name(endpoint: str, arguments: list[str]) -> No
 
 
 def test_version_and_help(run_nedbus: Start) -> None:
-    """--version is the package's, before anything is imported and after; help names every command."""
+    """--version prints the package's version, with and without the fast path; --help lists every command."""
     version = run_nedbus("--version")
     assert version.wait() == 0
     assert version.out == run_command("--version").out == f"nedbus {nedbus.__version__}\n"
@@ -291,10 +291,10 @@ def test_version_and_help(run_nedbus: Start) -> None:
 
 
 @pytest.mark.process
-def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus, zygote: Zygote) -> None:
-    """An output that cannot be written is an error, not a traceback."""
+def test_full_disk_is_a_one_line_error(endpoint: str, bus: nedbus.Bus, fork_server: ForkServer) -> None:
+    """A failed write to stdout is a one-line error, not a traceback."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
     with Path("/dev/full").open("wb") as full, Path("err").open("wb") as err:
-        ended = fork_command(zygote, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
+        ended = fork_command(fork_server, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
     assert ended.wait(DEADLINE) == 1
     assert Path("err").read_text() == "nedbus: cannot write to stdout: no space left on device\n"

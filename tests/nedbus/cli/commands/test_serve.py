@@ -1,10 +1,10 @@
-"""The commands that `nedbus serve` shows for a second terminal."""
+"""The commands that `nedbus serve` suggests for a second terminal."""
 
 from __future__ import annotations
 
 import re
 
-from nedbus.cli.output.progress import what_to_type
+from nedbus.cli.output.progress import suggested_commands
 from nedbus.transport import DEFAULT_ENDPOINT
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_port
@@ -12,26 +12,26 @@ from tests.peers.processes import Start
 from tests.waits import wait_for
 
 
-def test_hint_needs_no_flag_that_it_lacks() -> None:
-    """Commands to paste need no certificate; where one is needed, that is said in one line."""
-    assert " list  published" in what_to_type([DEFAULT_ENDPOINT])
-    assert " hz -c tcp/b:1 " in what_to_type(["tls/a:1", "tcp/b:1"])
+def test_suggested_commands_work_as_pasted() -> None:
+    """Suggested commands use an endpoint without TLS; if there is none, a hint asks for a certificate."""
+    assert " list  published" in suggested_commands([DEFAULT_ENDPOINT])
+    assert " hz -c tcp/b:1 " in suggested_commands(["tls/a:1", "tcp/b:1"])
     for endpoint in ("tls/a:1", "quic/a:1"):
         hint = f"Readers at {endpoint} need their own certificate, see docs/security.md"
-        assert what_to_type([endpoint]) == hint
+        assert suggested_commands([endpoint]) == hint
 
 
 def wait_for_message(endpoint: str) -> None:
-    """Wait until a message is published there."""
+    """Wait until a message is published at this endpoint."""
     wait_for(lambda: run_command("get", "--wait", "-c", endpoint).exit_code == 0, what=f"a message at {endpoint}")
 
 
-def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
-    """Its commands name the loopback address, and work."""
+def test_suggested_commands_for_wildcard_address_use_loopback(run_nedbus: Start) -> None:
+    """For a service that listens on 0.0.0.0 the suggested commands name 127.0.0.1, and work."""
     port = free_port()
     service = run_nedbus("serve", "--listen", f"tcp/0.0.0.0:{port}", "-s", "sim:")
     wait_for(lambda: " all fields" in service.err, what="the hint")
     (here,) = re.findall(r"nedbus list -c (\S+)", service.err)
     assert here == f"tcp/127.0.0.1:{port}"
     wait_for_message(here)
-    assert " list  published" in what_to_type(["tcp/0.0.0.0:7447"])
+    assert " list  published" in suggested_commands(["tcp/0.0.0.0:7447"])

@@ -1,1 +1,1 @@
-"""Output of the commands: logs and terminals."""
+"""Tests of the output of commands: logs and terminals."""

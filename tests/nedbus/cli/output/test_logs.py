@@ -1,4 +1,4 @@
-"""The log: JSON for programs, priorities for the journal, levels, a closed list of events, and a limit for floods."""
+"""The log: JSON for programs, priorities for the journal, levels, a closed list of events, and rate limits."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.command_line import run_command
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.processes import Start
-from tests.waits import wait_for, wait_for_reader
+from tests.waits import wait_for, wait_for_matching
 
 REPLAY = "sim:?duration=1&speed=max"
 ROOT = Path(__file__).parents[4]
@@ -39,13 +39,13 @@ VEHICLES = 2 * BURST + 10
 
 
 def record(text: str = "%s is stale", *args: object, event: str | None = "stale", **more: object) -> logging.LogRecord:
-    """Return a record as a log call of a service makes it."""
+    """Return a record like that of a log call in a service."""
     warning = {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": args}
     return logging.makeLogRecord(warning | (about(event) if event else {}) | more)
 
 
 def log_calls(tree: ast.AST) -> Iterator[ast.Call]:
-    """Yield the calls that log something above DEBUG."""
+    """Yield the log calls above DEBUG."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             logger, level = node.func.value, node.func.attr
@@ -59,7 +59,7 @@ def is_about(node: ast.expr | None) -> bool:
 
 
 def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
-    """Yield what an expression can be: itself, either side of a condition, or what is assigned to its name."""
+    """Yield the possible values of an expression: itself, both branches of a condition, or assignments to its name."""
     if isinstance(node, ast.IfExp):
         yield from values_of(node.body, tree)
         yield from values_of(node.orelse, tree)
@@ -81,8 +81,8 @@ def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
     return {str(each.value) if isinstance(each, ast.Constant) else ast.unparse(each) for each in events}
 
 
-def test_each_line_has_an_event_of_the_table() -> None:
-    """Whatever is logged above DEBUG has an event that EVENTS documents; no event of the table is left over."""
+def test_log_calls_use_exactly_the_documented_events() -> None:
+    """Every log call above DEBUG has an event of the table EVENTS, and every event of the table is used."""
     used: set[str] = set()
     for path, text in ((path, path.read_text()) for path in sorted(SERVICE.rglob("*.py"))):
         tree = ast.parse(text if "_log." in text else "")
@@ -93,18 +93,18 @@ def test_each_line_has_an_event_of_the_table() -> None:
     assert used == EVENTS.keys() - {"suppressed"}
 
 
-def test_manual_says_what_is_limited() -> None:
-    """The page about logs has the limits of the code, and names events that there are."""
+def test_documented_log_limits_match_the_code() -> None:
+    """docs/operate.md has the rate limits of the code, and names existing events."""
     section = (ROOT / "docs" / "operate.md").read_text().partition("\n## Logs\n")[2]
     named = re.findall(r"^\| ((?:`[a-z_]+`(?:, )?)+) \| [a-z ]", section, re.MULTILINE)
     events = {each for names in named for each in re.findall(r"`([a-z_]+)`", names)} & EVENTS.keys()
     assert {"error", "rejected", "client_refused"} <= events
     assert f"{BURST} lines" in section
-    assert f"{PER_MINUTE} a minute" in section
+    assert f"{PER_MINUTE} per minute" in section
 
 
-def test_json_is_one_harmless_object() -> None:
-    """Whatever a peer sent, a line is one object of ASCII that acts on no terminal; null is only a missing event."""
+def test_json_line_escapes_text_of_peers() -> None:
+    """A line is one JSON object of printable ASCII, whatever a peer sent; only a missing event is null."""
     address = Address("7", "estimator_local_position", 2)
     extra = about("rejected", address, source=EVIL, reason=EVIL * 1000)
     line = JsonFormatter().format(record("%s: rejected", EVIL * 1000, about=extra["about"], created=1.5))
@@ -122,8 +122,8 @@ def test_json_is_one_harmless_object() -> None:
     assert fields["event"] is None
 
 
-def test_traceback_is_one_text() -> None:
-    """In JSON a traceback is one string; the end of a long one is kept, where the error is named."""
+def test_json_traceback_is_one_string() -> None:
+    """A traceback in JSON is one string; a long one keeps its end, which names the error."""
     try:
         raise ValueError("x" * 100_000 + EVIL + "the end")
     except ValueError:
@@ -134,8 +134,8 @@ def test_traceback_is_one_text() -> None:
     assert len(exception) < 30_000
 
 
-def test_journal_gets_a_priority_for_each_line() -> None:
-    """Each line of a traceback has the priority of syslog, 3 for errors to 7 for debug."""
+def test_journal_lines_have_syslog_priorities() -> None:
+    """Each line, also of a traceback, has a syslog priority: 3 for errors to 7 for debug."""
     formatter = JournalFormatter(TextFormatter("%(message)s"))
     assert formatter.format(record("%s\nforged", "x")) == "<4>x\\nforged"
     for level, number in ((logging.DEBUG, 7), (logging.INFO, 6), (logging.ERROR, 3), (logging.CRITICAL, 3)):
@@ -149,15 +149,15 @@ def test_journal_gets_a_priority_for_each_line() -> None:
 
 
 def test_service_logs_json(start: Start) -> None:
-    """Each line of a service is an object with an event, of its source if there is one.
+    """Each line of a service is a JSON object with an event, and with the source if there is one.
 
-    What a person would read beside the log is in an object; what to type in a second terminal is left out.
+    Notices to the user are objects as well; the suggested commands are omitted.
     """
     sources = ("-s", REPLAY, "-s", "sim:?vehicle=2")
     soon = Timings(reports=(0.2,))
-    service = start_hasty(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
-    for event in ("done", "progress"):  # a report comes after what to type
-        wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - it is called at once
+    service = start_with_timings(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
+    for event in ("done", "progress"):  # the first report follows the suggested commands
+        wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - called at once
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
     lines = [json.loads(line) for line in service.err.splitlines()]
@@ -168,8 +168,8 @@ def test_service_logs_json(start: Start) -> None:
 
 
 @pytest.mark.parametrize("level", ["info", "debug"])
-def test_error_of_a_command_is_an_object(run_nedbus: Start, level: str) -> None:
-    """The error that ends a command is one object too, with the traceback where the level is debug."""
+def test_error_of_a_command_is_a_json_object(run_nedbus: Start, level: str) -> None:
+    """The error that ends a command is one JSON object, with a traceback at level debug."""
     ended = run_nedbus("--log-format", "json", "--log-level", level, "get", "-c", "tcp/127.0.0.1:1")
     assert ended.wait() == 1
     (fields,) = [json.loads(line) for line in ended.err.splitlines()]
@@ -178,8 +178,8 @@ def test_error_of_a_command_is_an_object(run_nedbus: Start, level: str) -> None:
     assert ("exception" in fields) == (level == "debug")
 
 
-def test_level_selects(endpoint: str) -> None:
-    """With --log-level warning a service says nothing while all is well; --debug wins; other words are refused."""
+def test_log_level_selects_lines(endpoint: str) -> None:
+    """--log-level warning hides lines of normal operation, --debug overrides it, and other values are refused."""
     quiet = run_command("--log-level", "warning", "serve", "-c", endpoint, "-s", REPLAY, "--until-done")
     assert (quiet.exit_code, quiet.err) == (0, "")
     loud = run_command("--log-level", "error", "--debug", "get", "-c", "tcp/127.0.0.1:1")
@@ -190,8 +190,8 @@ def test_level_selects(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("other", [0, 1], ids=["journal", "another file"])
-def test_journal_is_recognised(start: Start, endpoint: str, other: int) -> None:
-    """Lines have priorities and no date where JOURNAL_STREAM names stderr, and only there."""
+def test_journal_is_detected(start: Start, endpoint: str, other: int) -> None:
+    """Lines have priorities instead of dates only if JOURNAL_STREAM identifies stderr."""
     script = """
 import os, sys
 from nedbus.cli import main
@@ -208,7 +208,7 @@ main()
 
 
 class Limited:
-    """A rate limit with a clock of the test's, and what passed."""
+    """A rate limit with a fake clock, and the lines that passed it."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -220,21 +220,21 @@ class Limited:
             self.lines.append(record.getMessage())
 
     def flood(self, count: int, text: str = "%s is stale", *, event: str | None = "stale") -> int:
-        """Log this many; return how many passed."""
+        """Log `count` lines; return the number that passed."""
         before = len(self.lines)
         for number in range(count):
             self.handle(record(text, number, event=event))
         return len(self.lines) - before
 
 
-def test_flood_of_any_length_is_bounded() -> None:
-    """A burst passes, then a limited number a minute, each after a line with the number left out before it."""
+def test_flood_is_rate_limited() -> None:
+    """A burst passes, then a few lines a minute, each preceded by the number of suppressed lines."""
     limited = Limited()
     assert limited.flood(1000) == BURST
     limited.now += 60 / PER_MINUTE
     assert limited.flood(1000) == 2
-    left_out = f"suppressed {1000 - BURST} more lines like this one: {BURST} is stale"
-    assert limited.lines[-2:] == [left_out, "0 is stale"]
+    report = f"suppressed {1000 - BURST} more lines like this one: {BURST} is stale"
+    assert limited.lines[-2:] == [report, "0 is stale"]
     limited.now += 3600
     assert limited.flood(1000) == 1 + BURST
     limited = Limited()
@@ -243,24 +243,24 @@ def test_flood_of_any_length_is_bounded() -> None:
         limited.now += 1
     assert len(limited.lines) <= BURST + 2 * 10 * PER_MINUTE
     limited.limit.report()
-    told = [int(line.split()[1]) for line in limited.lines if line.startswith("suppressed")]
-    assert sum(told) + len(limited.lines) - len(told) == 6000
+    counts = [int(line.split()[1]) for line in limited.lines if line.startswith("suppressed")]
+    assert sum(counts) + len(limited.lines) - len(counts) == 6000
 
 
-def test_kinds_are_limited_each_for_itself() -> None:
-    """A flood leaves lines of other events and texts alone, and lines of the life of the process always pass."""
+def test_each_kind_of_line_has_its_own_limit() -> None:
+    """A flood does not suppress lines of other events and texts; lifecycle events are never limited."""
     limited = Limited()
     limited.flood(1000)
     assert limited.flood(3, "%s is back", event="stream_resumed") == 3
     assert limited.flood(3, event="stream_resumed") == 3
-    own = [name for name, event in EVENTS.items() if not event.limited]
-    assert {"retrying", "failed", "done", "router", "shutdown", "error"} <= set(own)
-    for name in own:
+    unlimited = [name for name, event in EVENTS.items() if not event.limited]
+    assert {"retrying", "failed", "done", "router", "shutdown", "error"} <= set(unlimited)
+    for name in unlimited:
         assert limited.flood(2 * BURST, event=name) == 2 * BURST
 
 
-def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
-    """When a flood has ended, the next line of any kind says what was left out of it; the end of the process, too."""
+def test_suppressed_lines_are_reported_after_a_flood() -> None:
+    """Suppressed lines are reported with the next line of any kind, and at exit."""
     limited = Limited()
     limited.flood(BURST + 5)
     assert limited.flood(1, "%s", event="done") == 1
@@ -274,14 +274,14 @@ def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
 
 
 def test_lines_of_other_packages_are_limited() -> None:
-    """A line without an event is limited; beyond a number of texts without placeholders all others are one kind."""
+    """Lines without an event are limited by their text; above a number of distinct texts all others share a limit."""
     limited = Limited()
     assert limited.flood(1000, event=None) == BURST
     assert sum(limited.flood(1, f"text {number} %s", event=None) for number in range(5000)) <= 1000 + BURST
 
 
-def test_report_is_an_event() -> None:
-    """A line that says what was left out has its number, the event, and the level of what it stands for."""
+def test_report_of_suppressed_lines_is_an_event() -> None:
+    """A report of suppressed lines has their number, event and level."""
     reports: list[logging.LogRecord] = []
     limit = RateLimit(reports.append, now=lambda: 0.0)
     for _ in range(BURST + 3):
@@ -294,44 +294,46 @@ def test_report_is_an_event() -> None:
 
 
 def count_lines(text: str, elapsed: float) -> Counter[str]:
-    """Return how often each event happened, logged or left out; hold that few were logged."""
-    happened: Counter[str] = Counter()
+    """Return the number of lines of each event, logged or suppressed; assert that few were logged."""
+    total: Counter[str] = Counter()
     logged: Counter[str] = Counter()
     for line in text.splitlines():
         fields = json.loads(line)
         event = str(fields["event"])
-        happened[fields.get("of", event)] += fields.get("count", 1)
+        total[fields.get("of", event)] += fields.get("count", 1)
         logged[f"suppressed {fields['of']}" if event == "suppressed" else event] += 1
     due = elapsed / 60 * PER_MINUTE + 1
     for event, count in logged.items():
-        # The last report is at the end of the process.
+        # One more report is logged at exit.
         assert count <= (due + 1 if event.startswith("suppressed") else BURST + due), event
-    return happened
+    return total
 
 
-def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, raw: Session) -> None:
-    """A peer that sends nonsense under ever new keys makes a reader log a few lines, and the number of the rest."""
+def test_flood_of_invalid_payloads_is_rate_limited(run_nedbus: Start, endpoint: str, zenoh_session: Session) -> None:
+    """Invalid payloads under ever new keys make a subscriber log a few lines and a count."""
     start = time.monotonic()
-    echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, measured=False)
-    wait_for_reader(raw, f"nedbus/1/{VLP}")
+    echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, coverage=False)
+    wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")
     block = zenoh.CongestionControl.BLOCK
     for number in range(1000):
-        raw.put(f"nedbus/flood-{number}/{VLP}", b"garbage", congestion_control=block)
-    raw.put(f"nedbus/1/{VLP}", encode(message(1)), congestion_control=block)
+        zenoh_session.put(f"nedbus/flood-{number}/{VLP}", b"garbage", congestion_control=block)
+    zenoh_session.put(f"nedbus/1/{VLP}", encode(message(1)), congestion_control=block)
     wait_for(lambda: echo.out, what="the last message")
     echo.signal(signal.SIGINT)
     assert echo.wait() == 130
-    happened = count_lines(echo.err, time.monotonic() - start)
-    assert happened["invalid"] == 100  # keys; further ones are only counted
+    total = count_lines(echo.err, time.monotonic() - start)
+    assert total["invalid"] == 100  # keys; further ones are only counted
 
 
-def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
-    """Vehicles that appear, reboot and fall silent by the hundred make a service log a few lines of each event."""
+def test_log_of_flapping_vehicles_is_rate_limited(
+    start: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus
+) -> None:
+    """A hundred vehicles that appear, reboot and fall silent make a service log only a few lines of each event."""
     began = time.monotonic()
     soon = Timings(stale=0.5)
-    service = start_hasty(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
+    service = start_with_timings(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
     wait_for(lambda: '"listening"' in service.err, what="the source")
-    fleet = [Px4(raw, namespace=f"wing{number}") for number in range(VEHICLES)]
+    fleet = [Px4(zenoh_session, namespace=f"wing{number}") for number in range(VEHICLES)]
 
     def status(name: str) -> object:
         (answer,) = bus.services()
@@ -348,7 +350,7 @@ def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session
     wait_for(lambda: len(cast("list[str]", status("stale"))) == VEHICLES, what="the silence")
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
-    happened = count_lines(service.err, time.monotonic() - began)
-    assert happened["published"] == happened["rebooted"] == VEHICLES
-    assert happened["stale"] >= VEHICLES
-    assert happened["shutdown"] == 1
+    total = count_lines(service.err, time.monotonic() - began)
+    assert total["published"] == total["rebooted"] == VEHICLES
+    assert total["stale"] >= VEHICLES
+    assert total["shutdown"] == 1

@@ -1,4 +1,4 @@
-"""Terminals: tables of any width, hostile text, closed streams, signals at any moment."""
+"""Terminal output: tables of any width, malicious text, closed streams, and signals at any time."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.flights.messages import VALID, VLP, message
 from tests.peers.command_line import fork_command, run_command
-from tests.peers.hasty import start_hasty
+from tests.peers.custom_timings import start_with_timings
 from tests.peers.ports import free_endpoint, free_port
-from tests.peers.processes import Start, Zygote, unmeasured
+from tests.peers.processes import ForkServer, Start, without_coverage
 from tests.waits import DEADLINE, repeating, wait_for
 
 ROOT = Path(__file__).parents[4]
@@ -38,12 +38,12 @@ EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
 
 
 def has_control(text: str) -> bool:
-    """Return whether anything in a text would act on a terminal."""
+    """Return whether a text contains a control character other than a newline."""
     return any(not (char.isprintable() or char == "\n") for char in text)
 
 
 def test_text_of_a_peer_is_one_short_printable_line() -> None:
-    """Escape sequences, directions of writing and line breaks are spelt out, and what is long is cut."""
+    """Control characters, bidirectional marks and line breaks are escaped, and long text is truncated."""
     assert to_text(EVIL) == r"\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
     assert len(to_text("x" * 100_000)) == 120
     assert len(to_text("\x1b" * 100_000)) < 500
@@ -60,8 +60,8 @@ ROWS = [
 
 
 @pytest.mark.parametrize("width", [30, 40, 64, 80, 110])
-def test_table_fits(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    """Lines fit, wide ones show more columns; a name is whole while columns can be left out, and then folded."""
+def test_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    """Lines fit; optional columns are removed first, then names are folded."""
     monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: width)
     lines = to_table(HEAD, ROWS, optional=OPTIONAL).splitlines()
     assert all(len(line) <= width for line in lines)
@@ -71,13 +71,13 @@ def test_table_fits(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     assert (ROWS[0][0] in shown) == (width >= 60)
 
 
-def test_table_without_rows_is_its_head() -> None:
-    """Before the first message there is a head alone."""
+def test_table_without_rows_is_its_header() -> None:
+    """Before the first message a table is only its header."""
     assert to_table(HEAD, [], optional=OPTIONAL).split() == list(HEAD)
 
 
-def test_table_is_whole_without_a_terminal() -> None:
-    """Where stdout is no terminal nothing is folded or left out, and no text is markup."""
+def test_table_is_complete_without_a_terminal() -> None:
+    """If stdout is not a terminal, nothing is folded or removed, and text is not parsed as markup."""
     cells = ("1/[bold]", *ROWS[1][1:-1], "x" * 300)
     head, *lines = to_table(HEAD, [*ROWS, cells]).splitlines()
     assert head.split() == list(HEAD)
@@ -95,7 +95,7 @@ ALL_TOPICS = [nedbus.Address("1", name, 0 if topic.instances else None) for name
 
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
-    """Return what makes lines of all topics for a terminal of a width, and of 24 lines."""
+    """Return a factory of `Lines` for a terminal of a given width and 24 lines."""
     monkeypatch.setenv("LINES", "24")
 
     def make(width: int) -> Lines:
@@ -105,8 +105,8 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
     return make
 
 
-def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None:
-    """Narrower and narrower: eph goes first, then heading, then velocity; position, doubts and loss never."""
+def test_narrow_terminal_removes_columns_in_order(lines: Callable[[int], Lines]) -> None:
+    """A narrower terminal removes eph, then heading, then velocity, but never position, doubts and loss."""
     one = sample(nedbus.Address("1", VLP))
     seen: list[list[str]] = []
     for width in range(150, 87, -1):
@@ -122,27 +122,27 @@ def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None
 
 
 def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
-    """There is one at first, one in each screenful, and one when the columns change; every state is below STATE."""
-    to_line, headed, state = lines(150), [], 0
+    """A heading comes first, once per screenful, and when the columns change; every state is below STATE."""
+    to_line, with_heading, state = lines(150), [], 0
     for number in range(80):
         *head, line = to_line(sample(nedbus.Address("1" if number < 40 else "wing", VLP))).splitlines()
         if head:
-            headed.append(number)
+            with_heading.append(number)
             state = head[0].index("STATE")
         assert line.index("z vxy vz unknown") == state
-    assert headed == [0, 22, 40, 62]
+    assert with_heading == [0, 22, 40, 62]
     of_fields = lines(150)(sample(nedbus.Address("1", VLP)), ["x", "eph"]).splitlines()
     assert of_fields[0].split() == ["VEHICLE/TOPIC", "TIME", "s", "x", "eph", "STATE"]
 
 
 class Terminal:
-    """A command on a terminal of its own, and what it shows."""
+    """A command on a pseudo-terminal, and its output."""
 
-    def __init__(self, zygote: Zygote, *arguments: str, **environment: str) -> None:
+    def __init__(self, fork_server: ForkServer, *arguments: str, **environment: str) -> None:
         self._main, terminal = pty.openpty()
-        self._output = bytearray()
+        self._bytes = bytearray()
         environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
-        self.popen = fork_command(zygote, *arguments, out=terminal, err=terminal, **environment)
+        self.popen = fork_command(fork_server, *arguments, out=terminal, err=terminal, **environment)
         os.close(terminal)
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -155,19 +155,19 @@ class Terminal:
         self.wait()
 
     @property
-    def shown(self) -> str:
-        return self._output.decode(errors="replace")
+    def output(self) -> str:
+        return self._bytes.decode(errors="replace")
 
     def wait(self) -> int:
-        """Wait for its end, and for all that it shows."""
+        """Return the exit code after all output has been read."""
         exit_code = self.popen.wait(DEADLINE)
         self._reader.join(DEADLINE)
         return exit_code
 
     def _read(self) -> None:
-        with suppress(OSError):  # the other side is closed
+        with suppress(OSError):  # the terminal was closed
             while data := os.read(self._main, 4096):
-                self._output.extend(data)
+                self._bytes.extend(data)
         os.close(self._main)
 
 
@@ -175,14 +175,14 @@ OnTerminal = Callable[..., Terminal]
 
 
 @pytest.fixture
-def on_terminal(zygote: Zygote) -> OnTerminal:
-    """Return what runs a command on a terminal of 80 columns."""
-    return partial(Terminal, zygote)
+def on_terminal(fork_server: ForkServer) -> OnTerminal:
+    """Return a function that runs a command on a terminal of 80 columns."""
+    return partial(Terminal, fork_server)
 
 
 @contextmanager
-def flying(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
-    """Publish topics of vehicles that stand still."""
+def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
+    """Publish topics of vehicles on the ground."""
     publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
 
     def publish() -> None:
@@ -195,10 +195,10 @@ def flying(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) ->
 
 @pytest.mark.process
 def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus) -> None:
-    """At 80 columns a line is a line, below a heading; the addresses of two vehicles are a column, and whole."""
-    with flying(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
+    """At 80 columns a message is one line below a heading, with complete addresses in one column."""
+    with publishing(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
         assert terminal.wait() == 0
-    shown = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
+    shown = [line for line in terminal.output.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
     assert len([line for line in shown if VLP in line]) == 40
     assert max(map(len, shown)) <= 80
     state = -1
@@ -210,18 +210,18 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
 
 
 @pytest.mark.process
-def test_info_names_what_is_gone(on_terminal: OnTerminal, endpoint: str, raw: Session) -> None:
-    """The number stands in the table, the addresses below it; on a terminal no address is broken."""
+def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_session: Session) -> None:
+    """The table has the number of gone streams; their addresses follow below it, and are not split on a terminal."""
     gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
     sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
-    service = answer(raw, "nedbus/@service/s/status", {"service": "s", "sources": sources})
+    service = answer(zenoh_session, "nedbus/@service/s/status", {"service": "s", "sources": sources})
     info = run_command("info", "-c", endpoint)
     assert info.exit_code == 0, info.err
     assert "  5 gone\n" in info.out
     assert f"\ngone: {', '.join(gone)}\n" in info.out
     with on_terminal("info", "-c", endpoint) as terminal:
         assert terminal.wait() == 0
-    lines = terminal.shown.splitlines()
+    lines = terminal.output.splitlines()
     assert max(map(len, lines)) <= 80
     assert all(any(address in line for line in lines) for address in gone)
     del service
@@ -232,27 +232,27 @@ def test_info_names_what_is_gone(on_terminal: OnTerminal, endpoint: str, raw: Se
 def test_hz_redraws_in_place(
     on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus, number: signal.Signals, exit_code: int
 ) -> None:
-    """On a terminal the table is drawn over the last one, as high as the terminal at most, and stays at the end.
+    """On a terminal each table replaces the previous one, is no higher than the terminal, and stays at the end.
 
-    Ctrl-C and SIGTERM, as of `timeout`, end the redrawing and show the cursor again.
+    Ctrl-C and SIGTERM, which `timeout` sends, stop the redrawing and show the cursor again.
     """
     vehicles = [str(vehicle) for vehicle in range(12)]
-    with flying(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
-        wait_for(lambda: terminal.shown.count("VEHICLE/TOPIC") >= 2, what="a second table")
+    with publishing(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
+        wait_for(lambda: terminal.output.count("VEHICLE/TOPIC") >= 2, what="a second table")
         terminal.popen.send_signal(number)
         assert terminal.wait() == exit_code
-    assert "\x1b[1A\x1b[2K" in terminal.shown
-    assert " more" in terminal.shown
-    assert all(drawing.count("\n") <= 10 for drawing in terminal.shown.split("VEHICLE/TOPIC")[1:])
-    assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
-    assert "Traceback" not in terminal.shown
+    assert "\x1b[1A\x1b[2K" in terminal.output
+    assert " more" in terminal.output
+    assert all(drawing.count("\n") <= 10 for drawing in terminal.output.split("VEHICLE/TOPIC")[1:])
+    assert terminal.output.rindex("\x1b[?25h") > terminal.output.rindex("\x1b[?25l")
+    assert "Traceback" not in terminal.output
 
 
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
-def test_signal_while_a_table_starts(
+def test_signal_during_table_setup_restores_the_cursor(
     monkeypatch: pytest.MonkeyPatch, number: signal.Signals, raised: type[BaseException]
 ) -> None:
-    """It has its effect when the table has started, and can be stopped: the cursor is shown again."""
+    """A signal while the cursor is being hidden takes effect afterwards, and the cursor is shown again."""
     shown: list[bool] = []
 
     def show_cursor(console: Console, show: bool = True) -> bool:
@@ -275,8 +275,8 @@ def test_signal_while_a_table_starts(
 
 
 @pytest.mark.parametrize("command", ["echo", "hz"])
-def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
-    """`echo` and `hz` say when the link to the router breaks, and when it is back; `hz` says so of each stream."""
+def test_lost_link_is_reported(run_nedbus: Start, command: str) -> None:
+    """`echo` and `hz` log when the link to the router is lost and up again; `hz` marks each stream as disconnected."""
     where = free_endpoint()
     router = open_router(listen=(where,))
     run_nedbus("serve", "-c", where, "-s", "sim:")
@@ -287,7 +287,7 @@ def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
     if command == "hz":
         wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
     with closing(open_router(listen=(where,))):
-        wait_for(lambda: f"the link to {where} is back" in follower.err, what="the link")
+        wait_for(lambda: f"the link to {where} is up again" in follower.err, what="the link")
         lines = follower.out.count("\n")
         wait_for(lambda: follower.out.count("\n") > lines + 3, what="more data")
 
@@ -297,7 +297,7 @@ def states(lines: str) -> list[str]:
 
 
 def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """A stream whose service was killed is not "ok", in `hz` as in `list`, and `hz` tells it once, first of all."""
+    """`hz` reports a stream whose service was killed as "gone", once."""
     service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="data")
     with bus.publisher(VLP, vehicle="other") as other:
@@ -316,9 +316,9 @@ def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bu
 
 
 def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, timings: Timings) -> None:
-    """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
+    """The streams of an ended replay in a running service are stale in `list`, `info` and `hz`."""
     run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
-    hz = start_hasty(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
+    hz = start_with_timings(start, Timings(stale=0.5), "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
     timings.stale = 0.5
     listed = run_command("list", "-c", endpoint)
@@ -326,50 +326,51 @@ def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, t
     assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5
 
 
-def answer(raw: Session, key: str, status: object) -> object:
-    """Answer queries for a status as a hostile service would."""
-    return raw.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
+def answer(zenoh_session: Session, key: str, status: object) -> object:
+    """Answer queries for a status like a malicious service."""
+    return zenoh_session.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
 
 
-def test_hostile_status_is_shown_harmless(endpoint: str, raw: Session) -> None:
-    """Escape sequences, forged lines and endless texts of a service are shown as short text, or left out."""
+def test_malicious_status_is_escaped(endpoint: str, zenoh_session: Session) -> None:
+    """Escape sequences, forged lines and long texts of a service are escaped and truncated, or omitted."""
     flood = [{"source": EVIL * 1000, "state": "retrying", "error": EVIL * 1000, "published": [EVIL] * 1000}]
     stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
     source = {**flood[0], "stale": [EVIL], "streams": [stream, None, {"address": 1}], "addresses": EVIL}
     status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
-    hostile = answer(raw, "nedbus/@service/hostile/status", status)
+    hostile = answer(zenoh_session, "nedbus/@service/hostile/status", status)
     for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
-        shown = run_command(*arguments, "-c", endpoint)
-        assert shown.exit_code == (arguments[0] == "health"), shown.err
-        assert not has_control(shown.out + shown.err)
-        assert "\nforged line" not in shown.out + shown.err
-        assert len(shown.out + shown.err) < 5000
+        result = run_command(*arguments, "-c", endpoint)
+        assert result.exit_code == (arguments[0] == "health"), result.err
+        assert not has_control(result.out + result.err)
+        assert "\nforged line" not in result.out + result.err
+        assert len(result.out + result.err) < 5000
     del hostile
 
 
-def test_hostile_keys_are_shown_harmless(endpoint: str, raw: Session) -> None:
-    """Keys and tokens with escape sequences reach neither the output nor the log."""
+def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> None:
+    """Escape sequences in keys and tokens reach neither the output nor the log."""
     tokens = [
-        raw.liveliness().declare_token(f"nedbus/{name}/@alive/1a/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)
+        zenoh_session.liveliness().declare_token(f"nedbus/{name}/@alive/1a/{VLP}")
+        for name in ("\x1b[2J", "a\nb", "x" * 5000)
     ]
 
     def put() -> None:
-        raw.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
-        raw.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
+        zenoh_session.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
+        zenoh_session.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
 
     with repeating(put):
         for arguments, exit_code in ((["list"], 0), (["echo", "*", "-d", "0.5"], 1), (["hz", "-d", "0.5"], 1)):
-            shown = run_command(*arguments, "-c", endpoint)
-            assert shown.exit_code == exit_code, shown.err
-            assert not has_control(shown.out + shown.err)
-            assert len(shown.out + shown.err) < 5000
-            assert exit_code == 0 or "not a VehicleLocalPosition" in shown.err
+            result = run_command(*arguments, "-c", endpoint)
+            assert result.exit_code == exit_code, result.err
+            assert not has_control(result.out + result.err)
+            assert len(result.out + result.err) < 5000
+            assert exit_code == 0 or "not a VehicleLocalPosition" in result.err
     assert len(tokens) == 3
 
 
-def test_flood_of_keys_leaves_hz_small(endpoint: str, bus: nedbus.Bus) -> None:
-    """Of 100 vehicles there are 50 rows a second and a number, not 100."""
-    with flying(bus, *(f"flood-{number}" for number in range(100))):
+def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
+    """For 100 vehicles `hz` prints 50 rows a second and the number of the others."""
+    with publishing(bus, *(f"flood-{number}" for number in range(100))):
         hz = run_command("hz", "-c", endpoint, "-n", "1000")  # each vehicle has sent by then
     assert hz.exit_code == 0
     assert "\n50 more\n" in hz.out
@@ -377,7 +378,7 @@ def test_flood_of_keys_leaves_hz_small(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 CLOSING = {
-    "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself finds a stream that is closed
+    "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself represents a closed stream
     "exec 2>&-": "os.close(2); sys.stderr = None",
 }
 CLOSED = "nedbus: cannot write to stdout: standard output is closed\n"
@@ -392,20 +393,20 @@ CLOSED = "nedbus: cannot write to stdout: standard output is closed\n"
         ("exec 2>&-", "get -v 9", (1, 0, "")),
     ],
 )
-def test_closed_stream_is_one_line(
+def test_closed_stdout_is_a_one_line_error(
     start: Start, endpoint: str, bus: nedbus.Bus, *, limit: str, command: str, expected: object, shell: bool
 ) -> None:
-    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain."""
+    """`nedbus list >&-` fails with a one-line error; a closed stderr is ignored."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
     script = f"import os, sys\n{CLOSING[limit]}\nfrom nedbus.cli import main\nmain()"
     if shell:
         line = f"{limit}; NEDBUS_CONNECT={endpoint} exec {sys.executable} -m nedbus {command}"
         ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
-        said = ended.returncode, len(ended.stdout.splitlines()), ended.stderr
+        result = ended.returncode, len(ended.stdout.splitlines()), ended.stderr
     else:
         process = start("-c", script, *command.split(), NEDBUS_CONNECT=endpoint)
-        said = process.wait(), len(process.out.splitlines()), process.err
-    assert said == expected
+        result = process.wait(), len(process.out.splitlines()), process.err
+    assert result == expected
 
 
 MOMENTS = [pytest.param("echo", imports) for imports in (1, 50, 150, 300, 10_000)]
@@ -414,15 +415,15 @@ MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz"
 
 @pytest.mark.process
 @pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports after that of nedbus.cli; 10,000 are all
-def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: str, imports: int) -> None:
-    """Ctrl-C at any moment from the start of `main` on ends without a traceback, as 130 in a shell."""
-    environment = unmeasured() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
+def test_interrupt_during_imports_prints_no_traceback(endpoint: str, command: str, imports: int) -> None:
+    """Ctrl-C at any time after the start of `main` ends without a traceback, with 130 in a shell."""
+    environment = without_coverage() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
     arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
     with subprocess.Popen(arguments, stdout=null, stderr=pipe, text=True, env=environment) as process:
         assert process.stderr is not None
         started, seen = False, 0
-        for line in process.stderr:  # the moment is one of the program, not of a clock
+        for line in process.stderr:  # interrupt at a line of the import log, not at a time
             seen += started
             started = started or line.rstrip().endswith(" nedbus.cli")
             if seen == imports or line.rstrip().endswith(" nedbus.cli.app"):
@@ -447,9 +448,9 @@ run.run_until_stopped(stand_still, on_stop=lambda: print("stopping", flush=True)
 
 
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
-def test_second_signal_ends_at_once(start: Start, number: signal.Signals, exit_code: int) -> None:
-    """A command that is stuck, and would have some time to end, has none after a second signal."""
-    stuck = start("-c", STUCK, measured=False)
+def test_second_signal_exits_at_once(start: Start, number: signal.Signals, exit_code: int) -> None:
+    """A second signal ends a hanging command at once, before the timeout."""
+    stuck = start("-c", STUCK, coverage=False)
     for text in ("started", "stopping"):
         wait_for(lambda text=text: text in stuck.out, what=text)  # type: ignore[misc]
         stuck.signal(number)
@@ -471,9 +472,9 @@ app(["serve", "-s", "sim:", "-l", sys.argv[1]])
 """
 
 
-def test_signal_during_a_slow_start_is_no_failure(start: Start) -> None:
-    """Where opening a router takes longer than closing a session may, Ctrl-C ends as ever, and nothing is lost."""
-    service = start("-c", SLOW, free_endpoint(), measured=False)
+def test_interrupt_during_a_slow_start_loses_nothing(start: Start) -> None:
+    """Ctrl-C while a router opens slowly exits with 130, even if that takes longer than the timeout for closing."""
+    service = start("-c", SLOW, free_endpoint(), coverage=False)
     wait_for(lambda: "opening" in service.out, what="the service to open its router")
     service.signal(signal.SIGINT)
     assert service.wait() == 130
@@ -501,23 +502,23 @@ run.run_until_stopped(work, closing=closing)
 @pytest.mark.parametrize(
     ("limit", "reason"),
     [
-        ("_END_TIMEOUT", "still at work 0.1 s after the signal"),
+        ("_END_TIMEOUT", "still running 0.1 s after the signal"),
         ("_CLOSE_TIMEOUT", "links not closed within 0.1 s"),
     ],
 )
-def test_what_does_not_end_is_ended_by_force(
+def test_hanging_command_is_terminated_after_timeout(
     start: Start, number: signal.Signals, exit_code: int, limit: str, reason: str
 ) -> None:
-    """Work has longer to end than a session to be closed; each says that it was cut short."""
-    endless = start("-c", ENDLESS.replace("LIMIT", limit), measured=False)
+    """Work and the closing of a session have a timeout each; the log names the one that expired."""
+    endless = start("-c", ENDLESS.replace("LIMIT", limit), coverage=False)
     wait_for(lambda: "started" in endless.out, what="the start")
     endless.signal(number)
     assert endless.wait() == exit_code
     assert reason in endless.err
 
 
-def test_hangup_ends_a_router(run_nedbus: Start) -> None:
-    """SIGHUP ends a command that has nothing to reload; the signal is logged, with the date."""
+def test_hangup_stops_a_router(run_nedbus: Start) -> None:
+    """SIGHUP stops a command without settings to reload; the log names the signal."""
     where = free_endpoint()
     router = run_nedbus("router", "-l", where)
     wait_for(lambda: f"router on {where}" in router.err, what="the router")
@@ -533,12 +534,12 @@ ON_TERMINAL = (
 
 
 @contextmanager
-def owning_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """Run `nedbus` as the first process of a terminal; yield it and the other side of the terminal."""
+def on_controlling_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run `nedbus` as the session leader of a terminal; yield the process and the other side of the terminal."""
     main, terminal = pty.openpty()
     python = (sys.executable, "-c", ON_TERMINAL, sys.executable, "-m", "nedbus", *command)
     with log.open("wb") as err, subprocess.Popen(
-        python, stdin=terminal, stdout=terminal, stderr=err, start_new_session=True, env=unmeasured()
+        python, stdin=terminal, stdout=terminal, stderr=err, start_new_session=True, env=without_coverage()
     ) as process:  # fmt: skip
         os.close(terminal)
         yield process, main
@@ -547,10 +548,10 @@ def owning_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen
 
 @pytest.mark.process
 @pytest.mark.parametrize("command", ["serve -s sim:", "record -o flight.mcap", "web --http 127.0.0.1:PORT"])
-def test_closed_terminal_ends_commands(bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str) -> None:
-    """A closed terminal ends a service, a recording and a page, as Ctrl-C does; none runs on unseen."""
+def test_closed_terminal_stops_commands(bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str) -> None:
+    """Closing the terminal stops a service, a recording and a web page, as Ctrl-C does."""
     log, arguments = tmp_path / "log", command.replace("PORT", str(free_port())).split()
-    with flying(bus, "9"), owning_terminal(log, *arguments, "-c", endpoint) as (process, main):
+    with publishing(bus, "9"), on_controlling_terminal(log, *arguments, "-c", endpoint) as (process, main):
         begun = {
             "serve": lambda: "1" in bus.vehicles(),
             "record": lambda: Path("flight.mcap").exists() and Path("flight.mcap").stat().st_size > 1000,
@@ -564,9 +565,9 @@ def test_closed_terminal_ends_commands(bus: nedbus.Bus, endpoint: str, tmp_path:
 
 @pytest.mark.process
 def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> None:
-    """A SIGHUP from `kill` makes a service reload, on an open terminal too."""
+    """`kill -HUP` reloads a service that runs on an open terminal."""
     log = tmp_path / "log"
-    with owning_terminal(log, "serve", "-s", "sim:", "-c", endpoint) as (process, main):
+    with on_controlling_terminal(log, "serve", "-s", "sim:", "-c", endpoint) as (process, main):
         wait_for(lambda: "sim:" in log.read_text(), what="the source")
         process.send_signal(signal.SIGHUP)
         wait_for(lambda: "settings reloaded: 0 started, 0 stopped, 1 unchanged" in log.read_text(), what="the reload")
@@ -577,8 +578,8 @@ def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.process
-def test_make_run(tmp_path: Path) -> None:
-    """A second one says that the address is in use, and how to choose; Ctrl-C ends the first without make's error."""
+def test_make_run_twice_explains_the_address_conflict(tmp_path: Path) -> None:
+    """A second `make run` names the address in use and the remedy; Ctrl-C ends the first without an error of make."""
     program = tmp_path / "venv" / "bin" / "nedbus"
     program.parent.mkdir(parents=True)
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
@@ -588,7 +589,9 @@ def test_make_run(tmp_path: Path) -> None:
     command = ["make", "-C", str(ROOT), "run", f"VENV={tmp_path}/venv", f"ARGS={options}"]
     log = tmp_path / "log"
     with log.open("w") as written:
-        first = subprocess.Popen(command, stdout=written, stderr=written, env=unmeasured(), start_new_session=True)
+        first = subprocess.Popen(
+            command, stdout=written, stderr=written, env=without_coverage(), start_new_session=True
+        )
     try:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
         second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)

@@ -15,9 +15,9 @@ import nedbus
 from nedbus.transport import Session
 from nedbus_msgs import Definition, define_msg, field_type, short_hash
 from tests.nedbus_msgs.messages.test_messages import write_wheels
-from tests.peers.answering import answering, reply_with
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.peers.queryables import answer_queries, reply_with
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 COUNT = 500
 
@@ -67,7 +67,7 @@ def test_message_of_a_log_is_read_without_a_file(
     ],
 )
 def test_hostile_description_harms_no_other_stream(
-    client: nedbus.Bus, bus: nedbus.Bus, raw: Session, answer: bytes | dict[str, Any]
+    client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session, answer: bytes | dict[str, Any]
 ) -> None:
     """If a peer sends a wrong description, its own message is invalid, and others are read."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
@@ -75,11 +75,14 @@ def test_hostile_description_harms_no_other_stream(
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/peer/Evil"
-    with answering(raw, schema, reply_with({schema: payload})), client.subscribe("*", mode="every") as subscription:
+    with (
+        answer_queries(zenoh_session, schema, reply_with({schema: payload})),
+        client.subscribe("*", mode="every") as subscription,
+    ):
         good = bus.publisher("vehicle_attitude", vehicle="1")
-        wait_for_reader(raw, "nedbus/7/evil")
+        wait_for_matching(zenoh_session, "nedbus/7/evil")
         encoding = f"application/msgpack;px4_msgs/Evil;hash={identity}"
-        raw.put("nedbus/7/evil", msgpack.packb([0, 1, 2]), encoding=encoding)
+        zenoh_session.put("nedbus/7/evil", msgpack.packb([0, 1, 2]), encoding=encoding)
         good.publish({"timestamp": 5})
         assert subscription.receive(DEADLINE).message == nedbus.VehicleAttitude(timestamp=5)
 
@@ -118,12 +121,12 @@ def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> Non
 
 
 def test_message_of_unknown_encoding_says_so(
-    client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+    client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Without name and hash in its encoding a message cannot be looked up, and the error says so."""
     with client.subscribe("wheel_encoders") as subscription:
-        wait_for_reader(raw, "nedbus/7/wheel_encoders")
-        raw.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
+        wait_for_matching(zenoh_session, "nedbus/7/wheel_encoders")
+        zenoh_session.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
 
         def is_counted() -> bool:
             with pytest.raises(nedbus.NoDataError):

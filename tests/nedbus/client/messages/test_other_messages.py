@@ -27,7 +27,7 @@ from tests.nedbus.client.lossy import LossyQueue
 from tests.nedbus.client.numbered import take, wait_for_subscriber
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 __all__ = ["clock"]  # a fixture
 
@@ -165,7 +165,7 @@ def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: A
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         receiver = Receiver(session, queue)
         with nedbus.Subscription[Any](receiver, queue, owner=None) as subscription:
-            wait_for_reader(bus._session, address.key())
+            wait_for_matching(bus._session, address.key())
             for number in range(10):
                 publisher.publish(make(address, number))
             received = [subscription.receive(DEADLINE).message for _ in range(10)]

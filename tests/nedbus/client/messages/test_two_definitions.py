@@ -27,11 +27,11 @@ from nedbus.transport import Session, open_router, query
 from nedbus_msgs import Address, Definition, Provenance, codec_of, define, encoding_of, field_type, short_hash
 from tests.flights.ulogs import UlogWriter
 from tests.nedbus.client.numbered import wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.command_line import run_command
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.peers.queryables import answer_queries, reply_with
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 NAME, TOPIC = "WindCell", "wind_cell"
 pytestmark = pytest.mark.usefixtures("patient_lookups")
@@ -197,7 +197,7 @@ def test_definition_is_kept_while_its_vehicle_changes(client: nedbus.Bus, bus: n
     assert [as_dict(sample.message) for sample in client.latest(TOPIC)] == [fields_of("B", 9)]
 
 
-def test_encoding_names_the_definition(bus: nedbus.Bus, raw: Session) -> None:
+def test_encoding_names_the_definition(bus: nedbus.Bus, zenoh_session: Session) -> None:
     """The hash is in the encoding of messages without a file; a query for it is answered with that definition."""
     for firmware in "AB":
         publisher_of(bus, firmware).publish(fields_of(firmware, 1))
@@ -208,24 +208,24 @@ def test_encoding_names_the_definition(bus: nedbus.Bus, raw: Session) -> None:
     )
     assert len(set(short.values())) == 2
     for parameter, expected in ("", set("AB")), (f"?hash={short['B']}", {"B"}):
-        replies = query(raw, f"nedbus/@schema/*/{NAME}{parameter}", timeout=DEADLINE)
+        replies = query(zenoh_session, f"nedbus/@schema/*/{NAME}{parameter}", timeout=DEADLINE)
         found = [json.loads(reply.payload.to_bytes()) for reply in replies]
         assert {each["hash"] for each in found} == {short[firmware] for firmware in expected}
 
 
-def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, raw: Session) -> None:
+def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, zenoh_session: Session) -> None:
     """A peer that describes a message with other fields, whatever hash it claims, leaves it undecoded."""
     wrong, definition = definition_of("B"), definition_of("A")
     schema = f"nedbus/@schema/peer/{NAME}"
     layout = {"wire": 0, "fields": [{"name": name, "type": str(kind)} for name, kind in wrong.types.items()]}
     claim = {"layouts": [layout], "hash": short_hash(NAME, definition.types)}
     with (
-        answering(raw, schema, reply_with({schema: json.dumps(claim).encode()})),
+        answer_queries(zenoh_session, schema, reply_with({schema: json.dumps(claim).encode()})),
         client.subscribe(TOPIC, mode="every") as subscription,
     ):
-        wait_for_reader(raw, f"nedbus/1/{TOPIC}")
+        wait_for_matching(zenoh_session, f"nedbus/1/{TOPIC}")
         payload = codec_of(definition).encode_fields(fields_of("A", 1))
-        raw.put(f"nedbus/1/{TOPIC}", payload, encoding=encoding_of(definition, None))
+        zenoh_session.put(f"nedbus/1/{TOPIC}", payload, encoding=encoding_of(definition, None))
 
         def is_rejected() -> bool:
             with suppress(nedbus.NoDataError):
@@ -235,12 +235,12 @@ def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, raw: Session
         wait_for(is_rejected, what="the message to be rejected")
 
 
-def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """A message is read once one publisher has described it, while another one, which is stopped, does not answer."""
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))
     with (
-        answering(raw, f"nedbus/@schema/peer/{NAME}", held.append),
+        answer_queries(zenoh_session, f"nedbus/@schema/peer/{NAME}", held.append),
         closing(Reader(endpoint, "models").bus) as reader,
         reader.subscribe(TOPIC, mode="every") as subscription,
     ):
@@ -249,14 +249,14 @@ def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus
         held.clear()
 
 
-def test_payload_of_another_size_is_invalid(bus: nedbus.Bus, raw: Session) -> None:
+def test_payload_of_another_size_is_invalid(bus: nedbus.Bus, zenoh_session: Session) -> None:
     """A payload that does not fit the definition that its encoding names is invalid."""
     publisher_of(bus, "A")
     with bus.subscribe(TOPIC, mode="every") as subscription:
         key, encoding = f"nedbus/1/{TOPIC}", encoding_of(definition_of("A"), None)
-        wait_for_reader(raw, key)
+        wait_for_matching(zenoh_session, key)
         for payload in (msgpack.packb([0, 1, 2.0]), msgpack.packb([7, 1, 2.0, 3.0]), msgpack.packb([0, 1, 2.0, 3.0])):
-            raw.put(key, payload, encoding=encoding)
+            zenoh_session.put(key, payload, encoding=encoding)
         assert as_dict(subscription.receive(DEADLINE).message) == {"timestamp": 1, "north": 2.0, "east": 3.0}
         assert subscription.counts.invalid == 2
 

@@ -16,8 +16,8 @@ import nedbus
 from nedbus.transport import Session
 from tests.flights.messages import VLP
 from tests.nedbus.client.numbered import numbered, take
-from tests.peers.answering import answering
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries
 from tests.waits import DEADLINE, wait_for, wait_for_router
 
 COUNT = 5000  # messages, more than are sent without a reader that reads
@@ -105,7 +105,7 @@ def test_cancelled_publish_many_can_be_continued(
     assert stuck.counts == nedbus.Counts(received=COUNT)
 
 
-def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
+def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Session, bus: nedbus.Bus) -> None:
     """A reader that acknowledges nothing delays a close until it is cancelled; then everything is closed."""
     asked: list[zenoh.Query] = []
 
@@ -124,12 +124,12 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus
                 closing.cancel()
                 with pytest.raises(asyncio.CancelledError):
                     await closing
-                await asyncio.to_thread(wait_for_router, raw)
+                await asyncio.to_thread(wait_for_router, zenoh_session)
                 assert list(bus.vehicles()) == vehicles
             with pytest.raises(nedbus.ClosedError):
                 await second.publish({"timestamp": 2})
 
-    with answering(raw, f"nedbus/*/{VLP}/@ack", asked.append):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
         asyncio.run(scenario())
     wait_for(
         lambda: not any(each.name.startswith("nedbus-close_") for each in threading.enumerate()),
@@ -137,10 +137,12 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, raw: Session, bus
     )
 
 
-def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(client: nedbus.Bus, raw: Session) -> None:
+def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(
+    client: nedbus.Bus, zenoh_session: Session
+) -> None:
     """A `with` block that ends with an exception, as Ctrl-C does, waits for no reader."""
     asked: list[zenoh.Query] = []
-    silent = answering(raw, f"nedbus/*/{VLP}/@ack", asked.append)
+    silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
         publisher.publish({"timestamp": 1})
         raise RuntimeError("on purpose")
@@ -148,10 +150,10 @@ def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(client: ned
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_close_with_a_timeout_gives_up(client: nedbus.Bus, raw: Session, whole_bus: bool) -> None:
+def test_close_with_a_timeout_gives_up(client: nedbus.Bus, zenoh_session: Session, whole_bus: bool) -> None:
     """A reader that acknowledges nothing delays a close by its timeout at most, and with 0 not at all."""
     asked: list[zenoh.Query] = []
-    with answering(raw, f"nedbus/*/{VLP}/@ack", asked.append):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
         for vehicle, timeout in (("1", 0.0), ("2", 0.05)):
             publisher = client.publisher(VLP, vehicle=vehicle, lossless=True)
             publisher.publish({"timestamp": 1})
@@ -180,7 +182,7 @@ def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.usefixtures("stuck")
 def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """One Ctrl-C ends a script of which six publishers wait for a reader."""
-    process = start("-c", SCRIPT, NEDBUS_CONNECT=endpoint, measured=False)
+    process = start("-c", SCRIPT, NEDBUS_CONNECT=endpoint, coverage=False)
     wait_for(lambda: len(bus.latest()) == 6, what=f"the messages: {process.err}")
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err

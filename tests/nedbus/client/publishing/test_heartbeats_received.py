@@ -39,10 +39,10 @@ def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> N
         subscriber.undeclare()
 
 
-def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, raw: Session) -> None:
+def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, zenoh_session: Session) -> None:
     """Each downsampled stream has its own numbers, and heartbeats with the last one."""
     heard: Heartbeats = {}
-    take, undeclare = follow_heartbeats(raw, f"nedbus/*/{VLP}/@rate/*")
+    take, undeclare = follow_heartbeats(zenoh_session, f"nedbus/*/{VLP}/@rate/*")
     with bus.publisher(VLP, vehicle="1") as publisher, bus.subscribe(VLP, mode="every", max_rate=1):
         wait_for_demand(publisher)
 

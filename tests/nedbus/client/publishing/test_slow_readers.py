@@ -177,7 +177,7 @@ def test_reader_that_dies_is_given_up(
 ) -> None:
     """A replay continues without a reader that is killed or ends, and other readers miss nothing."""
     timings.return_wait = 0.5
-    dying = start("-c", READER, endpoint, str(COUNT), "slow", measured=False)
+    dying = start("-c", READER, endpoint, str(COUNT), "slow", coverage=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")
     _, sending = publish_all(bus)
     wait_for(lambda: "ten" in dying.out, what="the first messages")

@@ -88,9 +88,11 @@ class QueueAccount(PendingQueue):
         with changing_timings() as timings:
             timings.retransmit_timeout = 1e6
             self._now += 1.0
-            for writer in list(self.account.requesting):
+            for writer in list(self.counters.requesting):
                 self.next_request(writer, self._now)
-        asked = [(writer, writer.request.requested) for writer in self.account.requesting if writer.request is not None]
+        asked = [
+            (writer, writer.request.requested) for writer in self.counters.requesting if writer.request is not None
+        ]
         return [Request(writer, writer.name, numbers) for writer, numbers in asked if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
@@ -102,7 +104,7 @@ class QueueAccount(PendingQueue):
 
     @property
     def held(self) -> int:
-        return self.account.held
+        return self.counters.held
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:

@@ -26,8 +26,8 @@ from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
 from tests.nedbus.client.test_bus import BOTH, SCHEMA
-from tests.peers.answering import answering, reply_with
-from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
+from tests.peers.queryables import answer_queries, reply_with
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 KEY = f"nedbus/1/{VLP}"
 ADDRESS = Address("7", "estimator_local_position", 1)  # of what is rejected
@@ -153,7 +153,7 @@ def test_two_threads_get_a_message_each(bus: nedbus.Bus) -> None:
 
 
 def test_invalid_payload_never_ends_an_iteration(
-    client: nedbus.Bus, raw: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
+    client: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Garbage, foreign keys, deletes and wildcard puts are counted and logged once; valid samples arrive."""
     subscription = client.subscribe("*", mode="every")
@@ -167,9 +167,9 @@ def test_invalid_payload_never_ends_an_iteration(
         ("nedbus/1/estimator_local_position", good),
         ("nedbus/1", good),
     ):
-        raw.put(key, payload)
-    raw.delete(KEY)
-    raw.put(f"nedbus/2/{VLP}", good)
+        zenoh_session.put(key, payload)
+    zenoh_session.delete(KEY)
+    zenoh_session.put(f"nedbus/2/{VLP}", good)
     sample = subscription.receive(DEADLINE)
     assert (sample.vehicle, sample.message, sample.sent) == ("2", message(2, x=1.0), None)
     assert subscription.counts == Counts(received=2, invalid=7)
@@ -179,7 +179,7 @@ def test_invalid_payload_never_ends_an_iteration(
 
 
 def test_long_keys_cost_a_reader_nothing(
-    bus: nedbus.Bus, raw: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
+    bus: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
     """150 invalid keys of 60 kB are counted but not kept, with 100 short log lines at most."""
     subscription = bus.subscribe("*", mode="every")
@@ -187,7 +187,7 @@ def test_long_keys_cost_a_reader_nothing(
     tracemalloc.start()
     try:
         for number in range(150):
-            raw.put(f"nedbus/{number}/{'x' * 60_000}", b"", congestion_control=zenoh.CongestionControl.BLOCK)
+            zenoh_session.put(f"nedbus/{number}/{'x' * 60_000}", b"", congestion_control=zenoh.CongestionControl.BLOCK)
         wait_for(lambda: subscription.counts.invalid == 150, what="all to be counted")
         kept, _ = tracemalloc.get_traced_memory()
     finally:
@@ -199,7 +199,9 @@ def test_long_keys_cost_a_reader_nothing(
     assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [True]
 
 
-def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
+def test_newer_layout_is_read_by_its_schema(
+    client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
+) -> None:
     """An unknown layout is looked up once; its messages are invalid until then, and unknown fields are logged once."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     reply = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
@@ -210,8 +212,11 @@ def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, ca
         reply(query)
 
     subscription = client.subscribe(mode="every")
-    wait_for_reader(raw, KEY)
-    with answering(raw, SCHEMA, count), repeating(lambda: raw.put(KEY, msgpack.packb([9, 4, True, 2.5]))):
+    wait_for_matching(zenoh_session, KEY)
+    with (
+        answer_queries(zenoh_session, SCHEMA, count),
+        repeating(lambda: zenoh_session.put(KEY, msgpack.packb([9, 4, True, 2.5]))),
+    ):
         taken = list(islice(subscription, 2))
     assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [(4, 2.5), (4, 2.5)]
     assert subscription.counts.invalid > 0
@@ -220,38 +225,38 @@ def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, ca
     assert unread == ["layout 9 of VehicleLocalPosition is newer than this reader; not read: brand_new"]
 
 
-def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) -> None:
+def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session: Session) -> None:
     """The query of last messages waits for the description of a layout that the reader does not know."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)
-    with answering(raw, SCHEMA, schema), answering(raw, KEY, last):
+    with answer_queries(zenoh_session, SCHEMA, schema), answer_queries(zenoh_session, KEY, last):
         assert [(each.message.timestamp, each.message.x) for each in client.latest()] == [(4, 2.5)]
 
 
 @pytest.mark.parametrize(
     "answer", [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}']
 )
-def test_layout_without_a_description_is_invalid(bus: nedbus.Bus, raw: Session, answer: bytes) -> None:
+def test_layout_without_a_description_is_invalid(bus: nedbus.Bus, zenoh_session: Session, answer: bytes) -> None:
     """After a hostile or broken description of a layout its messages are counted as invalid."""
-    with answering(raw, SCHEMA, reply_with({SCHEMA: answer})):
+    with answer_queries(zenoh_session, SCHEMA, reply_with({SCHEMA: answer})):
         subscription = bus.subscribe(VLP, mode="every")
-        wait_for_reader(raw, KEY)
-        raw.put(KEY, msgpack.packb([9, 1, 2]))
-        raw.put(KEY, encode(message(2)))
+        wait_for_matching(zenoh_session, KEY)
+        zenoh_session.put(KEY, msgpack.packb([9, 1, 2]))
+        zenoh_session.put(KEY, encode(message(2)))
         assert take(subscription, 1) == [2]
         assert subscription.counts.invalid == 1
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, raw: Session, mode: Mode) -> None:
+def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, zenoh_session: Session, mode: Mode) -> None:
     """A peer that sends unknown layouts and never replies delays no other stream, and is queried once."""
-    held = raw.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
+    held = zenoh_session.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(VLP, mode=mode)
-    wait_for_reader(raw, f"nedbus/2/{VLP}")
+    wait_for_matching(zenoh_session, f"nedbus/2/{VLP}")
     for layout in range(100, 150):
-        raw.put(f"nedbus/2/{VLP}", msgpack.packb([layout, 1, 2]))
+        zenoh_session.put(f"nedbus/2/{VLP}", msgpack.packb([layout, 1, 2]))
     wait_for(lambda: subscription.waiting or subscription.counts.invalid, what="the first of them")
     publish(publisher, 1)
     assert take(subscription, 1) == [1]
@@ -277,19 +282,19 @@ def test_unexpected_error_in_the_pump_is_counted(
     assert any("unexpected error, " in text and "discarded" in text for text in caplog.messages)
 
 
-def test_reports_arrive_with_their_reason(bus: nedbus.Bus, raw: Session) -> None:
+def test_reports_arrive_with_their_reason(bus: nedbus.Bus, zenoh_session: Session) -> None:
     """A report of a service is read with its address; anything else is ignored."""
     rejections = bus.rejections()
-    wait_for_reader(raw, ADDRESS.rejected_key())
+    wait_for_matching(zenoh_session, ADDRESS.rejected_key())
     for key, payload in (
         ("nedbus/@rejected/7/Nothing", b'{"reason": "no such topic"}'),
         (ADDRESS.rejected_key(), b"no JSON"),
         (Address("8", VLP).rejected_key(), b'["a list"]'),
         (ADDRESS.rejected_key(), b'{"reason": "%s"}' % (b"x" * 100_000)),
     ):
-        raw.put(key, payload)
-    queries = QueryServer(raw)
-    PublisherRegistry(raw, queries, prefix="nedbus", is_client=True).reject(ADDRESS, {"reason": "x is NaN"})
+        zenoh_session.put(key, payload)
+    queries = QueryServer(zenoh_session)
+    PublisherRegistry(zenoh_session, queries, prefix="nedbus", is_client=True).reject(ADDRESS, {"reason": "x is NaN"})
     reports: list[RejectionReport] = []
 
     def has_come() -> bool:

@@ -21,7 +21,7 @@ from tests.flights.local_position import LAYOUTS, downgrade, encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
 from tests.peers.ports import free_endpoint
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 COUNT = 900  # fewer than half a window: here one thread publishes and reads
 
@@ -135,7 +135,7 @@ def test_nothing_is_lost_while_the_router_is_away() -> None:
 
 
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
-def test_unusual_payloads_are_decoded_one_by_one(bus: nedbus.Bus, raw: Session, filler: int) -> None:
+def test_unusual_payloads_are_decoded_one_by_one(bus: nedbus.Bus, zenoh_session: Session, filler: int) -> None:
     """Payloads of other encoders, older layouts, invalid ones and wrong keys give the same result as one by one."""
     good = message(7, x=1.5, hagl_max_z=3.0, hagl_max_xy=3.0)
     values = [list(value) if isinstance(value, tuple) else value for value in good.__dict__.values()]
@@ -146,15 +146,15 @@ def test_unusual_payloads_are_decoded_one_by_one(bus: nedbus.Bus, raw: Session, 
     bad = bytearray(encode(good))
     bad[4 + 9] = 0xC0  # a tag
     subscription = bus.subscribe("*", mode="every")
-    wait_for_reader(raw, key)
+    wait_for_matching(zenoh_session, key)
     for payload in (*payloads, bytes(bad), b"", encode(good) + b"\0", *payloads):
-        raw.put(key, payload)
-    raw.put(f"nedbus/*/{VLP}", encode(good))
-    raw.delete(key)
-    raw.put("nedbus/1/nothing", encode(good))
+        zenoh_session.put(key, payload)
+    zenoh_session.put(f"nedbus/*/{VLP}", encode(good))
+    zenoh_session.delete(key)
+    zenoh_session.put("nedbus/1/nothing", encode(good))
     batches = subscription.batches()
     taken = take_batches(batches, 2 * len(payloads))
-    raw.put(key, encode(message(8)))
+    zenoh_session.put(key, encode(message(8)))
     taken += take_batches(batches, 1)
     messages = [to_message(element) for batch in taken for element in batch.messages]
     assert messages == [good] * 2 * len(payloads) + [message(8)]

@@ -24,8 +24,8 @@ from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 from tests.nedbus.client.numbered import is_read, take, wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.processes import Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
 
 __all__ = ["Clock", "clock", "publish", "take", "wait_for_demand"]  # for others that thin
@@ -103,33 +103,33 @@ def test_array_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
         assert take(subscription, 2) == [1, 1]
 
 
-def thinned_by(raw: Session) -> list[str]:
+def thinned_by(zenoh_session: Session) -> list[str]:
     """Return the declared downsampled streams, by their liveliness tokens."""
-    return [str(reply.ok.key_expr) for reply in raw.liveliness().get("nedbus/**/@rate/*") if reply.ok]
+    return [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("nedbus/**/@rate/*") if reply.ok]
 
 
-def test_nothing_is_declared_without_readers(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
+def test_nothing_is_declared_without_readers(bus: nedbus.Bus, zenoh_session: Session, clock: Clock) -> None:
     """Downsampled streams are declared for their readers only, and withdrawn a minute after the last one."""
     publisher, other = (bus.publisher(VLP, vehicle=vehicle) for vehicle in "78")
     subscription = bus.subscribe(VLP, mode="every")
     wait_for_subscriber(publisher)
     publish(publisher, clock, 1, 10)
     assert take(subscription, 10) == list(range(1, 11))
-    assert thinned_by(raw) == []
+    assert thinned_by(zenoh_session) == []
     for _ in range(2):
         with bus.subscribe(VLP, vehicle="7", mode="every", max_rate=5):
             wait_for_demand(publisher)
             publish(publisher, clock, 11, 2)
             publish(other, clock, 11, 2)
-            wait_for(lambda: thinned_by(raw) == [f"{publisher.key}/@rate/5"], what="the downsampled stream")
+            wait_for(lambda: thinned_by(zenoh_session) == [f"{publisher.key}/@rate/5"], what="the downsampled stream")
         wait_for(lambda: not is_wanted(publisher), what="the end of the demand")
         publish(publisher, clock, 13, 3000)
-        assert thinned_by(raw)
+        assert thinned_by(zenoh_session)
 
         def withdraws() -> bool:
             clock.now += 61_000 * MS
             publish(publisher, clock, 4000, 1)
-            return not thinned_by(raw)
+            return not thinned_by(zenoh_session)
 
         wait_for(withdraws, what="the end of the downsampled stream")
 
@@ -150,12 +150,12 @@ def test_listener_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clo
         assert subscription.counts == nedbus.Counts(received=11)
 
 
-def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
+def test_storage_is_no_vehicle(bus: nedbus.Bus, zenoh_session: Session, clock: Clock) -> None:
     """A subscription starts with the last messages of publishers, not with those of a storage."""
-    stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=raw.new_timestamp())
+    stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=zenoh_session.new_timestamp())
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
-    with answering(raw, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
         assert subscription.receive(DEADLINE).vehicle == "7"
         wait_for_demand(publisher)
         publish(publisher, clock, 2, 1)

@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_forgotten_last(monkeypatch: pytest.MonkeyPatch)
         pending_queue.put([raw(number, key=key_of(vehicle), publisher=vehicle) for number in numbers])
     assert pending_queue.counts == Counts(lost=4, forgotten=2)  # b, then a
     assert [sample.vehicle for sample in drain(pending_queue)] == list("abcdae")
-    assert len(pending_queue.account.requesting) == 2
+    assert len(pending_queue.counters.requesting) == 2
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])

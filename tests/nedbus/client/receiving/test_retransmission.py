@@ -25,9 +25,9 @@ from tests.flights.local_position import encode, encoding_of
 from tests.flights.messages import VLP, message
 from tests.nedbus.client.lossy import Lossy, LossyQueue
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
-from tests.peers.answering import answering, reply_with
 from tests.peers.ports import free_endpoint
-from tests.waits import DEADLINE, wait_for, wait_for_reader, wait_for_router
+from tests.peers.queryables import answer_queries, reply_with
+from tests.waits import DEADLINE, wait_for, wait_for_matching, wait_for_router
 
 KEY = f"nedbus/7/{VLP}"
 
@@ -72,14 +72,14 @@ def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pyte
     assert lossy.subscription.counts == Counts(received=4, lost=2)
 
 
-def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, raw: Session, timings: Timings) -> None:
+def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, zenoh_session: Session, timings: Timings) -> None:
     """A publisher of another program, with sequence numbers but no cache, gets one request per gap after a timeout."""
     timings.retransmit_timeout = 0.2
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
-    foreign = zenoh.ext.declare_advanced_publisher(raw, key, sample_miss_detection=misses)
+    foreign = zenoh.ext.declare_advanced_publisher(zenoh_session, key, sample_miss_detection=misses)
     lossy.queue.missing = {1, 3}
-    wait_for_reader(raw, key)
+    wait_for_matching(zenoh_session, key)
     for timestamp in range(3):
         foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
     assert lossy.receive(2) == [0, 2]
@@ -109,15 +109,15 @@ def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, timings:
 
 
 @pytest.mark.parametrize("waits", ["without", "with a timeout"])
-def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, waits: str) -> None:
+def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: Session, waits: str) -> None:
     """The newest message is recovered by a heartbeat, also if its reader waits in Zenoh's channel without timeout.
 
     The sample that wakes it up is invisible to other readers of its session, and does not leave the process.
     """
     received: list[int] = []
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
-    foreign = raw.declare_subscriber(KEY, seen)
-    wait_for_router(raw)
+    foreign = zenoh_session.declare_subscriber(KEY, seen)
+    wait_for_router(zenoh_session)
     lossless = LossyQueue(KEY)
     other = Receiver(lossy.session, lossless)
 
@@ -147,10 +147,10 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, wa
     foreign.undeclare()
 
 
-def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
+def test_answers_of_others_are_left_out(lossy: Lossy, zenoh_session: Session) -> None:
     """Replies of peers other than the publisher are ignored."""
     lie = reply_with({KEY: encode(message(666))}, encoding=encoding_of("sim"))
-    with answering(raw, f"{KEY}/@adv/pub/**", lie):
+    with answer_queries(zenoh_session, f"{KEY}/@adv/pub/**", lie):
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
@@ -158,7 +158,7 @@ def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
 
 
 @pytest.mark.parametrize("when", ["open", "closed"])
-def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str) -> None:
+def test_flood_of_replies_delays_no_other(lossy: Lossy, zenoh_session: Session, when: str) -> None:
     """A flood of replies to a request does not stop the session, not even after its reader has closed."""
     asked = threading.Event()
 
@@ -168,7 +168,7 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str)
             for _ in range(2000):
                 query.reply(KEY, b"junk")
 
-    with answering(raw, f"{KEY}/@adv/pub/**", flood):
+    with answer_queries(zenoh_session, f"{KEY}/@adv/pub/**", flood):
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         if when == "closed":
@@ -190,31 +190,31 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, when: str)
 @pytest.mark.parametrize(
     "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
 )
-def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> None:
+def test_odd_heartbeats_are_none(lossy: Lossy, zenoh_session: Session, entity: str) -> None:
     """A forged heartbeat causes no request, and prevents no other."""
-    raw.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
-    raw.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
+    zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
+    zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
     lossy.queue.missing = {1}
     lossy.publish(0, 1, 2)
     assert lossy.receive(3) == [0, 1, 2]
     lossy.publish(3)
     assert lossy.receive(1) == [3]
     assert {key for key, _, _ in lossy.asked} == {KEY}
-    assert not lossy.queue.account.requesting
+    assert not lossy.queue.counters.requesting
 
 
-def test_requests_without_replies_delay_no_others(lossy: Lossy, raw: Session) -> None:
+def test_requests_without_replies_delay_no_others(lossy: Lossy, zenoh_session: Session) -> None:
     """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"
-    with answering(raw, f"{evil}/**", taken.append):
+    with answer_queries(zenoh_session, f"{evil}/**", taken.append):
         for number in range(1, 300):
-            raw.put(f"{evil}/{number:x}/1/_", b"\x05\x00\x00\x00")
+            zenoh_session.put(f"{evil}/{number:x}/1/_", b"\x05\x00\x00\x00")
         wait_for(lambda: taken, what="a question for one that is invented")
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
-        assert lossy.queue.account.requesting  # the others still wait
+        assert lossy.queue.counters.requesting  # the others still wait
         taken.clear()
 
 
@@ -257,7 +257,7 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
     lossy.publish(*range(4))
     assert lossy.receive(1) == [0]
-    wait_for(lambda: lossy.queue.account.requesting, what="the hole")
+    wait_for(lambda: lossy.queue.counters.requesting, what="the hole")
     lossy.subscription.close()
     assert lossy.subscription.counts.lost == 2
 
@@ -277,7 +277,7 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
     wait_for(
-        lambda: (lossy.queue.waiting, lossy.queue.account.held) == (10, 9),
+        lambda: (lossy.queue.waiting, lossy.queue.counters.held) == (10, 9),
         what="what comes before the hole and after it",
     )
     asked_before = list(lossy.asked)

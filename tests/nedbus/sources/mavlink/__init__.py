@@ -1,1 +1,1 @@
-"""The ULog stream over MAVLink: reassembly, the client, and the peer that plays a PX4."""
+"""Tests of the MAVLink source and the ULog stream."""

@@ -1,9 +1,8 @@
-"""Simulate a MAVLink 2 vehicle for tests: one UDP socket, one process, the streams of a PX4 from a file of rows.
+"""Simulated MAVLink 2 vehicle for tests: one UDP socket, one process, the streams of a PX4 from a file of rows.
 
-Every position that was sent is a JSON line on stdout with its float32 values.
-The last line has the number of messages that were dropped.
-The same arguments give the same packets, in order; commands are not answered.
-Unlike PX4, GLOBAL_POSITION_INT (the heading) is sent without an origin too and GPS_GLOBAL_ORIGIN is repeated.
+Each position sent is a JSON line on stdout with its float32 values; the last line has the number of dropped packets.
+The same arguments produce the same packets in the same order; commands are not answered.
+Unlike PX4, it sends GLOBAL_POSITION_INT (the heading) without an origin, too, and repeats GPS_GLOBAL_ORIGIN.
 """
 
 import argparse
@@ -30,7 +29,7 @@ BOOT_MS = 5000  # time_boot_ms after a reboot
 
 
 def covariance(known: dict[int, float]) -> list[float]:
-    """Return the 21 numbers of an upper triangle: NaN, as PX4 sends it, but for the known ones."""
+    """Return the 21 elements of an upper triangle: NaN, as PX4 sends it, except the given ones."""
     return [known.get(index, NAN) for index in range(21)]
 
 
@@ -77,7 +76,7 @@ def odometry(ms: int, row: Row) -> Any:
 
 
 def schedule(streams: list[Stream]) -> Iterator[tuple[float, Build]]:
-    """Yield (seconds since boot, builder) endlessly; at equal times the position is last."""
+    """Yield (seconds since boot, builder) endlessly; at equal times the position comes last."""
     heap = [(0.0, order, 0) for order, (rate, _) in enumerate(streams) if rate > 0]
     while True:
         now, order, turn = heapq.heappop(heap)

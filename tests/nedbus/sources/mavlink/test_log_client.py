@@ -1,4 +1,4 @@
-"""The client of PX4's ULog stream with a fake clock: each case was seen on a real PX4 (SITL, main of 2026-05-14)."""
+"""ULog stream state machine with a fake clock; each case was observed on a real PX4 (SITL, main of 2026-05-14)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from nedbus.sources.mavlink.log_client import Command, LogReason, LogState, LogS
 from nedbus.timings import TIMINGS
 from tests.peers.px4_log_stream import START, STOP, STREAMS, datagrams
 
-from .counted import CountedReassembly
+from .counting_reassembly import CountingReassembly
 
 OURS: Final = (245, 191)
 OTHERS: Final = (246, 190)
 PX4: Final = dialect.MAV_AUTOPILOT_PX4
 ACCEPTED: Final = dialect.MAV_RESULT_ACCEPTED
-TAKEN: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
+REJECTED: Final = dialect.MAV_RESULT_TEMPORARILY_REJECTED
 IN_PROGRESS: Final = dialect.MAV_RESULT_IN_PROGRESS
 
 Log = Literal["1", "armed", "take"]
@@ -27,7 +27,7 @@ Reason = tuple[LogState, LogReason | None]
 
 
 class Session:
-    """A client, the vehicle's part by hand, what was sent, and each state with its reason."""
+    """A client, a hand-driven vehicle, the commands sent, and each state with its reason."""
 
     def __init__(self, *log: Log, armed: bool = False, autopilot: int = PX4) -> None:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
@@ -46,7 +46,7 @@ class Session:
     def acknowledged(self) -> list[int]:
         return [each.sequence for each in self.sent if each.kind == "acknowledge"]
 
-    def take(self, commands: list[Command]) -> None:
+    def add(self, commands: list[Command]) -> None:
         self.sent += commands
         if self.client.status[:2] != self.states[-1]:
             self.states.append(self.client.status[:2])
@@ -57,22 +57,22 @@ class Session:
         for step in range(round(seconds * 10)):
             self.now += 0.1
             if heartbeats and step % 10 == 0:
-                self.take(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
-            self.take(self.client.tick(self.now))
+                self.add(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
+            self.add(self.client.tick(self.now))
 
     def answer(self, command: int, result: int, ids: tuple[int, int] = OURS) -> None:
-        self.take(self.client.on_command_ack(command, result, *ids, self.now))
+        self.add(self.client.on_command_ack(command, result, *ids, self.now))
 
     def receive(self, *, acked: bool = False, begins: bool = False, sequence: int | None = None) -> None:
-        """Receive the next message of the stream, or the one with this sequence."""
+        """Receive the next message of the stream, or the one with this sequence number."""
         self._next = 0 if begins else self._next
         assert self.client.accepts(*OURS)
         at = self._next if sequence is None else sequence
-        self.take(self.client.on_data(at, self.now, acked=acked, begins=begins))
+        self.add(self.client.on_data(at, self.now, acked=acked, begins=begins))
         self._next += sequence is None
 
     def header(self, messages: int = 274, round_trip: float = 0.004) -> None:
-        """Receive a header, as long as it is acknowledged."""
+        """Receive a header for as long as it is acknowledged."""
         for number in range(messages):
             before = len(self.acknowledged)
             self.receive(acked=True, begins=number == 0)
@@ -84,12 +84,12 @@ class Session:
         for step in range(round(seconds / interval)):
             self.now += interval
             if step % max(1, round(1 / interval)) == 0:
-                self.take(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
+                self.add(self.client.on_heartbeat(self.autopilot, self.now, armed=self.armed))
             self.receive()
-            self.take(self.client.tick(self.now))
+            self.add(self.client.tick(self.now))
 
     def start(self) -> None:
-        """Start a stream, and receive its header and its first second."""
+        """Start a stream; receive its header and its first second."""
         self.wait(0.1)
         self.answer(START, ACCEPTED)
         self.header()
@@ -98,12 +98,12 @@ class Session:
 
 @pytest.fixture
 def session() -> Session:
-    """Return a session with log=1 in which nothing has happened."""
+    """Return a session with log=1, before the first heartbeat."""
     return Session()
 
 
-def test_stream_starts_and_every_acked_message_is_acknowledged(session: Session) -> None:
-    """START at the first heartbeat; each LOGGING_DATA_ACKED is acknowledged, repeated and late ones too."""
+def test_every_acked_message_is_acknowledged(session: Session) -> None:
+    """The first heartbeat triggers START; each LOGGING_DATA_ACKED is acknowledged, including retransmissions."""
     session.start()
     session.receive(acked=True, sequence=273)
     session.receive(acked=True)
@@ -114,8 +114,8 @@ def test_stream_starts_and_every_acked_message_is_acknowledged(session: Session)
     assert session.client.header_seconds == pytest.approx(273 * 0.004)
 
 
-def test_messages_for_other_ids_are_rejected(session: Session) -> None:
-    """Data that were not requested, or are addressed to another client, are neither used nor acknowledged."""
+def test_data_for_other_ids_is_rejected(session: Session) -> None:
+    """Data that was not requested, or is addressed to another client, is neither used nor acknowledged."""
     assert not session.client.accepts(*OURS)
     session.wait(0.1)
     assert session.client.accepts(*OURS)
@@ -124,9 +124,9 @@ def test_messages_for_other_ids_are_rejected(session: Session) -> None:
 
 
 def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
-    """The answer to another client on the link, or to another command, changes nothing."""
+    """A COMMAND_ACK for another client, or for another command, has no effect."""
     session.wait(0.1)
-    session.answer(START, TAKEN, OTHERS)
+    session.answer(START, REJECTED, OTHERS)
     session.answer(STOP, ACCEPTED)
     session.answer(400, ACCEPTED)
     assert session.states[-1] == ("starting", None)
@@ -138,17 +138,17 @@ def test_command_acks_for_other_ids_are_ignored(session: Session) -> None:
 @pytest.mark.parametrize(
     ("result", "reason", "retry"),
     [
-        (TAKEN, "taken", TIMINGS.log_retry),
+        (REJECTED, "taken", TIMINGS.log_retry),
         (dialect.MAV_RESULT_DENIED, "bandwidth", TIMINGS.log_slow_retry),
         (dialect.MAV_RESULT_UNSUPPORTED, "unsupported", TIMINGS.log_slow_retry),
         (dialect.MAV_RESULT_FAILED, "failed", TIMINGS.log_retry),
         (99, "failed", TIMINGS.log_retry),
     ],
 )
-def test_refusal_is_reported_once_and_retried_seldom(
+def test_rejected_start_is_reported_once_and_retried(
     session: Session, result: int, reason: LogReason, retry: float
 ) -> None:
-    """Each result of START has its reason; another attempt with the same result is no news."""
+    """Each result of START maps to a reason; a retry with the same result does not change the status."""
     session.wait(0.1)
     for _ in range(3):
         session.answer(START, result)
@@ -160,16 +160,16 @@ def test_refusal_is_reported_once_and_retried_seldom(
     assert set(session.commands) == {"start"}
 
 
-def test_in_progress_is_waited_for(session: Session) -> None:
-    """IN_PROGRESS is no result: the answer follows."""
+def test_in_progress_extends_timeout(session: Session) -> None:
+    """After IN_PROGRESS the client keeps waiting for the final result."""
     session.wait(0.9)
     session.answer(START, IN_PROGRESS)
     session.wait(0.8)
     assert session.commands == ["start"]
 
 
-def test_missing_answer_is_reported_after_three_attempts(session: Session) -> None:
-    """With SDLOG_BACKEND 0 no command is answered: attempts after 0, 1 and 3 s, and then every 30 s."""
+def test_unanswered_start_is_reported_after_three_attempts(session: Session) -> None:
+    """With SDLOG_BACKEND 0 no command is answered: START is sent after 0, 1 and 3 s, and then every 30 s."""
     session.wait(0.1)
     for seconds, attempts in ((0.8, 1), (0.4, 2), (1.6, 2), (0.4, 3), (3.5, 3)):
         session.wait(seconds)
@@ -182,8 +182,8 @@ def test_missing_answer_is_reported_after_three_attempts(session: Session) -> No
     assert len(session.commands) <= 10
 
 
-def test_autopilot_other_than_px4_is_not_asked() -> None:
-    """The reason names the autopilot."""
+def test_autopilot_other_than_px4_receives_no_start() -> None:
+    """The client sends nothing, and the reason names the autopilot."""
     session = Session(autopilot=dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
     session.wait(100)
     assert session.sent == []
@@ -191,8 +191,8 @@ def test_autopilot_other_than_px4_is_not_asked() -> None:
     assert "MAV_AUTOPILOT_ARDUPILOTMEGA" in session.client.status.text
 
 
-def test_armed_vehicle_is_asked_after_disarming() -> None:
-    """A start blocks the vehicle's logger, so it waits; a stream that runs goes on in flight."""
+def test_start_waits_for_disarming() -> None:
+    """START blocks the vehicle's logger, so it waits for disarming; a running stream continues in flight."""
     session = Session(armed=True)
     session.wait(60)
     assert (session.commands, session.states[1:]) == ([], [("waiting_for_disarm", "armed")])
@@ -204,15 +204,14 @@ def test_armed_vehicle_is_asked_after_disarming() -> None:
     assert session.client.status.state == "streaming"
 
 
-def test_armed_vehicle_is_asked_on_request() -> None:
-    """log=armed allows a start in flight."""
+def test_log_armed_starts_in_flight() -> None:
     session = Session("armed", armed=True)
     session.start()
     assert session.client.status.state == "streaming"
 
 
-def test_arming_ends_the_attempts(session: Session) -> None:
-    """Without an answer START is not repeated once the vehicle is armed."""
+def test_arming_stops_start_retries(session: Session) -> None:
+    """An unanswered START is not repeated once the vehicle is armed."""
     session.wait(0.5)
     session.armed = True
     session.wait(60)
@@ -221,33 +220,33 @@ def test_arming_ends_the_attempts(session: Session) -> None:
 
 
 class TestOwnership:
-    """The stream belongs to one client; who else wants it, is rejected."""
+    """PX4 streams to one client at a time, and rejects all others."""
 
-    def test_stream_of_another_client_is_left_alone(self, session: Session) -> None:
-        """Without log=take a rejected client never sends STOP, neither then nor when it ends."""
+    def test_rejected_client_without_take_never_sends_stop(self, session: Session) -> None:
+        """Without log=take a rejected client does not send STOP, not even when it stops."""
         session.wait(0.1)
         for _ in range(4):
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
             session.wait(TIMINGS.log_retry)
-        session.answer(START, TAKEN)
-        session.take(session.client.stop(session.now))
+        session.answer(START, REJECTED)
+        session.add(session.client.stop(session.now))
         assert set(session.commands) == {"start"}
         assert session.client.status.state == "stopped"
 
-    def test_client_that_has_the_stream_is_named(self, session: Session) -> None:
-        """Its data on the same link show its ids."""
+    def test_owner_of_stream_is_named(self, session: Session) -> None:
+        """Data on the same link reveals the ids of the client that owns the stream."""
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         assert "another client has it" in session.client.status.text
         assert not session.client.accepts(255, 190)
         assert "system 255 component 190 has it" in session.client.status.text
         assert session.client.status[:2] == ("refused", "taken")
 
-    def test_stream_of_another_client_is_taken_over_on_request(self) -> None:
-        """log=take: STOP, its acceptance, a pause, START; acknowledgements go on meanwhile."""
+    def test_log_take_takes_over_stream(self) -> None:
+        """log=take sends STOP, waits for acceptance and a pause, then sends START, and acknowledges data throughout."""
         session = Session("take")
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.answer(STOP, IN_PROGRESS)
         session.wait(0.2)
         session.receive(acked=True, sequence=70)
@@ -261,36 +260,36 @@ class TestOwnership:
         session.header()
         assert session.states[1:] == [("starting", None), ("header", None)]
 
-    def test_stream_is_taken_over_once(self) -> None:
-        """A client that is rejected again leaves the stream alone; with SDLOG_BACKEND 1 a takeover changes nothing."""
+    def test_log_take_takes_over_only_once(self) -> None:
+        """A client that is rejected again does not repeat STOP; with SDLOG_BACKEND 1 a takeover has no effect."""
         session = Session("take")
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.answer(STOP, ACCEPTED)
         session.wait(TIMINGS.log_timeout + 0.2)
         for _ in range(5):
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
             session.wait(TIMINGS.log_retry + 0.2)
         assert session.commands.count("stop") == 1
         assert session.states[1:] == [("starting", None), ("refused", "taken")]
 
-    def test_stream_of_an_earlier_process_is_started_anew(self, session: Session) -> None:
-        """A stream to the client's own ids whose header it missed: STOP, a pause and START, once."""
+    def test_stream_of_earlier_process_is_restarted(self, session: Session) -> None:
+        """A stream to the client's own ids without a header is restarted once with STOP, a pause and START."""
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.receive(sequence=7000)
         assert session.commands == ["start", "stop"]
         session.answer(STOP, ACCEPTED)
         session.receive(sequence=7001)
         session.wait(TIMINGS.log_timeout + 0.2)
         assert session.commands == ["start", "stop", "start"]
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.receive(sequence=7002)
         assert session.commands == ["start", "stop", "start"]
         assert session.client.status.reason == "taken"
 
-    def test_stop_by_another_client_is_named(self, session: Session) -> None:
-        """PX4 sends 44 acknowledged messages to the first client, and nothing else: START waits for the other one."""
+    def test_stop_by_another_client_is_detected(self, session: Session) -> None:
+        """PX4 sends only 44 acknowledged messages to the first client, which retries START later."""
         session.start()
         for _ in range(44):
             session.receive(acked=True)
@@ -301,10 +300,10 @@ class TestOwnership:
         session.wait(3)
         assert session.commands[:2] == ["start", "start"]
 
-    def test_second_start_leaves_the_stream_untouched(self, session: Session) -> None:
-        """An answer to a START that is not open, or a rejection of the second one, changes nothing."""
+    def test_second_start_does_not_affect_stream(self, session: Session) -> None:
+        """A late answer to START, or the rejection of a second START, has no effect."""
         session.start()
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         session.answer(START, ACCEPTED)
         session.stream()
         assert session.states[-1] == ("streaming", None)
@@ -312,10 +311,10 @@ class TestOwnership:
 
 
 class TestNoData:
-    """START is accepted, and nothing is sent: after STOP without waiting, or when another link has the stream."""
+    """PX4 accepts START but sends no data: after STOP without waiting, or if another link has the stream."""
 
-    def test_start_without_data_is_followed_by_stop_and_start(self, session: Session) -> None:
-        """STOP after 1 s, START 2.5 s after its acceptance."""
+    def test_start_without_data_is_followed_by_restart(self, session: Session) -> None:
+        """STOP follows after 1 s, and START 2.5 s after STOP was accepted."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.wait(0.8)
@@ -331,8 +330,8 @@ class TestNoData:
         session.stream()
         assert session.states[1:] == [("starting", None), ("header", None), ("streaming", None)]
 
-    def test_start_without_data_is_given_up(self, session: Session) -> None:
-        """After three attempts the stream is stopped, and asked for every 30 s."""
+    def test_start_without_data_fails_after_three_attempts(self, session: Session) -> None:
+        """After three attempts the client sends STOP, and retries every 30 s."""
         session.wait(0.1)
         for attempts in (3, 4):
             for _ in range(150):
@@ -342,16 +341,16 @@ class TestNoData:
             assert session.commands == ["start", "stop"] * attempts
         assert session.states[1:] == [("starting", None), ("refused", "no_data")]
 
-    def test_data_in_the_middle_are_no_start(self, session: Session) -> None:
-        """Data of an earlier stream that are still on their way are not the new one."""
+    def test_late_data_of_earlier_stream_is_not_a_new_stream(self, session: Session) -> None:
+        """Delayed data of an earlier stream does not count as the requested one."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.receive(sequence=300)
         session.wait(1.2)
         assert session.commands == ["start", "stop"]
 
-    def test_lost_answer_is_replaced_by_the_first_message(self, session: Session) -> None:
-        """The header arrives, the COMMAND_ACK does not: START is not repeated."""
+    def test_header_replaces_lost_command_ack(self, session: Session) -> None:
+        """If the header arrives without a COMMAND_ACK, START is not repeated."""
         session.wait(0.1)
         session.header()
         session.stream()
@@ -360,11 +359,11 @@ class TestNoData:
 
 
 class TestHeader:
-    """While PX4 sends the header, its logger is blocked, and the vehicle's own log has a hole."""
+    """While PX4 sends the header its logger is blocked, which leaves a gap in the vehicle's own log."""
 
     @pytest.mark.parametrize("round_trip", [0.03, 0.08, 0.2, 3.0])
-    def test_long_round_trip_aborts_the_header(self, session: Session, round_trip: float) -> None:
-        """Judged by the first messages: no acknowledgement more, as PX4 obeys STOP only afterwards."""
+    def test_long_round_trip_aborts_header(self, session: Session, round_trip: float) -> None:
+        """The first messages decide; acknowledgements cease, as PX4 obeys STOP only then or after the header."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         began = session.now
@@ -382,8 +381,8 @@ class TestHeader:
         assert session.commands.count("start") == 1
         assert session.states[-1] == ("refused", "slow_link")
 
-    def test_lost_messages_do_not_abort_the_header(self, session: Session) -> None:
-        """A lost message costs 50 ms: one of twenty is no long round trip."""
+    def test_lost_messages_do_not_abort_header(self, session: Session) -> None:
+        """A lost message delays the header by 50 ms; one in twenty does not count as a long round trip."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         for number in range(410):
@@ -391,7 +390,7 @@ class TestHeader:
             session.now += 0.054 if number % 20 == 1 else 0.004
         assert session.client.status.state == "header"
 
-    def test_header_that_is_only_repeated_is_over(self, session: Session) -> None:
+    def test_header_with_only_retransmissions_stalls(self, session: Session) -> None:
         """PX4 repeats a message every 50 ms, and ends the stream silently after 2.5 s without acknowledgement."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
@@ -404,19 +403,19 @@ class TestHeader:
         session.wait(TIMINGS.log_retry)
         assert session.commands == ["start", "start"]
 
-    def test_header_before_a_slow_stream_is_complete(self, session: Session) -> None:
-        """Few slow topics send nothing for seconds after the header: PX4 rejects START, so the stream exists."""
+    def test_header_of_slow_stream_completes_on_rejected_start(self, session: Session) -> None:
+        """With few slow topics no data follows for seconds; PX4 rejects START, which proves that the stream exists."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.header()
         session.wait(1.5)
         assert session.commands == ["start", "start"]
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         assert session.client.status == ("streaming", None, "")
         assert session.client.header_seconds == pytest.approx(273 * 0.004)
 
-    def test_header_that_stops_is_over(self, session: Session) -> None:
-        """Without repetitions and without an answer to START, the header is given up."""
+    def test_silent_header_stalls(self, session: Session) -> None:
+        """Without retransmissions and without an answer to START the header is considered stalled."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.header(10)
@@ -425,21 +424,21 @@ class TestHeader:
 
 
 class TestSilence:
-    """PX4 does not announce the end of a stream: START shows whether it exists."""
+    """PX4 does not announce the end of a stream; its answer to START shows whether the stream still exists."""
 
-    def test_slow_stream_is_left_alone(self, session: Session) -> None:
-        """One topic at 1 Hz fills a message in 5 s: PX4 is asked seldom, and the stream goes on."""
+    def test_slow_stream_continues(self, session: Session) -> None:
+        """One topic at 1 Hz fills a message in 5 s: START is sent rarely, and the stream continues."""
         session.start()
         for _ in range(40):
             session.wait(5)
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
             session.receive()
         assert session.states[-1] == ("streaming", None)
         assert session.commands.count("start") < 30
         assert "stop" not in session.commands
 
-    def test_ended_stream_is_started_again_within_seconds(self, session: Session) -> None:
-        """PX4 accepts START: the old stream is over, a new one begins with sequence 0."""
+    def test_ended_stream_restarts_within_seconds(self, session: Session) -> None:
+        """If PX4 accepts START, the old stream is over and a new one begins with sequence number 0."""
         session.start()
         session.wait(1.2)
         session.answer(START, ACCEPTED)
@@ -448,8 +447,8 @@ class TestSilence:
         session.stream()
         assert session.states[-3:] == [("starting", "silent"), ("header", None), ("streaming", None)]
 
-    def test_unanswered_stream_has_ended(self, session: Session) -> None:
-        """Neither data nor an answer: the stream is over, and asked for again later."""
+    def test_silence_without_answer_ends_stream(self, session: Session) -> None:
+        """Without data and without an answer to START the stream has ended; START is retried later."""
         session.start()
         session.wait(10)
         assert session.states[-1] == ("ended", "silent")
@@ -458,17 +457,17 @@ class TestSilence:
         session.header()
         assert session.client.status.state == "header"
 
-    def test_stream_of_another_client_is_found_after_longest_silence(self, session: Session) -> None:
-        """PX4 rejects START because of another client's stream: no stream of ours is silent for 15 s."""
+    def test_longest_silence_means_another_client_owns_stream(self, session: Session) -> None:
+        """If PX4 keeps rejecting START, another client has the stream: the client's own is never silent for 15 s."""
         session.start()
         for _ in range(18):
             session.wait(1)
-            session.answer(START, TAKEN)
+            session.answer(START, REJECTED)
         assert session.states[-1] == ("refused", "taken")
         assert "stop" not in session.commands
 
-    def test_armed_vehicle_is_not_asked_because_of_silence(self, session: Session) -> None:
-        """In flight START could begin a header: the end is judged by silence alone, and data correct it."""
+    def test_silence_in_flight_sends_no_start(self, session: Session) -> None:
+        """START could begin a header in flight, so silence alone ends the stream, and new data resumes it."""
         session.start()
         session.armed = True
         session.stream(2)
@@ -481,19 +480,19 @@ class TestSilence:
         session.wait(0.1)
         assert session.commands == ["start", "start"]
 
-    def test_stream_that_is_alive_after_all_goes_on(self, session: Session) -> None:
-        """After disarming, PX4 rejects START: the stream was only slow."""
+    def test_rejected_start_after_disarming_resumes_stream(self, session: Session) -> None:
+        """If PX4 rejects START after disarming, the stream was only slow."""
         session.start()
         session.armed = True
         session.wait(20)
         session.armed = False
         session.wait(0.1)
-        session.answer(START, TAKEN)
+        session.answer(START, REJECTED)
         assert session.states[-1] == ("streaming", None)
 
     @pytest.mark.parametrize("seconds", [4.0, 60.0, 600.0])
-    def test_outage_of_the_link_does_not_end_the_stream(self, session: Session, seconds: float) -> None:
-        """PX4 goes on without a client; the client sends nothing while the link is silent."""
+    def test_link_outage_does_not_end_stream(self, session: Session, seconds: float) -> None:
+        """PX4 continues without a client; the client sends nothing while the link is silent."""
         session.start()
         session.wait(seconds, heartbeats=False)
         assert session.states[-1] == ("ended", "link_lost")
@@ -502,8 +501,8 @@ class TestSilence:
         assert session.states[-2:] == [("ended", "link_lost"), ("streaming", None)]
         assert session.commands == ["start"]
 
-    def test_stream_that_ended_during_an_outage_is_started_again(self, session: Session) -> None:
-        """An unacknowledged message ended it: PX4 accepts START."""
+    def test_stream_that_ended_during_outage_restarts(self, session: Session) -> None:
+        """An unacknowledged message ended the stream, so PX4 accepts START."""
         session.start()
         session.wait(20, heartbeats=False)
         session.wait(1.3)
@@ -512,19 +511,19 @@ class TestSilence:
         assert session.states[-2:] == [("starting", "silent"), ("header", None)]
 
 
-def test_reboot_starts_a_new_stream(session: Session) -> None:
-    """After a reboot the stream is gone: START follows the next heartbeat."""
+def test_reboot_triggers_new_start(session: Session) -> None:
+    """A reboot ends the stream; START follows the next heartbeat."""
     session.start()
     session.client.on_reboot()
-    session.take([])
+    session.add([])
     assert not session.client.accepts(*OURS)
     session.start()
     assert session.commands == ["start", "start"]
     assert session.states[-4:] == [("idle", None), ("starting", None), ("header", None), ("streaming", None)]
 
 
-def test_new_stream_without_notice_is_followed(session: Session) -> None:
-    """Sequence 0 with ULog's magic begins a stream, whatever came before."""
+def test_unannounced_new_stream_is_accepted(session: Session) -> None:
+    """Sequence number 0 with ULog's magic bytes begins a new stream at any time."""
     session.start()
     session.header()
     session.stream()
@@ -533,12 +532,12 @@ def test_new_stream_without_notice_is_followed(session: Session) -> None:
 
 
 class TestStop:
-    """`stop` ends the client's own stream."""
+    """`stop` ends only the client's own stream."""
 
-    def test_stop_is_repeated_until_it_is_accepted(self, session: Session) -> None:
-        """STOP is sent again after 1 s; the tail is acknowledged until PX4 accepts."""
+    def test_stop_is_repeated_until_accepted(self, session: Session) -> None:
+        """STOP is repeated after 1 s; the last messages are acknowledged until PX4 accepts STOP."""
         session.start()
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         session.answer(STOP, IN_PROGRESS)
         session.wait(1.2)
         for _ in range(44):
@@ -551,19 +550,19 @@ class TestStop:
         assert session.states[-2:] == [("stopping", None), ("stopped", None)]
         assert session.commands == ["start", "stop", "stop"]
 
-    def test_stop_without_an_answer_ends(self, session: Session) -> None:
-        """A vehicle that is gone gets three attempts, and no more."""
+    def test_unanswered_stop_times_out(self, session: Session) -> None:
+        """STOP is sent three times to a vehicle that does not answer."""
         session.start()
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         session.wait(3.5)
         assert session.commands == ["start", "stop", "stop", "stop"]
         assert session.client.status.state == "stopped"
 
-    @pytest.mark.parametrize("result", [ACCEPTED, TAKEN, None])
-    def test_open_start_is_answered_before_stop(self, session: Session, result: int | None) -> None:
-        """A stream that may be another client's is stopped only if the START was accepted."""
+    @pytest.mark.parametrize("result", [ACCEPTED, REJECTED, None])
+    def test_stop_waits_for_pending_start(self, session: Session, result: int | None) -> None:
+        """The stream may be another client's, so STOP is sent only if the pending START is accepted."""
         session.wait(0.1)
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         assert session.client.status.state == "stopping"
         session.wait(0.5)
         if result is None:
@@ -574,8 +573,7 @@ class TestStop:
         assert session.client.status.state == ("stopping" if result == ACCEPTED else "stopped")
 
     def test_stop_before_any_start_sends_nothing(self, session: Session) -> None:
-        """There is nothing to end."""
-        session.take(session.client.stop(session.now))
+        session.add(session.client.stop(session.now))
         session.wait(10)
         assert (session.sent, session.client.status.state) == ([], "stopped")
 
@@ -588,11 +586,11 @@ def recorded(name: str) -> list[tuple[float, bool, bytes]]:
 
 
 class Replay:
-    """A part of a session that a real PX4 sent, given to a client; a real client's acknowledgements beside its."""
+    """Replays part of a recorded session to a client, and collects the recorded client's acknowledgements."""
 
     def __init__(self, name: str, begin: float, end: float, ids: tuple[int, int], *log: Log) -> None:
         self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1])
-        self.reassembly = CountedReassembly()
+        self.reassembly = CountingReassembly()
         self.states: list[Reason] = [("idle", None)]
         self.acknowledged: list[int] = []
         self.recorded: list[int] = []
@@ -637,49 +635,49 @@ class Replay:
 @pytest.mark.logs
 @pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there")
 class TestRecordedSessions:
-    """Sessions of a real PX4 with two clients: what ours makes of what the vehicle sent."""
+    """Replays of recorded sessions of a real PX4 with two clients."""
 
     STARTED: Final[list[Reason]] = [("starting", None), ("header", None), ("streaming", None)]
 
-    def test_flight_is_acknowledged_as_by_the_recorded_client(self) -> None:
-        """Each message that the real client acknowledged, in that order, among them late topics and the tail."""
+    def test_flight_is_acknowledged_like_recorded_client(self) -> None:
+        """The acknowledgements are the recorded ones in the same order, including late topics and those after STOP."""
         replay = Replay("flight1", 0, 90, (245, 190))
         assert replay.acknowledged == replay.recorded
         assert len(replay.acknowledged) == 320
         assert replay.states[1:] == [*self.STARTED, ("ended", "stopped_elsewhere")]
         assert replay.client.header_seconds == pytest.approx(1.1, abs=0.01)
 
-    def test_second_start_is_harmless_and_foreign_stop_is_named(self) -> None:
-        """A second START and that of another client are rejected; then the other client sends STOP."""
+    def test_second_start_is_rejected_and_foreign_stop_detected(self) -> None:
+        """A second START and one by another client are rejected; then the other client sends STOP."""
         replay = Replay("session", 4.0, 15.0, (245, 190))
         assert replay.states[1:] == [*self.STARTED, ("ended", "stopped_elsewhere")]
         assert replay.acknowledged == replay.recorded
 
-    def test_client_that_reads_nothing_loses_messages_and_goes_on(self) -> None:
-        """Nothing was read for 5 s and for 12 s: 615 and 3,433 messages are lost, the stream goes on."""
+    def test_stream_continues_after_client_stops_reading(self) -> None:
+        """Pauses of 5 s and 12 s without reading lose 615 and 3,433 messages, and the stream continues."""
         replay = Replay("session", 26.2, 52.0, (245, 190))
         outage: list[Reason] = [("ended", "link_lost"), ("streaming", None)]
         assert replay.states[1:] == [*self.STARTED, *outage, *outage]
         assert replay.reassembly.lost == 615 + 3433
 
-    def test_header_that_is_not_acknowledged_stalls(self) -> None:
-        """The recorded client acknowledged nothing: the first message came 50 times, then nothing."""
+    def test_unacknowledged_header_stalls(self) -> None:
+        """The recorded client sent no acknowledgement: PX4 sent the first message 50 times and gave up."""
         replay = Replay("session", 65.95, 72.0, (247, 190))
         assert replay.states[1:] == [("starting", None), ("header", None), ("ended", "stalled")]
         assert replay.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
-    def test_unacknowledged_late_topic_ends_the_stream_in_flight(self) -> None:
-        """The recorded client stopped acknowledging: the stream ends silently, and is not started in flight."""
+    def test_unacknowledged_late_topic_ends_stream_in_flight(self) -> None:
+        """The recorded client stopped acknowledging: the stream ends silently, and does not restart in flight."""
         replay = Replay("session", 70.0, 82.9, (247, 190))
         assert replay.states[1:] == [*self.STARTED, ("ended", "silent")]
 
-    def test_reboot_begins_a_new_stream(self) -> None:
-        """The vehicle was killed and started again: silence, time_boot_ms back near 0, a new header after START."""
+    def test_restarted_vehicle_begins_new_stream(self) -> None:
+        """After a kill and restart time_boot_ms is near 0 again, and a new header follows START."""
         replay = Replay("session", 95.0, 110.5, (247, 190))
         assert replay.states[1:] == [*self.STARTED, ("idle", None), *self.STARTED]
 
-    def test_second_client_sees_nothing(self) -> None:
-        """On the other link START is rejected, and no data arrive."""
+    def test_second_client_receives_no_data(self) -> None:
+        """On the other link START is rejected, and no data arrives."""
         replay = Replay("session_second", 9.5, 12.0, (246, 191))
         assert replay.states[1:] == [("starting", None), ("refused", "taken")]
         assert replay.acknowledged == []

@@ -17,12 +17,12 @@ from nedbus.errors import OutputError
 from nedbus.sources.mavlink.log_stream import LogFile
 from tests.flights.ulogs import write_log
 from tests.nedbus.ulog.test_parser import small_log
-from tests.peers.processes import unmeasured
+from tests.peers.processes import without_coverage
 
 BEGIN: Final = 1500
 """Bytes that hold the definitions and some messages of the small log."""
 KILLS: Final = 50
-PIECE: Final = 249
+CHUNK_SIZE: Final = 249
 """Bytes of a LOGGING_DATA."""
 SAVE: Final = f"""
 import os, sys, time
@@ -33,8 +33,8 @@ for folder in sys.stdin:
     if not (pid := os.fork()):
         print(os.getpid(), flush=True)
         file = LogFile(Path(folder.strip()), "1")
-        for start in range(0, len(log), {PIECE}):
-            file.write(log[start : start + {PIECE}])
+        for start in range(0, len(log), {CHUNK_SIZE}):
+            file.write(log[start : start + {CHUNK_SIZE}])
             print(file.path.stat().st_size, flush=True)
         time.sleep(3600)
     os.waitpid(pid, 0)
@@ -42,8 +42,8 @@ for folder in sys.stdin:
 """
 
 
-def test_file_has_whole_records_after_each_write(tmp_path: Path) -> None:
-    """However the stream is cut, pyulog reads the file without damage after every write, as after kill -9."""
+def test_file_is_valid_after_each_write(tmp_path: Path) -> None:
+    """However the stream is split, the file has only complete records after each write, as after SIGKILL."""
     log, file = small_log(), LogFile(tmp_path, "1")
     file.write(log[:BEGIN])
     counts = []
@@ -58,8 +58,8 @@ def test_file_has_whole_records_after_each_write(tmp_path: Path) -> None:
     assert file.path.read_bytes() == log
 
 
-def test_gap_is_marked_as_dropout(tmp_path: Path) -> None:
-    """A gap discards the record that it cut, and is a dropout of its duration."""
+def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
+    """A gap discards the record that it cut, and becomes a dropout of its duration."""
     log, file = small_log(), LogFile(tmp_path, "1")
     file.write(log[: len(log) - 100])
     file.mark_gap(0.25)
@@ -69,8 +69,8 @@ def test_gap_is_marked_as_dropout(tmp_path: Path) -> None:
     assert not saved.file_corruption
 
 
-def test_streams_of_one_second_have_files_of_their_own(tmp_path: Path) -> None:
-    """A file is never overwritten; a folder that cannot be made is an error that names it."""
+def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:
+    """A file is never overwritten; a folder that cannot be created raises an error that names it."""
     files = [LogFile(tmp_path / "logs", "1") for _ in range(3)]
     for each in files:
         each.close()
@@ -83,26 +83,26 @@ def test_streams_of_one_second_have_files_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.timeout(300)
-def test_killed_process_leaves_a_valid_log(tmp_path: Path) -> None:
-    """Killed with SIGKILL at 50 random moments, the file has every record that was complete, and nothing else."""
+def test_killed_process_leaves_valid_log(tmp_path: Path) -> None:
+    """After SIGKILL at any of 50 random moments the file has exactly the complete records."""
     path = write_log(tmp_path / "flight.ulg", range(0, 20_000_000, 10_000))
     log, chance = path.read_bytes(), random.Random(1)
     command = [sys.executable, "-c", SAVE, os.fspath(path)]
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=unmeasured()
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=without_coverage()
     ) as process:
         assert process.stdin
         assert process.stdout
         for number in range(KILLS):
             print(tmp_path / f"{number}", file=process.stdin, flush=True)
-            pid, count = int(process.stdout.readline()), chance.randrange(1, len(log) // PIECE)
+            pid, count = int(process.stdout.readline()), chance.randrange(1, len(log) // CHUNK_SIZE)
             written = [int(process.stdout.readline()) for _ in range(count)][-1]
             os.kill(pid, signal.SIGKILL)
-            while not process.stdout.readline().endswith("killed\n"):  # behind half a line, maybe
+            while not process.stdout.readline().endswith("killed\n"):  # may follow a partial line
                 pass
             (saved,) = (tmp_path / f"{number}").iterdir()
             content = saved.read_bytes()
-            assert len(content) >= written > count * PIECE - PIECE - 2**12
+            assert len(content) >= written > count * CHUNK_SIZE - CHUNK_SIZE - 2**12
             assert log.startswith(content)
             assert not ULog(str(saved)).file_corruption
         process.stdin.close()

@@ -1,4 +1,4 @@
-"""Reassembly of a ULog stream: sequences, gaps and malformed messages, and recordings of a real PX4 (SITL)."""
+"""Reassembly of a ULog stream: sequence numbers, gaps, malformed messages, and recordings of a real PX4 (SITL)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus.sources.mavlink.log_reassembly import Piece
+from nedbus.sources.mavlink.log_reassembly import Chunk
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
 
-from .counted import CountedReassembly
+from .counting_reassembly import CountingReassembly
 
 HEADER: Final = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 3_000_000)
 SIZE: Final = 249
@@ -28,11 +28,11 @@ needs_recordings = [
 ]
 
 
-def add(reassembly: CountedReassembly, message: Message) -> Piece:
+def add(reassembly: CountingReassembly, message: Message) -> Chunk:
     return reassembly.add(message.sequence, len(message.data), message.offset, message.data)
 
 
-def begin(reassembly: CountedReassembly, content: bytes = bytes(SIZE - 16)) -> None:
+def begin(reassembly: CountingReassembly, content: bytes = bytes(SIZE - 16)) -> None:
     """Begin a stream."""
     assert add(reassembly, Message(True, 0, 0, HEADER + content)).begins
 
@@ -41,114 +41,114 @@ def plain(sequence: int, data: bytes = b"data", offset: int = 0) -> Message:
     return Message(False, sequence, offset, data)
 
 
-def test_first_message_begins_a_stream_and_its_repetition_does_not() -> None:
-    """Sequence 0 with ULog's magic begins a stream; the same bytes again are a repetition, others a new stream."""
-    reassembly = CountedReassembly()
+def test_retransmitted_first_message_begins_no_new_stream() -> None:
+    """Sequence number 0 with ULog's magic bytes begins a stream; identical bytes are a retransmission."""
+    reassembly = CountingReassembly()
     begin(reassembly, b"a")
-    assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Piece("duplicate")
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Chunk("duplicate")
     add(reassembly, plain(1))
-    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Piece("delivered", HEADER + b"b", begins=True)
-    assert add(reassembly, plain(1)) == Piece("delivered", b"data")
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Chunk("delivered", HEADER + b"b", begins=True)
+    assert add(reassembly, plain(1)) == Chunk("delivered", b"data")
     assert reassembly.lost == 0
 
 
-def test_same_first_message_begins_a_stream_after_reset() -> None:
-    """After a reboot the header may have the same bytes: it begins a stream all the same."""
-    reassembly = CountedReassembly()
+def test_same_first_message_begins_stream_after_reset() -> None:
+    """After a reboot a header with the same bytes begins a new stream."""
+    reassembly = CountingReassembly()
     begin(reassembly)
     reassembly.reset()
     begin(reassembly)
 
 
-def test_stream_joined_in_the_middle_has_no_definitions() -> None:
-    """Without its header a stream cannot be decoded: nothing is delivered or counted as lost until one begins."""
-    reassembly = CountedReassembly()
+def test_stream_joined_midway_has_no_definitions() -> None:
+    """Without its header a stream cannot be decoded: nothing is delivered or counted as lost until the next header."""
+    reassembly = CountingReassembly()
     for sequence in (0, 70, 3):
-        assert add(reassembly, plain(sequence)) == Piece("no_definitions")
+        assert add(reassembly, plain(sequence)) == Chunk("no_definitions")
     assert (reassembly.lost, reassembly.counts["no_definitions"]) == (0, 3)
     begin(reassembly)
 
 
 def test_trailing_zeros_are_restored() -> None:
-    """MAVLink 2 does not transmit zeros at the end of a payload."""
-    reassembly = CountedReassembly()
+    """MAVLink 2 truncates trailing zeros of a payload."""
+    reassembly = CountingReassembly()
     begin(reassembly)
     assert reassembly.add(1, 6, 0, b"ab").data == b"ab\0\0\0\0"
     assert reassembly.add(2, 3, 0, [1, 2, 3, 0, 0]).data == b"\1\2\3"
 
 
-def test_gap_delivers_from_the_next_record_on() -> None:
-    """After a gap, bytes before the first record are skipped, and messages in which none begins."""
-    reassembly = CountedReassembly()
+def test_gap_skips_to_next_record() -> None:
+    """After a gap, bytes before the first record are skipped, as are messages without the start of a record."""
+    reassembly = CountingReassembly()
     begin(reassembly)
-    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised", lost=2)
-    assert add(reassembly, plain(4, offset=255)) == Piece("unsynchronised")
-    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Piece("delivered", b"begin", lost=1)
-    assert add(reassembly, plain(7, offset=255)) == Piece("delivered", b"data")
+    assert add(reassembly, plain(3, offset=255)) == Chunk("unsynchronised", lost=2)
+    assert add(reassembly, plain(4, offset=255)) == Chunk("unsynchronised")
+    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Chunk("delivered", b"begin", lost=1)
+    assert add(reassembly, plain(7, offset=255)) == Chunk("delivered", b"data")
     assert (reassembly.lost, reassembly.skipped, reassembly.bytes) == (3, 12, SIZE + 9)
 
 
-def test_empty_message_after_a_gap_does_not_synchronise() -> None:
-    """A message without data in which no record begins is no place to go on."""
-    reassembly = CountedReassembly()
+def test_empty_message_does_not_resynchronise() -> None:
+    """After a gap, a message without data in which no record begins does not resynchronise the stream."""
+    reassembly = CountingReassembly()
     begin(reassembly)
     add(reassembly, plain(2, b"", offset=255))
-    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised")
+    assert add(reassembly, plain(3, offset=255)) == Chunk("unsynchronised")
 
 
-def test_late_message_is_lost_and_not_used() -> None:
-    """A late message cannot be told from a repetition: it stays lost."""
-    reassembly = CountedReassembly()
+def test_late_message_stays_lost() -> None:
+    """A late message is indistinguishable from a retransmission, so it stays lost."""
+    reassembly = CountingReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2)).lost == 1
-    assert add(reassembly, plain(1)) == Piece("duplicate")
-    assert add(reassembly, plain(2)) == Piece("duplicate")
+    assert add(reassembly, plain(1)) == Chunk("duplicate")
+    assert add(reassembly, plain(2)) == Chunk("duplicate")
     assert reassembly.lost == 1
 
 
 @pytest.mark.parametrize(("length", "offset"), [(250, 0), (255, 255), (10, 10), (10, 254), (0, 0)])
-def test_malformed_message_is_rejected(length: int, offset: int) -> None:
-    """A length or an offset that cannot be is counted, and leaves a gap."""
-    reassembly = CountedReassembly()
+def test_malformed_message_leaves_a_gap(length: int, offset: int) -> None:
+    """A message with an impossible length or offset is rejected and counted as lost."""
+    reassembly = CountingReassembly()
     begin(reassembly)
-    assert reassembly.add(1, length, offset, bytes(SIZE)) == Piece("malformed")
+    assert reassembly.add(1, length, offset, bytes(SIZE)) == Chunk("malformed")
     assert add(reassembly, plain(2)).lost == 1
 
 
-def test_sequence_wraps() -> None:
-    """The sequence goes on with 0 after 65535, with losses or without."""
-    reassembly = CountedReassembly()
+def test_sequence_wraps_without_loss() -> None:
+    """The sequence number continues with 0 after 65535, with or without losses."""
+    reassembly = CountingReassembly()
     begin(reassembly)
     for sequence in range(1, 2**16):
         assert not add(reassembly, plain(sequence)).lost
-    assert add(reassembly, plain(0)) == Piece("delivered", b"data")
+    assert add(reassembly, plain(0)) == Chunk("delivered", b"data")
     assert add(reassembly, plain(2)).lost == 1
     assert reassembly.counts.total() == 2**16 + 2
 
 
-def test_jump_counts_at_most_half_of_the_sequence() -> None:
+def test_largest_loss_is_half_of_sequence() -> None:
     """A step of 32,768 is the largest loss; a larger one is a late message, unless the next ones continue it."""
-    reassembly = CountedReassembly()
+    reassembly = CountingReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2**15)).lost == 2**15 - 1
-    reassembly = CountedReassembly()
+    reassembly = CountingReassembly()
     begin(reassembly)
-    assert add(reassembly, plain(2**15 + 1)) == Piece("duplicate")
+    assert add(reassembly, plain(2**15 + 1)) == Chunk("duplicate")
 
 
-def test_stream_resumes_after_an_outage_of_more_than_half_of_the_sequence() -> None:
-    """A long run of successive old numbers is the stream itself, which went on meanwhile: all between is lost."""
-    reassembly = CountedReassembly()
+def test_stream_resumes_after_loss_of_more_than_half_of_sequence() -> None:
+    """A long run of consecutive old numbers is the live stream: all messages in between were lost."""
+    reassembly = CountingReassembly()
     begin(reassembly)
-    pieces = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
-    first = next(index for index, piece in enumerate(pieces) if piece.verdict == "delivered")
+    chunks = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
+    first = next(index for index, chunk in enumerate(chunks) if chunk.verdict == "delivered")
     assert first < 256
-    assert pieces[first].lost == reassembly.lost == 40_000 + first - 1
-    assert all(piece == Piece("delivered", b"data") for piece in pieces[first + 1 :])
+    assert chunks[first].lost == reassembly.lost == 40_000 + first - 1
+    assert all(chunk == Chunk("delivered", b"data") for chunk in chunks[first + 1 :])
 
 
 def to_messages(records: Iterable[bytes], size: int = SIZE) -> list[Message]:
-    """Divide a header and records into messages, as PX4 does."""
+    """Split a header and records into messages, as PX4 does."""
     data, starts = bytearray(HEADER), []
     for record in records:
         starts.append(len(data))
@@ -161,21 +161,21 @@ def to_messages(records: Iterable[bytes], size: int = SIZE) -> list[Message]:
     return messages
 
 
-def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], CountedReassembly]:
-    """Return the records of the reassembled stream, which a parser splits that trusts all lengths."""
-    reassembly, data = CountedReassembly(), bytearray()
+def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], CountingReassembly]:
+    """Return the records of the reassembled stream, split by a parser that trusts all lengths."""
+    reassembly, data = CountingReassembly(), bytearray()
     records: list[tuple[str, bytes]] = []
     for message in messages:
-        piece = add(reassembly, message)
-        if piece.lost or piece.begins:
+        chunk = add(reassembly, message)
+        if chunk.lost or chunk.begins:
             data.clear()
-        data += piece.data[16:] if piece.begins else piece.data
+        data += chunk.data[16:] if chunk.begins else chunk.data
         records += split_records(data)
     return records, reassembly
 
 
 class Impaired(NamedTuple):
-    """Messages as they arrive, and the indices of those in the original list that arrive in order."""
+    """Messages in order of arrival, and the indices of those in the original list that arrive in order."""
 
     messages: list[Message]
     in_order: set[int]
@@ -184,7 +184,7 @@ class Impaired(NamedTuple):
 def impair(
     messages: Sequence[Message], *, loss: float, burst: int = 1, reorder: float = 0.0, seed: int = 1
 ) -> Impaired:
-    """Drop LOGGING_DATA, in bursts, and let some arrive up to eight messages late; what is acknowledged is repeated."""
+    """Drop LOGGING_DATA in bursts, and delay some by up to eight messages; acknowledged messages always arrive."""
     rng, drops, arriving = random.Random(seed), 0, []
     for index, message in enumerate(messages):
         if not message.acked and index:
@@ -202,8 +202,8 @@ def impair(
     return Impaired([messages[index] for index in order], in_order)
 
 
-def whole_records(messages: Sequence[Message], arrived: set[int]) -> list[tuple[str, bytes]]:
-    """Return the records all of whose bytes are in messages that arrived in order."""
+def complete_records(messages: Sequence[Message], arrived: set[int]) -> list[tuple[str, bytes]]:
+    """Return the records whose bytes are all in messages that arrived in order."""
     data, ends, records = bytearray(), [], []
     for message in messages:
         data += message.data
@@ -220,8 +220,8 @@ def whole_records(messages: Sequence[Message], arrived: set[int]) -> list[tuple[
 
 
 @given(st.data())
-def test_exactly_the_whole_records_are_delivered(data: st.DataObject) -> None:
-    """Whatever is dropped, late or repeated: each record of which no byte is missing, and nothing else."""
+def test_exactly_the_complete_records_are_delivered(data: st.DataObject) -> None:
+    """With messages dropped, delayed or repeated, each complete record is delivered, and nothing else."""
     rng = random.Random(data.draw(st.integers(0, 2**32)))
     sizes = [rng.choice([1, 5, 40, 300, 900]) for _ in range(data.draw(st.integers(1, 300)))]
     messages = to_messages(struct.pack("<HB", size, ord("D")) + rng.randbytes(size) for size in sizes)
@@ -229,14 +229,14 @@ def test_exactly_the_whole_records_are_delivered(data: st.DataObject) -> None:
     impaired = impair(messages, loss=loss, burst=rng.randint(1, 5), reorder=reorder, seed=rng.randrange(1000))
     repeated = [each for each in impaired.messages for _ in range(rng.choice([1, 1, 1, 2]))]
     records, reassembly = deliver(repeated)
-    assert records == whole_records(messages, impaired.in_order)
+    assert records == complete_records(messages, impaired.in_order)
     assert reassembly.lost == max(impaired.in_order) + 1 - len(impaired.in_order)
     assert reassembly.counts["duplicate"] == len(repeated) - len(impaired.in_order)
 
 
 @cache
 def recorded(name: str) -> list[Message]:
-    """Return the messages of a recorded stream, without repetitions."""
+    """Return the messages of a recorded stream, without retransmissions."""
     found = [
         stream_message(frame) for _, is_sent, frame in datagrams(STREAMS / f"ulog_stream_{name}.bin.gz") if is_sent
     ]
@@ -255,7 +255,7 @@ def logged(name: str) -> list[bytes]:
 
 
 class Comparison(NamedTuple):
-    """Data messages in both the stream and the log, those in the stream alone, and gaps: each a number of messages."""
+    """Numbers of data messages: in both stream and log, in the stream only, and missing in each gap."""
 
     common: int
     invented: int
@@ -293,8 +293,8 @@ class TestRecordings:
 
     pytestmark = needs_recordings
 
-    def test_stream_equals_the_vehicles_own_log(self, name: str, messages: int, lost: int, common: int) -> None:
-        """Every data message is in the log, in order; only around gaps does the log have more."""
+    def test_stream_equals_log_of_vehicle(self, name: str, messages: int, lost: int, common: int) -> None:
+        """Each data message is in the log, in order; the log has more only at gaps."""
         records, reassembly = deliver(recorded(name))
         compared = compare(records, name)
         assert (reassembly.counts["delivered"], reassembly.counts.total(), reassembly.lost) == (
@@ -314,12 +314,12 @@ class TestImpairedLink:
 
     pytestmark = needs_recordings
 
-    def test_every_whole_message_is_delivered(self, loss: float, burst: int, reorder: float) -> None:
-        """Nothing is invented, decoding resumes with the next whole record, and the loss is counted exactly."""
+    def test_every_complete_message_is_delivered(self, loss: float, burst: int, reorder: float) -> None:
+        """No message is invented, decoding resumes with the next complete record, and the loss count is exact."""
         messages = recorded("flight1")
         impaired = impair(messages, loss=loss, burst=burst, reorder=reorder)
         records, reassembly = deliver(impaired.messages)
-        assert records == whole_records(messages, impaired.in_order)
+        assert records == complete_records(messages, impaired.in_order)
         assert reassembly.lost == len(messages) - len(impaired.in_order)
         compared = compare(records, "flight1")
         assert compared.invented == 0

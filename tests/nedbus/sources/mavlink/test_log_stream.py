@@ -1,4 +1,4 @@
-"""`mavlink:LINK?log=1`: the ULog stream that a real PX4 recorded, published in full and compared with its own log."""
+"""`mavlink:LINK?log=1`: recorded ULog streams of a real PX4, published in full and compared with its own log."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import reader
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Piece
+from nedbus.sources.mavlink.log_reassembly import Chunk
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings
-from nedbus.ulog import SPOKEN, Data, Texts, UlogParser
+from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from tests.flights.ulogs import log_messages_in, write_raw_log
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
@@ -35,7 +35,7 @@ from .test_log_reassembly import compare as compare_records
 from .test_log_reassembly import deliver, recorded
 
 MESSAGES: Final = 47_708
-"""Messages of all topics in the stream."""
+"""Messages of all topics in the stream of the flight."""
 
 FLIGHT: Final = STREAMS / "ulog_stream_flight1.bin.gz"
 
@@ -43,14 +43,14 @@ pytestmark = pytest.mark.timeout(400)  # a flight of 84 s, which coverage slows 
 
 
 def recorded_flight(test: Any) -> Any:
-    """Mark a test that plays a whole flight."""
+    """Mark a test that plays a complete flight."""
     absent = pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
     return pytest.mark.logs(pytest.mark.slow(absent(test)))
 
 
 @pytest.fixture(autouse=True)
-def patience(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
-    """Let messages wait, as a flight is sent as fast as it is read, and let the header and answers take long."""
+def long_timeouts(monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
+    """Lengthen queues and timeouts, as a flight is sent as fast as it is read."""
     timings.log_answer, timings.log_link, timings.log_header = DEADLINE, DEADLINE, 10 * DEADLINE
     monkeypatch.setattr(reader, "_MAX_WAITING", 1_000_000)
 
@@ -59,7 +59,7 @@ Attack = Callable[[bytes, int], None]
 
 
 class Received:
-    """Messages that one source yields until the recording has been sent and nothing more arrives."""
+    """Messages that a source yields until the recording has ended and nothing more arrives."""
 
     def __init__(
         self, options: str, recording: Path = SHORT, *, attack: Attack | None = None, **peer: Any
@@ -87,13 +87,13 @@ class Received:
                     self.reasons.add(item.reason)
                     if is_end:
                         break
-        data = [each for each in self.messages if each.address.topic != SPOKEN.name]
+        data = [each for each in self.messages if each.address.topic != LOG_MESSAGE.name]
         self.stream = [each for each in data if each.source]
         self.converted = [each for each in data if not each.source]
 
 
 def logged_messages(path: Path) -> dict[tuple[str, int], set[str]]:
-    """Return the messages of a vehicle's own log by topic and instance, as text, which NaN equals itself in."""
+    """Return the messages of a vehicle's own log by topic and instance, as text, in which NaN equals itself."""
     parser, found = UlogParser(verify=True), defaultdict[tuple[str, int], set[str]](set)
     for record in [*parser.feed(path.read_bytes()), *parser.close()]:
         if isinstance(record, Data):
@@ -103,7 +103,7 @@ def logged_messages(path: Path) -> dict[tuple[str, int], set[str]]:
 
 
 def compare(received: Received, path: Path) -> int:
-    """Return the number of messages that the log has; those of the hole at the header are not in it."""
+    """Return the number of messages that are in the log; only those in its gap during the header may be missing."""
     logged = logged_messages(path)
     missing = [
         each for each in received.stream
@@ -119,7 +119,7 @@ def sent_messages() -> list[tuple[str, str]]:
     recording = read_recording(SHORT)
     plain = [each.content for each in recording.entries if not isinstance(each.content, bytes)]
     records = UlogParser(verify=True).feed(b"".join(each.data for each in (*recording.header, *plain)))
-    records = list(Texts().merge(records))
+    records = list(LogMessageBuilder().merge(records))
     return [
         (each.subscription.name, repr(each.subscription.layout.decode(each.payload)))
         for each in records
@@ -128,7 +128,7 @@ def sent_messages() -> list[tuple[str, str]]:
 
 
 def test_stream_is_published_in_full() -> None:
-    """All messages of all topics that a real PX4 (SITL) sent are published, in order, each with all of its fields."""
+    """All messages of all topics that a real PX4 (SITL) sent are published in order, with all of their fields."""
     received, sent = Received("log=1"), sent_messages()
     assert [(each.address.topic, repr(each.fields)) for each in received.messages if each.source] == sent
     assert len({topic for topic, _ in sent}) == 20
@@ -138,8 +138,8 @@ def test_stream_is_published_in_full() -> None:
 
 
 @recorded_flight
-def test_conversion_takes_over_when_the_stream_ends() -> None:
-    """Another client's STOP ends the stream: converted messages come again, and never both of one topic at once."""
+def test_conversion_resumes_when_stream_ends() -> None:
+    """After another client's STOP, converted messages replace those of the stream, without overlap."""
     received = Received("log=1&topics=vehicle_attitude", FLIGHT, events={40.0: "foreign_stop"})
     sources = [each.source for each in received.messages if each.address.topic == "vehicle_attitude"]
     assert [source for source, _ in groupby(sources)] == [None, "mavlink-ulog", None]
@@ -147,8 +147,8 @@ def test_conversion_takes_over_when_the_stream_ends() -> None:
 
 
 @recorded_flight
-def test_stream_of_px4_equals_its_own_log(tmp_path: Path) -> None:
-    """All topics arrive without a gap, each message equal to the own log of a real PX4 (SITL), and so is the file."""
+def test_published_stream_and_saved_file_equal_log_of_vehicle(tmp_path: Path) -> None:
+    """All messages of a real PX4 (SITL) arrive without a gap and equal its own log, and so does the saved file."""
     received = Received(f"log=1&save={tmp_path}", FLIGHT)
     status = received.status
     assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
@@ -163,8 +163,8 @@ def test_stream_of_px4_equals_its_own_log(tmp_path: Path) -> None:
 
 
 @recorded_flight
-def test_px4s_words_in_a_stream_are_those_of_its_own_log() -> None:
-    """Texts and events are log_message, each once, as in the log; STATUSTEXT only before the stream."""
+def test_log_messages_of_stream_equal_those_of_log() -> None:
+    """Logged strings and events become the log_message of the log; STATUSTEXT is used only before the stream."""
     received = Received("log=1&topics=log_message", FLIGHT)
     words = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
     assert {each.source for each in words} == {"mavlink-ulog"}
@@ -176,8 +176,8 @@ def test_px4s_words_in_a_stream_are_those_of_its_own_log() -> None:
 
 
 @recorded_flight
-def test_converted_topics_give_way_to_the_stream() -> None:
-    """A topic is converted until the stream brings it, never both; topics that the stream lacks stay converted."""
+def test_stream_replaces_converted_topics() -> None:
+    """A topic is converted until it arrives in the stream, never both; topics that the stream lacks stay converted."""
     received = Received("log=1&topics=vehicle_attitude,vehicle_local_position,home_position", FLIGHT)
     first = min(cast("int", each.fields["timestamp"]) for each in received.stream)
     after = Counter(
@@ -189,17 +189,17 @@ def test_converted_topics_give_way_to_the_stream() -> None:
 
 @recorded_flight
 @pytest.mark.parametrize(("name", "messages", "lost", "gaps", "impairment"), [
-    ("default_topics", 18_482, 44, 11, {}),  # lost by PX4 behind the header, and in the hole of its own log
+    ("default_topics", 18_482, 44, 11, {}),  # lost by PX4 after the header, and in the gap of its own log
     ("lossy1", 49_052, 0, 237, {}),
     ("flight1", MESSAGES, 0, 500, {"loss": 0.03, "reorder": 0.02, "seed": 1}),
     ("flight1", MESSAGES, 0, 1000, {"loss": 0.05, "seed": 3}),
     ("flight1", MESSAGES, 0, 1000, {"loss": 0.05, "burst": 20, "seed": 2}),
 ])  # fmt: skip
-def test_losses_agree_with_the_log(name: str, messages: int, lost: int, gaps: int, impairment: dict[str, Any]) -> None:
+def test_losses_are_within_bounds(name: str, messages: int, lost: int, gaps: int, impairment: dict[str, Any]) -> None:
     """No value is wrong, and the number of missing messages is within the bounds, for recordings of a PX4 (SITL).
 
-    `messages`: in the recording before STOP; `lost`: before it was recorded, and absent from the log, too;
-    `gaps`: LOGGING_DATA missing, or at least this number with an impairment.
+    `messages`: in the recording before STOP; `lost`: before it was recorded, and missing in the log, too;
+    `gaps`: missing LOGGING_DATA, or their least number with an impairment.
     """
     received = Received("log=armed", STREAMS / f"ulog_stream_{name}.bin.gz", **impairment)
     assert received.stream, received.reasons
@@ -217,8 +217,8 @@ def test_losses_agree_with_the_log(name: str, messages: int, lost: int, gaps: in
 @pytest.mark.parametrize(("peer", "reason"), [
     ({"refusal": 1}, "another client has it"), ({"refusal": 2}, "5000 B/s"),
 ])  # fmt: skip
-def test_refused_stream_names_the_reason(peer: dict[str, Any], reason: str) -> None:
-    """A refusal is reported with its cause, and everything is converted from MAVLink as without `log=`."""
+def test_rejected_stream_reports_reason(peer: dict[str, Any], reason: str) -> None:
+    """The status names the cause of a rejection, and messages are converted from MAVLink as without `log=`."""
     received = Received("log=1", **peer)
     assert not received.stream
     assert len(received.converted) > 500
@@ -244,19 +244,19 @@ HOSTILE: Final = [
 ]  # fmt: skip
 
 
-def test_hostile_vehicle_harms_no_other() -> None:
-    """A vehicle that answers START with invalid streams is rejected and reported; another one's stream is complete."""
+def test_hostile_vehicle_does_not_affect_others() -> None:
+    """A vehicle that sends invalid streams is rejected and reported; the stream of another vehicle is complete."""
     rng, mav, sent = random.Random(5), dialect.MAVLink(None, 66, 1), Counter[str]()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as hostile:
         hostile.bind(("127.0.0.1", 0))
         hostile.setblocking(False)
 
         def attack(frame: bytes, port: int) -> None:
-            """Send an invalid message beside a valid one."""
+            """Send an invalid message for each valid one."""
             message: Any = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
             mav.srcSystem = 66
             if (number := sent["frames"]) % 50:
-                mav.srcSystem = rng.choice((66, 66, 67))  # 67 was never asked
+                mav.srcSystem = rng.choice((66, 66, 67))  # 67 received no request
                 content = HOSTILE[number % 3] if number > 100 else HOSTILE[1]
                 sequence = rng.choice((0, 1, number % 2**16, rng.randrange(2**16)))
                 target = rng.choice(((245, 191), (245, 191), (1, 1)))
@@ -274,7 +274,7 @@ def test_hostile_vehicle_harms_no_other() -> None:
 
         received = Received("log=armed", attack=attack)
     ours = [each for each in received.stream if each.address.vehicle == "1"]
-    sent_data = [topic for topic, _ in sent_messages() if topic != SPOKEN.name]
+    sent_data = [topic for topic, _ in sent_messages() if topic != LOG_MESSAGE.name]
     assert len(ours) == len(received.stream) == len(sent_data), received.reasons
     reasons = {(each.where, each.reason) for each in received.rejections}
     assert sent[str(START)]
@@ -284,18 +284,18 @@ def test_hostile_vehicle_harms_no_other() -> None:
     assert len(reasons) < 110
 
 
-def test_stream_of_an_old_release_is_converted(tmp_path: Path) -> None:
-    """Fields of another type are read as those of a log are, and the message after a dropout has its duration."""
+def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
+    """Fields of another type are converted as in a log, and the message after a dropout has its duration."""
     fields = "uint64_t timestamp;int32_t cell_count;"
     rows = [("battery_status", (number, count)) for number, count in enumerate((6, 300, -1, 7))]
     path = write_raw_log(tmp_path / "a.ulg", {"battery_status": (fields, "Qi")}, rows)
     data = path.read_bytes() + struct.pack("<HBH", 2, ord("O"), 1500) + struct.pack("<HBHQi", 14, ord("D"), 0, 9, 8)
     client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming")))
     stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
-    found = list(stream.add(Piece("delivered", data, begins=True), 0.0))
+    found = list(stream.add(Chunk("delivered", data, begins=True), 0.0))
     messages = [each for each in found if isinstance(each, SourceMessage)]
     assert [each.fields.get("cell_count") for each in messages] == [6, None, None, 7, 8]
     assert [each.dropout for each in messages] == [0.0, 0.0, 0.0, 0.0, 1.5]
     [rejection] = [each for each in found if isinstance(each, Rejection)]
-    assert rejection.reason == "battery_status: left out cell_count where it is not a uint8, such as 300"
+    assert rejection.reason == "battery_status: cell_count left out where its value is not a uint8, such as 300"
     assert rejection.count == 0

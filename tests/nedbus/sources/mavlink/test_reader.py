@@ -1,4 +1,4 @@
-"""The client and the reassembly over UDP, with the peer that plays a recorded PX4 (SITL)."""
+"""State machine and reassembly over UDP, against a peer that plays recordings of a PX4 (SITL)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nedbus.sources.mavlink.log_client import Command, LogStreamClient
 from tests.peers.px4_log_stream import START, STOP, STREAMS, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
-from .counted import CountedReassembly
+from .counting_reassembly import CountingReassembly
 from .test_log_client import OTHERS, OURS, Log, Reason
 
 STARTED: Final[list[Reason]] = [("starting", None), ("header", None), ("streaming", None)]
@@ -39,11 +39,11 @@ def recorded_bytes(name: str) -> int:
 
 
 class Link:
-    """A client on a UDP port: what it received, and each state with its reason."""
+    """A client on a UDP port, with what it received, and each state with its reason."""
 
     def __init__(self, *log: Log, acknowledges: bool = True) -> None:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
-        self.reassembly = CountedReassembly()
+        self.reassembly = CountingReassembly()
         self.states: list[Reason] = [("idle", None)]
         self.bytes = self.rejected = 0
         self.peer: Px4LogStream
@@ -76,12 +76,12 @@ class Link:
                 self.states.append(client.status[:2])
 
     def run_to(self, *states: Reason) -> None:
-        """Receive until there are this many changes of the state, and compare them."""
+        """Receive until the state has changed this often, and compare the changes."""
         self.run(lambda: len(self.states) > len(states))
         assert self.states[1:] == [*states]
 
     def stop(self) -> None:
-        """End the stream."""
+        """Play the recording to its end, and stop the stream."""
         self.run(self.peer.finished.is_set)
         self._send(self.client.stop(time.monotonic()))
         self.run(lambda: self.client.status.state == "stopped")
@@ -106,8 +106,8 @@ class Link:
                 self.rejected += 1
                 return []
             fields = message.sequence, message.length, message.first_message_offset, message.data
-            piece = self.reassembly.add(*fields)
-            return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=piece.begins)
+            chunk = self.reassembly.add(*fields)
+            return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=chunk.begins)
         if (ms := getattr(message, "time_boot_ms", None)) is not None:
             if ms < self._boot - 1000:
                 client.on_reboot()
@@ -115,8 +115,8 @@ class Link:
         return []
 
 
-def test_stream_arrives_as_recorded() -> None:
-    """At full speed all bytes of the recording arrive, and only its own 11 messages are lost."""
+def test_recorded_stream_arrives_completely() -> None:
+    """At full speed all bytes of the recording arrive; only its own 11 lost messages are missing."""
     with Link("armed").to("default_topics", speed=None) as link:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
@@ -130,8 +130,8 @@ def test_stream_arrives_as_recorded() -> None:
     "impairment",
     [{"loss": 0.03}, {"loss": 0.05}, {"loss": 0.05, "burst": 20}, {"reorder": 0.02}, {"loss": 0.03, "reorder": 0.02}],
 )
-def test_losses_are_counted_as_they_happened(impairment: dict[str, float]) -> None:
-    """Messages that the link drops or delays are the ones counted as lost; what is acknowledged arrives."""
+def test_loss_count_equals_dropped_and_late_messages(impairment: dict[str, float]) -> None:
+    """Exactly the dropped and late messages count as lost; acknowledged messages always arrive."""
     with Link("armed").to("flight1", speed=None, seed=7, **impairment) as link:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
@@ -139,79 +139,79 @@ def test_losses_are_counted_as_they_happened(impairment: dict[str, float]) -> No
     assert link.peer.dropped + link.peer.late > 0
 
 
-def test_refusal_is_reported() -> None:
-    """PX4 denies the stream of a link that is too slow."""
+def test_denied_start_is_reported() -> None:
+    """PX4 denies the stream on a link that is too slow."""
     with Link().to("default_topics", refusal=dialect.MAV_RESULT_DENIED) as link:
         link.run_to(("starting", None), ("refused", "bandwidth"))
 
 
-def test_stream_of_another_client_is_not_used() -> None:
-    """Its data arrive on the same link, and are rejected."""
-    with Link().to("default_topics", owner=OTHERS, is_owner_heard=True) as link:
+def test_stream_of_another_client_is_rejected() -> None:
+    """Its data is rejected even if it arrives on the same link."""
+    with Link().to("default_topics", owner=OTHERS, is_owner_on_link=True) as link:
         link.run(lambda: link.rejected > 20)
     assert link.states[1:] == [("starting", None), ("refused", "taken")]
     assert set(link.peer.commands) == {START}
 
 
 @pytest.mark.slow
-class TestPx4:
-    """Streams that do not go as planned, in real time."""
+class TestAbnormalStreams:
+    """Streams with failures, in real time."""
 
-    def test_unacknowledged_message_ends_the_stream(self) -> None:
-        """It comes 50 times, then nothing."""
+    def test_unacknowledged_message_stalls_stream(self) -> None:
+        """PX4 sends the message 50 times, and then nothing."""
         with Link(acknowledges=False).to("flight1") as link:
             link.run_to(("starting", None), ("header", None), ("ended", "stalled"))
-            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last ones may come later
+            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last ones may arrive later
         assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
     def test_start_without_data_is_repeated(self) -> None:
-        """The logger gives up after 2.5 s; the next START succeeds."""
+        """The logger gives up after 2.5 s, and accepts the next START."""
         with Link().to("flight1", unsent=1) as link:
             link.run_to(*STARTED)
         assert [each for each in link.peer.commands if each == START] == [START, START]
 
     @pytest.mark.parametrize("is_heard", [True, False])
-    def test_stream_is_taken_over(self, is_heard: bool) -> None:
-        """With log=take the other client's stream ends, and this one begins."""
-        with Link("take").to("flight1", owner=OTHERS, is_owner_heard=is_heard) as link:
+    def test_log_take_takes_over_stream(self, is_heard: bool) -> None:
+        """With log=take the other client's stream ends, and this client's begins."""
+        with Link("take").to("flight1", owner=OTHERS, is_owner_on_link=is_heard) as link:
             link.run_to(*STARTED)
-        # An acknowledgement that the other client owes makes STOP last.
+        # STOP takes longer while an acknowledgement of the other client is missing.
         assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
 
-    def test_stream_of_an_earlier_process_is_started_anew(self) -> None:
-        """It has the same ids, so the data arrive, without their definitions."""
-        with Link().to("flight1", owner=OURS, is_owner_heard=True) as link:
+    def test_stream_of_earlier_process_is_restarted(self) -> None:
+        """It has the same ids, so its data arrives, but without definitions."""
+        with Link().to("flight1", owner=OURS, is_owner_on_link=True) as link:
             link.run_to(("starting", None), ("refused", "taken"), *STARTED)
         assert link.reassembly.counts["no_definitions"]
 
-    def test_stop_of_another_client_is_noticed(self) -> None:
-        """The tail is acknowledged, and the stream not started again at once."""
+    def test_stop_by_another_client_is_detected(self) -> None:
+        """The last messages are acknowledged, and the stream is not restarted at once."""
         with Link("armed").to("flight1") as link:
             link.run_to(*STARTED)
-            link.peer.cause("foreign_stop")
+            link.peer.trigger("foreign_stop")
             link.run_to(*STARTED, ("ended", "stopped_elsewhere"))
         assert link.reassembly.lost == 0
 
-    def test_reboot_is_followed_by_a_new_stream(self) -> None:
-        """The header comes again, with another time, and the same data."""
+    def test_reboot_triggers_new_stream(self) -> None:
+        """The header arrives again with another start time, followed by the same data."""
         with Link("armed").to("flight1") as link:
             link.run_to(*STARTED)
-            link.peer.cause("reboot")
+            link.peer.trigger("reboot")
             link.run_to(*STARTED, ("idle", None), *STARTED)
         assert (link.peer.streams, link.reassembly.lost) == (2, 0)
 
-    def test_stream_survives_an_outage(self) -> None:
-        """The vehicle is silent for some seconds: the messages in between are lost, and counted."""
+    def test_stream_survives_link_outage(self) -> None:
+        """Messages sent while the link is silent for some seconds are counted as lost."""
         with Link("armed").to("flight1") as link:
             link.run_to(*STARTED)
-            link.peer.cause("vanish")
+            link.peer.trigger("vanish")
             link.run_to(*STARTED, ("ended", "link_lost"))
-            link.peer.cause("return")
+            link.peer.trigger("return")
             link.run(lambda: link.reassembly.lost)
         assert link.states[-1] == ("streaming", None)
         assert link.peer.commands == [START]
 
-    def test_long_round_trip_aborts_the_header(self) -> None:
+    def test_long_round_trip_aborts_header(self) -> None:
         """At 80 ms the header would take half a minute."""
         with Link().to("flight1", round_trip=0.08) as link:
             link.run_to(("starting", None), ("header", None), ("refused", "slow_link"))

@@ -1,4 +1,4 @@
-"""All that a real PX4 said over MAVLink in one flight, compared with its own log."""
+"""All MAVLink messages of one flight of a real PX4, compared with its own log."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.peers.px4_log_stream import STREAMS, datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
 TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
-UNTIMED: Final = 2.0  # s: what has no time of its own is in the log at most so long before, by its own rate there
+UNTIMED: Final = 2.0  # s: maximum age in the log of the values of a message without a time
 OF_STATUS: Final = 1.2  # s: ESTIMATOR_STATUS comes once a second
 RESOLUTION: Final = {
     "lat": 1e-7, "lon": 1e-7, "latitude_deg": 1e-7, "longitude_deg": 1e-7,
@@ -33,7 +33,7 @@ RESOLUTION: Final = {
     "voltage_v": 1e-3, "remaining": 0.01, "current_a": 0.01,
 }  # fmt: skip
 NOT_IN_THE_LOG: Final = {"time_utc_usec", *(f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health"))}
-FIELDS: Final = {  # that it says of each topic
+FIELDS: Final = {  # converted, by topic
     "vehicle_attitude": "q",
     "vehicle_odometry": "angular_velocity orientation_variance pose_frame position position_variance q quality"
     " reset_counter velocity velocity_frame velocity_variance",
@@ -53,37 +53,37 @@ pytestmark = [
 ]
 
 
-def is_same(name: str, said: Any, logged: Any) -> bool:
-    """Return whether a value is the log's, within the resolution that MAVLink has."""
-    if isinstance(said, tuple):
-        return all(is_same(name, one, other) for one, other in zip(said, logged, strict=True))
-    if said == logged or not isinstance(said, float):
-        return bool(said == logged)
-    error = math.remainder(said - logged, math.tau) if name == "cog_rad" else float(said - logged)
-    return abs(error) <= RESOLUTION.get(name, 1e-6) or (math.isnan(said) and math.isnan(logged))
+def is_same(name: str, converted: Any, logged: Any) -> bool:
+    """Return whether a value equals the logged one within MAVLink's resolution."""
+    if isinstance(converted, tuple):
+        return all(is_same(name, one, other) for one, other in zip(converted, logged, strict=True))
+    if converted == logged or not isinstance(converted, float):
+        return bool(converted == logged)
+    error = math.remainder(converted - logged, math.tau) if name == "cog_rad" else float(converted - logged)
+    return abs(error) <= RESOLUTION.get(name, 1e-6) or (math.isnan(converted) and math.isnan(logged))
 
 
 @pytest.mark.slow
-def test_all_topics_of_mavlink_say_what_was_logged() -> None:
-    """Each message is valid and equals the log's of that time, within MAVLink's resolution; none is out of order."""
+def test_converted_messages_equal_log() -> None:
+    """Each converted message is valid, in order, and equals the logged one within MAVLink's resolution."""
     rows: dict[tuple[str, int | None], list[Any]] = defaultdict(list)
     for each in open_replay(f"ulog:{LOG}?topics={','.join(TOPICS)}").messages:
         rows[each.address.topic, each.address.instance].append(upgrade_with(BY_TOPIC[each.address.topic], each.fields))
     times = {key: [row.timestamp for row in of_key] for key, of_key in rows.items()}
     vehicle, parser = Vehicle("1", MavlinkOptions.model_validate({"topics": ",".join(TOPICS)})), dialect.MAVLink(None)
-    compared, unlogged, fields_said = Counter[str](), Counter[str](), defaultdict[str, set[str]](set)
+    compared, unlogged, fields_converted = Counter[str](), Counter[str](), defaultdict[str, set[str]](set)
     for time_ns, datagram in read_datagrams(PX4 / "twelve_messages_mavlink.bin.gz"):
         for message in parser.parse_buffer(datagram) or []:
             if not message.get_srcSystem():
-                continue  # none of the dialect
+                continue  # not in the dialect
             vehicle.track_sequence(message.get_seq(), time_ns / 1e9)
-            said = vehicle.handle(message, time_ns / 1e9)
-            if said is None:
+            converted = vehicle.handle(message, time_ns / 1e9)
+            if converted is None:
                 continue
-            assert isinstance(said, SourceMessage)
-            assert not said.rebooted
-            topic, instance, fields = said.address.topic, said.address.instance, said.fields
-            model, now = upgrade_with(BY_TOPIC[topic], fields), said.fields["timestamp"]
+            assert isinstance(converted, SourceMessage)
+            assert not converted.rebooted
+            topic, instance, fields = converted.address.topic, converted.address.instance, converted.fields
+            model, now = upgrade_with(BY_TOPIC[topic], fields), converted.fields["timestamp"]
             assert isinstance(now, int)
             of_topic, until = rows[topic, instance], bisect(times[topic, instance], now)
             has_time = topic not in ("vehicle_status", "vehicle_land_detected", "battery_status")
@@ -91,18 +91,18 @@ def test_all_topics_of_mavlink_say_what_was_logged() -> None:
                 unlogged[topic] += 1
                 continue
             compared[topic] += 1
-            fields_said[topic] |= fields.keys() - {"timestamp"}
+            fields_converted[topic] |= fields.keys() - {"timestamp"}
             for name in fields.keys() - NOT_IN_THE_LOG - {"timestamp"}:
                 of_status = topic == "vehicle_global_position" and name not in ("lat", "lon", "alt")
                 if of_status and name in ("eph", "epv"):
-                    continue  # these are of times that the log has not
+                    continue  # from times that the log lacks
                 age = OF_STATUS if of_status else 0.0 if has_time else UNTIMED
                 since = min(until - 1, bisect(times[topic, instance], now - age * 1e6))
                 candidates = [getattr(row, name) for row in of_topic[since:until]]
                 value = getattr(model, name)
                 assert any(is_same(name, value, each) for each in candidates), (topic, now, name, value, candidates)
-    assert fields_said == {topic: set(names.split()) for topic, names in FIELDS.items()}
-    # The log has not every attitude, and was closed before the last odometry.
+    assert fields_converted == {topic: set(names.split()) for topic, names in FIELDS.items()}
+    # The log lacks some attitudes, and was closed before the last odometry.
     assert unlogged == {"vehicle_attitude": 472, "vehicle_odometry": 1}
     assert compared == {
         "vehicle_attitude": 3279, "vehicle_odometry": 2293, "vehicle_global_position": 1480, "sensor_gps": 387,
@@ -111,22 +111,22 @@ def test_all_topics_of_mavlink_say_what_was_logged() -> None:
 
 
 @pytest.mark.slow
-def test_utc_is_that_of_the_vehicles_clock() -> None:
-    """SYSTEM_TIME gives the GPS messages their Unix time, which goes on with the time since boot."""
+def test_gps_time_comes_from_system_time() -> None:
+    """SYSTEM_TIME provides the Unix time of GPS messages, which advances with the time since boot."""
     vehicle, parser = Vehicle("1", MavlinkOptions.model_validate({"topics": "sensor_gps"})), dialect.MAVLink(None)
     origins = []
     for time_ns, datagram in read_datagrams(PX4 / "twelve_messages_mavlink.bin.gz"):
         for message in parser.parse_buffer(datagram) or []:
-            said = vehicle.handle(message, time_ns / 1e9) if message.get_srcSystem() else None
-            if isinstance(said, SourceMessage) and "time_utc_usec" in said.fields:
-                origins.append(int(str(said.fields["time_utc_usec"])) - int(str(said.fields["timestamp"])))
+            converted = vehicle.handle(message, time_ns / 1e9) if message.get_srcSystem() else None
+            if isinstance(converted, SourceMessage) and "time_utc_usec" in converted.fields:
+                origins.append(int(str(converted.fields["time_utc_usec"])) - int(str(converted.fields["timestamp"])))
     assert len(origins) == 378
     assert max(origins) - min(origins) < 2_000_000  # simulated time, and the host's clock
 
 
 @pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
-def test_status_texts_are_in_the_log() -> None:
-    """Each STATUSTEXT of a flight is a text of the vehicle's own log, without its module, or an event with a tab."""
+def test_statustexts_are_in_log() -> None:
+    """Each STATUSTEXT of a flight is a logged string without its module name, or an event with a trailing tab."""
     vehicle, parser = Vehicle("1", MavlinkOptions(topics=("log_message",))), new_parser()
     texts = [
         (each.fields["timestamp"], str(each.fields["text"]))

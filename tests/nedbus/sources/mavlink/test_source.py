@@ -1,4 +1,4 @@
-"""Vehicles that speak MAVLink, encoded by pymavlink; one of them flies in a process of its own."""
+"""MAVLink vehicles encoded by pymavlink; one of them runs in a subprocess."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.nedbus.sources.mavlink import mavlink_peer
 from tests.peers.command_line import run_command
-from tests.peers.http_pages import Pages
-from tests.peers.listening import Listener, status_of_source
+from tests.peers.http_client import HttpClient
+from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
@@ -63,7 +63,7 @@ def listener(port: int) -> Iterator[Listener]:
 
 @pytest.fixture
 def fly(start: Start, port: int, tmp_path: Path) -> Fly:
-    """Start a vehicle."""
+    """Return a function that starts a simulated vehicle."""
 
     def fly(*arguments: object, rows: list[dict[str, float]] | None = None) -> Process:
         values = tmp_path / "values.json"
@@ -74,7 +74,7 @@ def fly(start: Start, port: int, tmp_path: Path) -> Fly:
 
 
 class Autopilot:
-    """The UDP socket of a vehicle: what a test sends by it, and what it was asked for."""
+    """UDP socket of a vehicle: sends messages, and collects the requests it receives."""
 
     def __init__(self, port: int, *, system: int = 9, component: int = 1) -> None:
         self.encoder = dialect.MAVLink(None, system, component)
@@ -115,23 +115,23 @@ def local_position(ms: int, *values: float) -> Any:
 
 
 def estimates(number: int) -> list[dict[str, float]]:
-    """Return the estimates of a simulated flight, five a second."""
+    """Return the estimates of a simulated flight at 5 Hz."""
     run = open_replay("sim:?seed=3")
     chosen = islice((each for each in run.messages if each.address.topic == VLP), 0, 20 * number, 20)
     flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dist_bottom_valid", "xy_global")
     return [{name: getattr(upgrade(each.fields), name) for name in (*ROW, *flags)} for each in chosen]
 
 
-def test_unknown_validity_is_neither_valid_nor_invalid(
+def test_validity_without_estimator_status_is_unknown(
     run_nedbus: Start, bus: nedbus.Bus, port: int, endpoint: str
 ) -> None:
-    """A vehicle without ESTIMATOR_STATUS, as ArduPilot by default: every command calls its validity unknown."""
-    pages = Pages(free_port())
+    """Each command reports unknown validity for a vehicle without ESTIMATOR_STATUS, such as ArduPilot by default."""
+    pages = HttpClient(free_port())
     run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
     asked = {
         "list": "validity unknown", "info": "validity unknown", "echo --once": "validity unknown",
         "hz --count 2": "validity unknown",
-        "health --expect 9 --valid xy": "the validity of xy is unknown, as the vehicle does not send it",
+        "health --expect 9 --valid xy": "validity of xy is unknown: the vehicle does not send it",
     }  # fmt: skip
     done = threading.Event()
 
@@ -162,8 +162,8 @@ def test_unknown_validity_is_neither_valid_nor_invalid(
         sending.result(DEADLINE)
 
 
-def test_flight_reaches_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int) -> None:
-    """30 Hz of positions, 50 Hz of attitude, a tenth of all packets dropped, a reboot: all the rest is published.
+def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int) -> None:
+    """All positions that were not dropped are published, at 10 % packet loss and with a reboot.
 
     The whole flight fits into the receive buffer of the link, as the service may run late.
     """
@@ -184,8 +184,8 @@ def test_flight_reaches_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, po
             assert sample.message.timestamp == line["time_boot_ms"] * 1000
             assert [getattr(sample.message, name) for name in NED] == [line[name] for name in NED]
             assert "heading" in sample.missing or abs(sample.message.heading) <= math.pi + 1e-6
-    wait_for(lambda: status_of_source(bus).published == len(sent), what="the last one to be counted")
-    now = status_of_source(bus)
+    wait_for(lambda: source_status(bus).published == len(sent), what="the last one to be counted")
+    now = source_status(bus)
     assert (*now.addresses, *now.stale) == (f"7/{VLP}",), "stale after 3 s"
     assert (now.rejected, now.reboots, now.retries) == (0, 1, 0)
     # Losses before the first packet, around the reboot and after the last position cannot be counted.
@@ -193,8 +193,8 @@ def test_flight_reaches_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, po
     assert "7/vehicle_local_position: the vehicle rebooted" in service.err
 
 
-def test_fields_are_those_of_mavlink(listener: Listener, port: int) -> None:
-    """The estimate has what MAVLink's messages have, in PX4's units, and no other fields."""
+def test_position_has_the_fields_of_mavlink(listener: Listener, port: int) -> None:
+    """The estimate has the values of MAVLink's messages in PX4's units, and no other fields."""
     names = ("origin", "estimator", "global_position", "altitude", "odometry", "attitude", "local_position")
     with Autopilot(port) as vehicle:
         vehicle.send(*(getattr(mavlink_peer, name)(2000, ROW) for name in names))
@@ -206,8 +206,8 @@ def test_fields_are_those_of_mavlink(listener: Listener, port: int) -> None:
     assert (str(received.address), received.lost) == (f"9/{VLP}", 0)
 
 
-def test_each_message_is_one_of_its_topic(port: int) -> None:
-    """The chosen messages arrive at their own addresses, with fields of earlier ones, and nothing else does."""
+def test_messages_are_converted_to_chosen_topics(port: int) -> None:
+    """Only the chosen messages arrive, at their own addresses, complemented by fields of earlier messages."""
     topics = "SensorGps,BatteryStatus,VehicleStatus,HomePosition"
     gps = dialect.MAVLink_gps_raw_int_message(5_000_000, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
     cells = [4000, 4100, *[65535] * 8]
@@ -242,8 +242,8 @@ def test_each_message_is_one_of_its_topic(port: int) -> None:
     }  # fmt: skip
 
 
-def test_vehicles_on_one_port(timings: Timings, listener: Listener, port: int) -> None:
-    """Each system id is a vehicle with requests at its own address."""
+def test_vehicles_share_a_port(timings: Timings, listener: Listener, port: int) -> None:
+    """Each system id is a vehicle, and receives its requests at its own address."""
     timings.source_tick = 0.01
     expected = {32: 20_000, **dict.fromkeys([33, 141, 230, 331], 119_974.875), ORIGIN: 0}
     with Autopilot(port, system=3) as one, Autopilot(port, system=250) as other:
@@ -258,8 +258,8 @@ def test_vehicles_on_one_port(timings: Timings, listener: Listener, port: int) -
     assert list(requested.values()) == [pytest.approx(expected)] * 2
 
 
-def test_burst_before_a_late_read_is_received(port: int) -> None:
-    """400 messages that arrive while the service does something else are all read, with Linux's own limit as well."""
+def test_receive_buffer_holds_a_burst(port: int) -> None:
+    """400 messages that arrive before the service reads are all received, even within Linux's default limit."""
     with closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link, Autopilot(port) as vehicle:
         vehicle.send(*map(local_position, range(400)))
         received: list[object] = []
@@ -268,8 +268,8 @@ def test_burst_before_a_late_read_is_received(port: int) -> None:
     assert len(received) == 400
 
 
-def test_hostile_datagrams_are_counted(listener: Listener, port: int) -> None:
-    """Random datagrams are counted as those of one place, and a vehicle beside them is received."""
+def test_random_datagrams_are_counted_as_rejected(listener: Listener, port: int) -> None:
+    """Random datagrams are counted under one link, and do not affect a vehicle on it."""
     rng, starts = random.Random(0), (b"", b"\xfd\xff\x00", b"\xfe\x09", b"\xfd\x1c\x00\x00\x00\x01\x01\x20\x00\x00")
     with Autopilot(port) as vehicle, Autopilot(port) as attacker:
         for ms in range(1000, 3000, 50):
@@ -281,8 +281,8 @@ def test_hostile_datagrams_are_counted(listener: Listener, port: int) -> None:
     assert {each.where for each in listener.rejections} == {f"udpin:127.0.0.1:{port}"}
 
 
-def test_messages_of_others_are_ignored(listener: Listener, port: int) -> None:
-    """A late datagram is rejected, as are messages of a system or component 0; a camera's position is ignored."""
+def test_late_and_foreign_messages_are_ignored(listener: Listener, port: int) -> None:
+    """Late datagrams and ids of 0 are rejected; the position of a camera is ignored silently."""
     with (
         Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as unnamed,
         Autopilot(port, component=0) as unset,
@@ -299,11 +299,11 @@ def test_messages_of_others_are_ignored(listener: Listener, port: int) -> None:
     assert late.reason == "out of order: 1500 ms since boot, after 2000 ms"
     link = f"udpin:127.0.0.1:{port}"
     assert [each.where for each in ignored] == [f"{link} system 0 component 1", f"{link} system 9 component 0"]
-    assert all("id 0 addresses all and is no sender's" in each.reason for each in ignored)
+    assert all("id 0 is for broadcast only" in each.reason for each in ignored)
 
 
-def test_two_senders_of_one_system_are_named(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
-    """Two senders with one system id are logged once, with both addresses; one that reconnects twice is not."""
+def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
+    """Two senders with one system id are logged once, with both addresses; a sender that reconnects twice is not."""
     with Autopilot(port) as one, Autopilot(port) as other, Autopilot(port) as third:
         for ms, sender in enumerate((one, one, other, other, third, third), start=1000):
             sender.send(local_position(ms))
@@ -318,8 +318,8 @@ def test_two_senders_of_one_system_are_named(listener: Listener, port: int, capl
         assert "both send as system 9, and their messages are mixed" in record.getMessage()
 
 
-def test_broken_tcp_link_is_an_error() -> None:
-    """A message in pieces is whole again; a link that is closed is an error, and can be reopened while it is there."""
+def test_closed_tcp_link_raises_and_can_be_reopened() -> None:
+    """A split message is reassembled; a closed link raises, and can be opened again."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = f"tcp:127.0.0.1:{server.getsockname()[1]}"
         for ms in (1000, 2000):
@@ -339,12 +339,12 @@ def test_broken_tcp_link_is_an_error() -> None:
         Listener(f"mavlink:{link}")
 
 
-def test_serial_port() -> None:
-    """A telemetry radio on a serial port is received; a port that disappears is an error."""
+def test_serial_port_is_received_until_it_disappears() -> None:
+    """A telemetry radio on a serial port is received; a port that disappears raises."""
     radio, port = os.openpty()
     tty.setraw(port)
     with Listener(f"mavlink:serial:{os.ttyname(port)}?baud=115200") as listener:
-        listener.turn()  # it sends a heartbeat
+        listener.step()  # it sends a heartbeat
         assert os.read(radio, 1)[0] == dialect.PROTOCOL_MARKER_V2
         os.write(radio, local_position(1000).pack(dialect.MAVLink(None, 9, 1)))
         assert listener.receive()[0].fields["y"] == 1.0
@@ -354,8 +354,7 @@ def test_serial_port() -> None:
             listener.receive()
 
 
-def test_port_in_use_is_an_error(listener: Listener, port: int) -> None:
-    """A port that another program uses is reported as the source's error."""
+def test_port_in_use_raises(listener: Listener, port: int) -> None:
     with pytest.raises(SourceError, match=r"cannot be opened \(address already in use\)"):
         Listener(f"mavlink:udpin:127.0.0.1:{port}")
     assert not listener.rejections
@@ -377,7 +376,7 @@ def test_port_in_use_is_an_error(listener: Listener, port: int) -> None:
         ("px4-zenoh:here", "'here' is not an endpoint"),
     ],
 )
-def test_invalid_source_is_an_error(text: str, reason: str) -> None:
-    """The error of an invalid source shows the right form."""
+def test_invalid_source_raises(text: str, reason: str) -> None:
+    """The error of an invalid source shows the expected form."""
     with pytest.raises(ConfigError, match=reason):
         parse_source(text).open_source(vehicle="1")

@@ -1,4 +1,4 @@
-"""Telemetry logs (.tlog) of QGroundControl and MAVProxy: converted as live messages, at the times in the file."""
+"""Telemetry logs (.tlog) of QGroundControl and MAVProxy: converted like live messages, at the times in the file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLAGS = 0x3F  # ESTIMATOR_STATUS: all valid
 
 
 def frames(system: int, count: int, *, signed: bool = False, version: int = 2) -> Iterable[bytes]:
-    """Yield records of a vehicle that booted at EPOCH: attitude, status and position ten times a second."""
+    """Yield records of a vehicle that booted at EPOCH: attitude, status and position at 10 Hz."""
     sender = mavlink.MAVLink(None, system, 1)
     if signed:
         sender.signing.secret_key, sender.signing.sign_outgoing = bytes(32), True
@@ -44,8 +44,8 @@ def frames(system: int, count: int, *, signed: bool = False, version: int = 2) -
 
 
 @pytest.mark.parametrize("form", [{}, {"signed": True}, {"version": 1}])
-def test_tlog_is_read_by_every_command(tmp_path: Path, form: dict[str, Any]) -> None:
-    """Arrays, a replay, events and a recording have all positions of the vehicle, at the host's UTC."""
+def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> None:
+    """Arrays, replay, events and recording have all positions of the vehicle, at the host's UTC."""
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"".join(frames(7, 100, **form)))
     positions = nedbus.read(path)
@@ -67,8 +67,8 @@ def test_tlog_is_read_by_every_command(tmp_path: Path, form: dict[str, Any]) -> 
     assert nedbus.missing_of(nedbus.read(tmp_path / "a.mcap")) == nedbus.missing_of(positions)
 
 
-def test_several_vehicles_of_a_tlog_are_told_apart(tmp_path: Path) -> None:
-    """Each autopilot is a vehicle, named by its system id; the ground station is none."""
+def test_autopilots_in_tlog_are_separate_vehicles(tmp_path: Path) -> None:
+    """Each autopilot is a vehicle named by its system id; the ground station is not a vehicle."""
     path = tmp_path / "flight.tlog"
     pairs = zip(frames(1, 10), frames(2, 10), strict=True)
     path.write_bytes(b"".join(one + two for one, two in pairs))
@@ -77,8 +77,8 @@ def test_several_vehicles_of_a_tlog_are_told_apart(tmp_path: Path) -> None:
     assert run_command("why", "-v", "1", str(path)).exit_code == 0
 
 
-def test_damage_of_a_tlog_costs_only_what_it_hits(tmp_path: Path) -> None:
-    """Bytes that are not MAVLink are skipped and reported; a file that ends within a frame is read up to it."""
+def test_damaged_tlog_loses_only_the_damaged_messages(tmp_path: Path) -> None:
+    """Bytes that are not MAVLink are skipped and reported; a truncated file is read up to the last whole frame."""
     path = tmp_path / "flight.tlog"
     records = list(frames(1, 50))
     damaged = bytearray(records[42])  # a position
@@ -93,8 +93,7 @@ def test_damage_of_a_tlog_costs_only_what_it_hits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"hello", bytes(5000), b"".join(frames(255, 0))])
-def test_file_without_mavlink_is_refused(tmp_path: Path, content: bytes) -> None:
-    """It is named, as an array and as a replay."""
+def test_tlog_without_mavlink_raises(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(content)
     for read in (nedbus.read, lambda path: open_replay(f"tlog:{path}")):

@@ -1,4 +1,4 @@
-"""Requests to one MAVLink vehicle, and its estimates, at times that the test gives."""
+"""Requests to one MAVLink vehicle, and its estimates, with a fake clock."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def new_vehicle(topics: str) -> Vehicle:
 
 @pytest.fixture
 def vehicle() -> Vehicle:
-    """Return a vehicle that has sent nothing, at 30 positions a second over a telemetry radio."""
+    """Return a vehicle that has sent nothing, with 30 positions per second over a telemetry radio."""
     return new_vehicle(VLP)
 
 
 def handle(vehicle: Vehicle, message: Any, now: float) -> SourceMessage:
-    """Return what a message makes, which is not rejected."""
-    said = vehicle.handle(message, now)
-    assert isinstance(said, SourceMessage)
-    return said
+    """Return the message converted by a vehicle, which must not be rejected."""
+    converted = vehicle.handle(message, now)
+    assert isinstance(converted, SourceMessage)
+    return converted
 
 
 def position(ms: int) -> Any:
@@ -42,7 +42,7 @@ def position(ms: int) -> Any:
 
 
 def estimate(vehicle: Vehicle, ms: int, now: float) -> dict[str, object]:
-    """Return what a position at this time since boot [ms] makes."""
+    """Return the fields converted from a position at this time since boot [ms]."""
     return dict(handle(vehicle, position(ms), now).fields)
 
 
@@ -52,12 +52,12 @@ def estimate(vehicle: Vehicle, ms: int, now: float) -> dict[str, object]:
         (0b1111111111, True),  # at rest, since 48f1687d3a
         (0b1101111111, True),  # in flight
         (0b1101100101, False),  # GPS lost
-        (0b0010100101, False),  # the constant position mode, up to 1.15: no velocity, and no position
-        (0b0010111101, False),  # the same, of a release that keeps a position all the same
+        (0b0010100101, False),  # constant position mode up to 1.15: no velocity, no position
+        (0b0010111101, False),  # the same, in a release that keeps the position
     ],
 )
-def test_constant_position_mode_is_no_sign_of_rest(vehicle: Vehicle, flags: int, expected: bool) -> None:
-    """Its bit counts where no horizontal velocity is valid: it was the opposite of that until PX4's 48f1687d3a."""
+def test_constant_position_mode_invalidates_only_without_velocity(vehicle: Vehicle, flags: int, expected: bool) -> None:
+    """The bit of constant position mode counts only without valid horizontal velocity; see PX4's 48f1687d3a."""
     vehicle.handle(dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0), 100.0)
     assert estimate(vehicle, 1, 100.0)["xy_valid"] is expected
 
@@ -66,8 +66,8 @@ def test_constant_position_mode_is_no_sign_of_rest(vehicle: Vehicle, flags: int,
     ("time_usec", "timestamp"),
     [(0, 7_000_000), (6_500_000, 6_500_000), (1_700_000_000_000_000, 7_000_000), (2**64 - 1, 7_000_000)],
 )
-def test_unix_time_is_no_time_since_boot(time_usec: int, timestamp: int) -> None:
-    """A time that is Unix time, unknown or nonsense is replaced by that of the newest message since boot."""
+def test_unusable_message_time_is_replaced(time_usec: int, timestamp: int) -> None:
+    """A time that is Unix time, unknown or invalid is replaced by that of the newest message since boot."""
     vehicle = new_vehicle(f"{VLP},sensor_gps")
     estimate(vehicle, 7000, 100.0)
     gps = dialect.MAVLink_gps_raw_int_message(time_usec, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
@@ -84,10 +84,8 @@ def test_unix_time_is_no_time_since_boot(time_usec: int, timestamp: int) -> None
         (0.5, 57600, 2.0, 10.0),
     ],
 )
-def test_flags_are_requested_as_often_as_the_link_carries(
-    rate: float, baud: int, status: float, odometry: float
-) -> None:
-    """ESTIMATOR_STATUS comes with each position where there is room for it, else with what room there is."""
+def test_estimator_status_rate_fits_link(rate: float, baud: int, status: float, odometry: float) -> None:
+    """ESTIMATOR_STATUS is requested with each position, or as often as the remaining bandwidth allows."""
     rates = request_rates(rate, baud, [VLP])
     assert [*rates] == [*NEEDED]
     assert rates[32] == rate
@@ -97,8 +95,8 @@ def test_flags_are_requested_as_often_as_the_link_carries(
 
 @pytest.mark.parametrize("topics", [[*TOPICS], ["vehicle_attitude"], ["sensor_gps", "home_position"], [VLP], ["x"]])
 @pytest.mark.parametrize("rate", [0.5, 30.0, 100.0])
-def test_only_what_is_needed_is_requested_and_as_the_link_carries(topics: list[str], rate: float) -> None:
-    """Nothing is requested for topics that were not chosen; a full link has all at 2 Hz, or what it wants, at least."""
+def test_only_needed_messages_are_requested_within_bandwidth(topics: list[str], rate: float) -> None:
+    """Only messages of chosen topics are requested; on a full link each keeps 2 Hz, or its own rate if lower."""
     rates = request_rates(rate, 57600, topics)
     needed = [number for number, (_, _, of) in STREAMS.items() if {*of.split()} & {*topics}]
     assert [*rates] == needed
@@ -109,24 +107,24 @@ def test_only_what_is_needed_is_requested_and_as_the_link_carries(topics: list[s
     assert load <= 0.9 * 57600 / 10 + 0.01 or max(hertz for number, hertz in rates.items() if number != 32) <= 2.0
 
 
-def test_each_topic_of_mavlink_has_a_message_that_is_requested() -> None:
-    """A topic that a MAVLink vehicle says has a row in STREAMS, with the topic's name as it is."""
+def test_every_converted_topic_has_a_requested_message() -> None:
+    """Each topic of CONVERSIONS is needed by a row of STREAMS, under the same name."""
     needed = {topic for _, _, topics in STREAMS.values() for topic in topics.split()}
     assert needed == {topic for topic, _ in CONVERSIONS.values()} <= TOPICS.keys()
 
 
-def test_euler_angles_replace_a_quaternion_that_is_not_sent() -> None:
-    """ATTITUDE is the attitude of a vehicle that sends no ATTITUDE_QUATERNION, and of no other."""
+def test_attitude_replaces_missing_attitude_quaternion() -> None:
+    """ATTITUDE is converted only for a vehicle that sends no ATTITUDE_QUATERNION."""
     vehicle = new_vehicle("vehicle_attitude")
-    said = handle(vehicle, dialect.MAVLink_attitude_message(1000, 0.1, -0.2, 3.0, 0, 0, 0), 100.0)
-    assert quaternion_to_euler(cast("tuple[float, ...]", said.fields["q"])) == pytest.approx((0.1, -0.2, 3.0))
+    converted = handle(vehicle, dialect.MAVLink_attitude_message(1000, 0.1, -0.2, 3.0, 0, 0, 0), 100.0)
+    assert quaternion_to_euler(cast("tuple[float, ...]", converted.fields["q"])) == pytest.approx((0.1, -0.2, 3.0))
     assert vehicle.handle(dialect.MAVLink_attitude_quaternion_message(1010, 1, 0, 0, 0, 0, 0, 0), 100.1)
     assert vehicle.handle(dialect.MAVLink_attitude_message(1020, 0, 0, 0, 0, 0, 0), 100.2) is None
     assert vehicle.handle(dialect.MAVLink_attitude_message(4000, 0, 0, 0, 0, 0, 0), 103.0)
 
 
-def test_each_topic_has_an_order_of_its_own() -> None:
-    """Messages of other topics may be later; only one that is older than the last of its own is out of order."""
+def test_order_is_checked_per_topic() -> None:
+    """Only a message older than the last one of the same topic is out of order."""
     vehicle = new_vehicle("*")
     odometry = [1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [math.nan] * 21, [math.nan] * 21]
     assert estimate(vehicle, 2000, 100.0)
@@ -138,7 +136,7 @@ def test_each_topic_has_an_order_of_its_own() -> None:
 
 
 def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
-    """Return the requests to a vehicle that sends some message each half a second."""
+    """Return the requests to a vehicle that sends a message every half second."""
     requests = []
     for second in seconds:
         for now in (second, second + 0.5):
@@ -147,8 +145,8 @@ def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
     return [each for each in requests if each]
 
 
-def test_requests_are_repeated_while_nothing_arrives(vehicle: Vehicle, caplog: pytest.LogCaptureFixture) -> None:
-    """Each message is requested three times, then every few seconds; each but the origin is logged once."""
+def test_unanswered_requests_are_repeated(vehicle: Vehicle, caplog: pytest.LogCaptureFixture) -> None:
+    """Each message is requested three times, then every few seconds; each one but the origin is logged once."""
     caplog.set_level("INFO")
     requested = [number for number, _ in requests_of(vehicle, range(100, 200))]
     assert requested[:12] == [*NEEDED, ORIGIN] * 2
@@ -158,10 +156,10 @@ def test_requests_are_repeated_while_nothing_arrives(vehicle: Vehicle, caplog: p
     assert "9/vehicle_local_position: the vehicle does not send ODOMETRY on request" in caplog.text
 
 
-def test_messages_that_arrive_are_requested_three_times(vehicle: Vehicle) -> None:
-    """A link loses some requests; after three rounds nothing is requested that arrives, nor an origin that is known."""
+def test_arriving_messages_are_requested_three_times(vehicle: Vehicle) -> None:
+    """As links lose requests there are three rounds; afterwards only missing messages are requested."""
     origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
-    assert vehicle.next_request(99.0) is None  # it was never heard
+    assert vehicle.next_request(99.0) is None  # no message received yet
     requested = []
     for second in range(100, 130):
         requested += requests_of(vehicle, range(second, second + 1))
@@ -181,8 +179,8 @@ def test_reordered_and_duplicate_messages_are_not_lost(vehicle: Vehicle) -> None
     assert vehicle.lost == 85 + 99 + 55
 
 
-def test_positions_that_stop_are_requested_again(vehicle: Vehicle) -> None:
-    """The streams of a vehicle that sends messages, but no positions, are requested again."""
+def test_stopped_positions_are_requested_again(vehicle: Vehicle) -> None:
+    """Messages of a vehicle that sends others, but no positions, are requested again."""
     requested = []
     for second in range(100, 140):
         if second < 120:
@@ -192,7 +190,7 @@ def test_positions_that_stop_are_requested_again(vehicle: Vehicle) -> None:
 
 
 def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
-    """A heading that is not repeated is not provided after 2 s; an origin stays until a reboot."""
+    """A heading that is not repeated expires after 2 s; an origin is kept until a reboot."""
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
     vehicle.handle(dialect.MAVLink_gps_global_origin_message(473977418, 85455939, 488000), 100.0)
     assert estimate(vehicle, 1000, 101.0)["heading"] == pytest.approx(math.pi / 2)
@@ -205,15 +203,15 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
 
 
-def test_yaw_of_the_attitude_replaces_the_heading(vehicle: Vehicle) -> None:
-    """Without a global position PX4 sends no GLOBAL_POSITION_INT; the heading is then the yaw of its attitude."""
+def test_attitude_yaw_replaces_missing_heading(vehicle: Vehicle) -> None:
+    """Without a global position PX4 sends no GLOBAL_POSITION_INT, so the heading is the yaw of ATTITUDE."""
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
     assert estimate(vehicle, 1, 100.0)["heading"] == pytest.approx(1.25)
 
 
 NAN, U16 = math.nan, 2**16 - 1
-UNKNOWN = {  # a message with the values by which MAVLink's common.xml marks unknown ones, and what is known in it
+UNKNOWN = {  # messages with the values that mean unknown in MAVLink's common.xml, and the fields that are known
     "gps": (
         dialect.MAVLink_gps_raw_int_message(10**6, 3, 1, 1, 1, U16, U16, U16, U16, 255, 0, 0, 0, 0, 0, U16),
         {"fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m"},
@@ -242,22 +240,22 @@ UNKNOWN = {  # a message with the values by which MAVLink's common.xml marks unk
 
 
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_values_that_mean_unknown_are_not_provided(name: str) -> None:
-    """The fields of a message whose values MAVLink defines as unknown are missing, not measured."""
+def test_unknown_values_are_not_provided(name: str) -> None:
+    """Fields with values that MAVLink defines as unknown are left out."""
     message, known = UNKNOWN[name]
     vehicle = new_vehicle("*")
     vehicle.handle(position(1000), 100.0)
-    said = vehicle.handle(message, 100.0)
-    assert said is None or isinstance(said, SourceMessage)
-    assert {*(said.fields if said else ())} - {"timestamp"} == known
+    converted = vehicle.handle(message, 100.0)
+    assert converted is None or isinstance(converted, SourceMessage)
+    assert {*(converted.fields if converted else ())} - {"timestamp"} == known
     if name == "further cells":
-        assert said is not None
-        assert said.fields["voltage_v"] == 16.0
+        assert converted is not None
+        assert converted.fields["voltage_v"] == 16.0
 
 
 @pytest.mark.parametrize(("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)])
-def test_no_measured_clearance_is_no_distance(vehicle: Vehicle, clearance: float, is_valid: bool) -> None:
-    """ALTITUDE.bottom_clearance is negative without a measurement."""
+def test_unmeasured_clearance_is_invalid(vehicle: Vehicle, clearance: float, is_valid: bool) -> None:
+    """ALTITUDE.bottom_clearance is negative or NaN without a measurement."""
     vehicle.handle(dialect.MAVLink_altitude_message(10**6, 1, 2, 3, 4, NAN, clearance), 100.0)
     fields = estimate(vehicle, 1000, 100.0)
     assert (fields["dist_bottom_valid"], "dist_bottom" in fields) == (is_valid, is_valid)
@@ -268,16 +266,16 @@ def chunk(text: bytes, number: int, sequence: int = 0, severity: int = 4) -> Any
 
 
 def texts_of(messages: list[tuple[float, Any]]) -> list[tuple[object, ...]]:
-    """Return timestamp, severity and text of what a vehicle says in messages at these times."""
+    """Return timestamp, severity and text of the log messages of a vehicle that sends messages at these times."""
     vehicle, later = new_vehicle("log_message"), [(99.0, dialect.MAVLink_timesync_message(0, 0))] * 3
     found = [vehicle.handle(message, now) for now, message in [(0.0, position(1000)), *messages, *later]]
-    said = [each for each in found if isinstance(each, SourceMessage)]
-    assert {each.address.stream for each in said} == {"log_message"}
-    return [tuple(each.fields.values()) for each in said]
+    converted = [each for each in found if isinstance(each, SourceMessage)]
+    assert {each.address.stream for each in converted} == {"log_message"}
+    return [tuple(each.fields.values()) for each in converted]
 
 
-def test_chunks_of_a_status_text_are_joined() -> None:
-    """In order, by id; what is lost between them, or behind the last one, is marked; controls are left out."""
+def test_statustext_chunks_are_joined() -> None:
+    """Chunks are joined in order, by id; missing chunks leave "...", and control characters are removed."""
     first, second = b"a" * 49 + b"\xc2", b"\xb5" + b"b" * 49
     assert texts_of([(0.0, chunk(b"Takeoff\x1b[31m detected\t", 0))]) == [(1_000_000, 4, "Takeoff detected")]
     whole = [(0.0, chunk(first, 1)), (0.1, chunk(second, 1, 1)), (0.2, chunk(b"end", 1, 2))]
@@ -290,7 +288,7 @@ def test_chunks_of_a_status_text_are_joined() -> None:
     assert [text for *_, text in texts_of([(0.0, chunk(b"c" * 50, 3))])] == ["c" * 50 + "..."]
 
 
-def test_flood_of_status_texts_is_counted() -> None:
+def test_flood_of_statustexts_is_limited() -> None:
     """Of 10,000 texts in a second, 100 are published, and the others rejected."""
     vehicle = new_vehicle("log_message")
     vehicle.handle(position(1000), 0.0)

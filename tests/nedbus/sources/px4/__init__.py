@@ -1,1 +1,1 @@
-"""PX4's Zenoh module."""
+"""Tests of the source for PX4 over Zenoh."""

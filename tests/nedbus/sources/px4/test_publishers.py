@@ -1,4 +1,4 @@
-"""Publishers of rmw_zenoh, with duplicates and restarts, by the tokens of a real PX4 and of ROS 2 nodes."""
+"""Publishers of rmw_zenoh, with duplicates and restarts, identified by tokens of a real PX4 and of ROS 2 nodes."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def streams() -> StreamRegistry:
     return StreamRegistry(Px4ZenohOptions.model_validate({}), vehicle="1")
 
 
-def test_token_of_a_real_px4_is_parsed() -> None:
-    """A token gives the key of the messages and, for PX4 but not for ROS 2, the gid of the node."""
+def test_token_of_real_px4_is_parsed() -> None:
+    """A token contains the key of the messages and, for PX4 but not for ROS 2, the gid of the node."""
     token = PublisherToken.parse(REAL)
     assert str(token.key) == f"0/fmu/out/{VLP}/px4_msgs::msg::dds_::VehicleLocalPosition_/{type_hash('1.16')}"
     assert (token.session, token.gid) == ("7f683599e27664034d4ab1bf80ed5a2f", GID)
@@ -56,18 +56,18 @@ def test_token_of_a_real_px4_is_parsed() -> None:
 @pytest.mark.parametrize(
     "text", ["", "a", REAL.replace("MP", "MS"), REAL + "/x", REAL.replace("/0/7", "/x/7"), 99 * REAL]
 )
-def test_other_tokens_are_refused(text: str) -> None:
+def test_invalid_token_raises(text: str) -> None:
     """A token that rmw_zenoh would not declare for a publisher raises DecodeError."""
     with pytest.raises(DecodeError):
         PublisherToken.parse(text)
 
 
-def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) -> None:
-    """Two publishers of one key are both rejected. After one has gone, the sequence of the other may start anywhere.
+def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRegistry) -> None:
+    """Both publishers of a key are rejected while they have the same gid.
 
-    That is neither a loss nor a reboot.
+    Afterwards the sequence of the other one may start anywhere: that is neither a loss nor a reboot.
     """
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     assert send(streams, stream, 7, 100.1) == (0, False)
     streams.add_publisher(px4("b"), 100.2)
@@ -76,17 +76,17 @@ def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) 
             send(streams, stream, number, 100.2 + number)
     streams.remove_publisher(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="the same gid"):
-        send(streams, stream, 900, 201.9)  # what it sent last comes after its token
+        send(streams, stream, 900, 201.9)  # its last messages arrive after its token
     assert send(streams, stream, 30, 202.1) == (0, False)
     assert send(streams, stream, 31, 202.2) == (0, False)
 
 
-def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: StreamRegistry) -> None:
-    """After a link with both of them breaks, their queued messages are rejected, as they are indistinguishable.
+def test_queued_messages_of_vanished_vehicles_are_rejected(streams: StreamRegistry) -> None:
+    """After two vehicles with the same gid lose their link, queued messages are rejected for a second.
 
     The key is free at once.
     """
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     for session in ("a", "b"):
         streams.add_publisher(px4(session), 0.0)
     assert not streams.remove_publisher(px4("a"), 10.0)
@@ -97,17 +97,17 @@ def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: Stre
     assert send(streams, stream, 2, 11.0) == (0, False)
 
 
-def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
+def test_topics_of_one_vehicle_may_share_a_gid(streams: StreamRegistry) -> None:
     """Two publishers in one session, or two sessions with different topics, are the same vehicle."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
         streams.add_publisher(token, 100.0)
     assert send(streams, stream, 1, 100.1) == (0, False)
 
 
-def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistry) -> None:
+def test_reconnected_vehicle_is_accepted_at_once(streams: StreamRegistry) -> None:
     """A publisher silent for 3 s does not block its successor, as a router detects a dead link only after 10 s."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)
     streams.add_publisher(px4("b"), 103.0)
@@ -116,9 +116,9 @@ def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistr
     assert send(streams, stream, 2, 109.1) == (0, False)
 
 
-def test_ros_2_nodes_of_one_name_are_distinguished_by_their_gids(streams: StreamRegistry) -> None:
+def test_ros_2_nodes_of_same_name_are_distinguished_by_gid(streams: StreamRegistry) -> None:
     """The first one is published; messages of the second are rejected while both exist."""
-    stream = streams.hear(str(key()), 0.0)
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     assert send(streams, stream, 1, 100.0, b"a" * 16) == (0, False)
     streams.add_publisher(node("b"), 100.0)
@@ -127,9 +127,9 @@ def test_ros_2_nodes_of_one_name_are_distinguished_by_their_gids(streams: Stream
     assert send(streams, stream, 2, 100.2, b"a" * 16) == (0, False)
 
 
-def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """The new token shows that the old publisher has gone: a reboot without losses."""
-    stream = streams.hear(str(key()), 0.0)
+def test_restarted_ros_2_publisher_is_accepted_at_once(streams: StreamRegistry) -> None:
+    """The new token shows that the old publisher has gone, which is a reboot without losses."""
+    stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)
     streams.remove_publisher(node("a"), 100.1)
@@ -138,11 +138,11 @@ def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegist
     assert send(streams, stream, 2, 100.4, b"b" * 16) == (0, False)
 
 
-def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
-    """A reboot counts once per vehicle, whichever topic shows it first, and so does the next one."""
+def test_reboot_is_counted_once_per_vehicle(streams: StreamRegistry) -> None:
+    """A reboot counts once, whichever topic shows it first, and so does the next one."""
     topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
-    vehicle = [streams.hear(str(key(topic)), 0.0) for topic in topics]
-    other = streams.hear(str(key(domain=1)), 0.0)
+    vehicle = [streams.on_message(str(key(topic)), 0.0) for topic in topics]
+    other = streams.on_message(str(key(domain=1)), 0.0)
     for now in (100.0, 110.0, 120.0):
         sequence = round(50 - now / 10)
         reboots = [send(streams, stream, sequence, now)[1] for stream in [*vehicle, other]]
@@ -156,7 +156,7 @@ def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
     tokens = [node(str(number)) for number in range(100)]
     for token in tokens:
         streams.add_publisher(token, 0.0)
-    assert len(streams.hear(str(key()), 0.0).tokens) == 64
+    assert len(streams.on_message(str(key()), 0.0).tokens) == 64
     for token in tokens:
         streams.remove_publisher(token, 0.0)
     streams.report(1.0)
@@ -168,21 +168,23 @@ def test_keys_are_bounded(monkeypatch: pytest.MonkeyPatch, streams: StreamRegist
     monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
     streams.add_publisher(px4("a"), 0.0)
     for domain in (1, 2):
-        streams.hear(str(key(domain=domain)), 0.0)
+        streams.on_message(str(key(domain=domain)), 0.0)
     with pytest.raises(NotAcceptedError, match="more than 3 keys: choose a domain"):
-        streams.hear(str(key(domain=3)), 0.0)
+        streams.on_message(str(key(domain=3)), 0.0)
     streams.report(0.0)
-    streams.hear(str(key(domain=3)), 0.0)
+    streams.on_message(str(key(domain=3)), 0.0)
 
 
-def test_keys_that_come_and_go_are_forgotten(streams: StreamRegistry) -> None:
-    """A key without a publisher is forgotten after a minute of silence, so that vehicles that left fill no table."""
+def test_silent_keys_without_publisher_are_removed(streams: StreamRegistry) -> None:
+    """A key without a publisher is removed after a minute of silence, so vehicles that left use no memory."""
     token = px4("a")
     streams.add_publisher(token, 0.0)
     for number in range(3000):
         now = float(number)
-        came = streams.hear(str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now)
-        streams.form_of(came)
+        came = streams.on_message(
+            str(TopicKey(0, f"v{number}/fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.16"))), now
+        )
+        streams.wire_format_of(came)
         send(streams, came, 1, now)
         streams.report(now)
     sizes = len(streams._streams), len(streams._owners), len(streams._reboots)

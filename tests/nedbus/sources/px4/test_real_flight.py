@@ -1,4 +1,4 @@
-"""Messages of a real PX4 (../shared/data/px4), played into a service at full speed, beside the vehicle's log."""
+"""Recordings of a real PX4 (../shared/data/px4), played into a service at full speed and compared with its log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
 from tests.flights.ulogs import LOGS
 from tests.nedbus.sources.mavlink.test_source import port
-from tests.peers.listening import Listener, status_of_source
+from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.peers.zenohd import start_zenohd
@@ -49,10 +49,10 @@ FLIGHT: Final = PX4 / "gps_loss_zenoh.jsonl.gz"
 TWELVE: Final = PX4 / "twelve_messages"
 DEFAULT_PUBCSV: Final = PX4 / "default_pubcsv_zenoh.jsonl.gz"
 MSG: Final = Path(__file__).parents[3] / "data" / "msg"
-"""Fields of messages that have no file here, as PX4's .msg files have them."""
+"""PX4's definitions of messages that nedbus does not define."""
 ALIKE: Final = PX4 / "two_alike_zenoh.jsonl.gz"
 MAVLINK: Final = PX4 / "gps_loss_mavlink.bin.gz"
-WINDOW: Final = 100  # messages that are on their way at once
+WINDOW: Final = 100  # messages in flight at once
 FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
 
 pytestmark = [
@@ -64,7 +64,7 @@ pytestmark = [
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """One line of a recording: a message, or a liveliness token that appears or goes, and the PX4 that sent it."""
+    """One line of a recording: a message, or a liveliness token that appears or disappears, and its PX4."""
 
     px4: int
     key: str
@@ -76,18 +76,18 @@ class Sent:
 
     @property
     def address(self) -> Address:
-        """The address as which the service publishes it."""
+        """The address under which the service publishes it."""
         _, topic, instance = split_ros2_topic("/".join(self.key.split("/")[1:-2]))
         return Address("1", topic, instance)
 
     @property
     def cdr(self) -> bytes:
-        """The message in one form, whatever its padding."""
+        """The message with normalised padding."""
         return encode_cdr(decode_cdr(self.payload, layout="1.16"), layout="1.16")
 
 
 def read_recording(path: Path) -> Iterator[Sent]:
-    """Yield what was sent, in order; a message is from the PX4 whose sequence it continues."""
+    """Yield the entries in order; a message belongs to the PX4 whose sequence it continues."""
     sessions: list[str] = []
     last: dict[tuple[int, str], int] = {}
     with gzip.open(path, "rt") as lines:
@@ -110,7 +110,7 @@ def read_recording(path: Path) -> Iterator[Sent]:
 
 
 class Px4:
-    """The session of one PX4: its messages may be dropped wherever there is no room, but by its own queue."""
+    """The session of one PX4, with a sending queue that never drops."""
 
     def __init__(self, endpoint: str) -> None:
         settings = {
@@ -150,7 +150,7 @@ class Px4:
 
 
 def play(bus: nedbus.Bus, px4s: Sequence[Px4], lines: Iterable[Sent], played: int) -> int:
-    """Send the messages of each PX4 as fast as the service takes them; `played` counts them, and is returned."""
+    """Send the messages of each PX4 as fast as the service reads them; return the number played so far."""
     for sent in lines:
         px4s[sent.px4].send(sent)
         played += bool(sent.payload)
@@ -161,10 +161,10 @@ def play(bus: nedbus.Bus, px4s: Sequence[Px4], lines: Iterable[Sent], played: in
 
 
 def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
-    """Wait until the service published or rejected `count` messages; it counts one after it was sent."""
+    """Wait until the service has published or rejected `count` messages; it counts each one after sending it."""
 
     def is_counted() -> bool:
-        now = status_of_source(bus)
+        now = source_status(bus)
         return now.published + now.rejected == count
 
     wait_for(is_counted, what=f"{count} messages")
@@ -187,13 +187,13 @@ def source() -> str:
 
 @pytest.fixture(params=["embedded", pytest.param("zenohd", marks=pytest.mark.slow)])
 def where(request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_path: Path, source: str) -> str:
-    """Start a service that receives from PX4s, as the router or as the client of a zenohd; return the endpoint."""
+    """Start a service that receives from PX4s, as the router or as a client of zenohd; return the endpoint."""
     endpoint = free_endpoint()
     if request.param == "embedded":
         service = run_nedbus("serve", "--listen", endpoint, "-s", source)
     else:
         file = tmp_path / "zenohd.json5"
-        # A zenohd drops what does not fit the queue of a link for 1 ms; here it is to be as slow as the machine.
+        # zenohd drops messages that wait for more than 1 ms; a slow machine needs longer.
         queue = "queue: { congestion_control: { drop: { wait_before_drop: 10000000 } } }"
         file.write_text(
             f'{{ listen: {{ endpoints: ["{endpoint}"] }}, scouting: {{ multicast: {{ enabled: false }} }},'
@@ -206,8 +206,8 @@ def where(request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_p
 
 
 @pytest.mark.slow
-def test_flight_arrives_as_it_was_logged(where: str) -> None:
-    """26,514 messages of a flight, four streams, GPS lost and back: all arrive, to the bit those of PX4's own log."""
+def test_positions_of_flight_equal_log(where: str) -> None:
+    """All 26,514 messages of a flight with a GPS outage arrive, and equal those of PX4's own log bit by bit."""
     logged = log_rows()
     equal: Counter[str] = Counter()
     total = 0
@@ -232,7 +232,7 @@ def test_flight_arrives_as_it_was_logged(where: str) -> None:
                 window.setdefault(sent.address, []).append(sent.cdr)
                 total += 1
         wait_until_counted(bus, total)
-        now = status_of_source(bus)
+        now = source_status(bus)
         assert (now.published, now.rejected, now.lost, now.reboots) == (total, 0, 0, 0)
         assert (total, every.counts.lost) == (26_514, 0)
     assert equal == {
@@ -265,7 +265,7 @@ def read_log(path: Path) -> dict[tuple[str, int, int], dict[str, object]]:
 
 
 def is_equal(value: object, logged: object) -> bool:
-    """Return whether a value is the log's, to the bit: -0.0 is not 0.0, NaN is NaN, and 1 may stand for true."""
+    """Return whether a value equals the logged one bit by bit: -0.0 is not 0.0, NaN is NaN, and 1 means true."""
     if isinstance(value, tuple) and isinstance(logged, tuple):
         return len(value) == len(logged) and all(map(is_equal, value, logged))
     return repr(value) == repr(logged) if isinstance(value, float) else value == logged
@@ -273,11 +273,11 @@ def is_equal(value: object, logged: object) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", [f"px4-zenoh:?msg={MSG}"])
-def test_every_message_arrives_as_it_was_logged(where: str) -> None:
-    """69,605 messages of 21 topics: all are published and read, and 46,457 are in the log, equal in all fields.
+def test_all_topics_of_flight_equal_log(where: str) -> None:
+    """All 69,605 messages of 21 topics are published and read; the 46,457 that are in the log equal it in all fields.
 
-    11 that PX4 counted are not in the recording. The five types without a file here are given, one of which has others
-    within it. A reader learns what they are when their first messages arrive, and lacks none.
+    11 that PX4 counted are missing in the recording. The five types that nedbus does not define are supplied, one of
+    them with nested messages. A reader gets the definitions with the first messages, and loses none.
     """
     logged = read_log(TWELVE.with_suffix(".ulg"))
     equal: Counter[bool] = Counter()
@@ -292,7 +292,7 @@ def test_every_message_arrives_as_it_was_logged(where: str) -> None:
                 fields = sample.message.__dict__
                 before, last[sample.address] = last.get(sample.address), repr(fields)
                 if before == repr(fields) and not get_topic(sample.topic).rate:
-                    continue  # what has no rate is brought back on a machine that held up the service for 3 s
+                    continue  # topics without a rate are published again if the service is held up for 3 s
                 received += 1
                 row = logged.get((sample.topic, sample.address.instance or 0, fields["timestamp"]))
                 if row is not None:
@@ -305,8 +305,8 @@ def test_every_message_arrives_as_it_was_logged(where: str) -> None:
             if total % WINDOW == 0:
                 read_all()
         read_all()
-        wait_for(lambda: status_of_source(bus).published >= total, what="the last one to be counted")
-        now = status_of_source(bus)
+        wait_for(lambda: source_status(bus).published >= total, what="the last one to be counted")
+        now = source_status(bus)
         assert (total, now.rejected, now.lost, now.reboots) == (69_605, 0, 11, 0)
         assert (now.not_carried, now.silent) == ((), ())
         assert every.counts == nedbus.Counts(received=every.counts.received)
@@ -314,11 +314,11 @@ def test_every_message_arrives_as_it_was_logged(where: str) -> None:
 
 
 @pytest.mark.slow
-def test_topics_that_a_px4_loses_are_named(where: str) -> None:
-    """PX4's default pub.csv: what comes no more, and what never came, is silent, and the doctor names the cure.
+def test_topics_lost_by_default_pubcsv_are_reported_silent(where: str) -> None:
+    """With PX4's default pub.csv, topics that stop or never arrive are silent, and the doctor suggests the remedy.
 
-    In its recording all topics that are reliable end after 3.4 s, and from then on the others come, for 4.3 s: here at
-    half that speed.
+    In the recording all reliable topics stop after 3.4 s, and only the others continue, for 4.3 s; it is played at half
+    that speed.
     """
     ended = [
         "battery_status/0",
@@ -338,13 +338,13 @@ def test_topics_that_a_px4_loses_are_named(where: str) -> None:
             px4.send(sent)
             last = sent
         with repeating(lambda: px4.send(last)):
-            wait_for(lambda: set(status_of_source(bus).silent) == silent, what="silent topics")
+            wait_for(lambda: set(source_status(bus).silent) == silent, what="silent topics")
             with changing_timings() as timings:
                 timings.listen = 0.1
                 findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__)
-            uncarried = status_of_source(bus).not_carried
-    assert list(uncarried) == sorted(uncarried)
-    assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(uncarried)
+            unsupported = source_status(bus).not_carried
+    assert list(unsupported) == sorted(unsupported)
+    assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(unsupported)
     [loss] = [each for each in findings if "silent while other topics arrive" in each.seen]
     assert (loss.state, "rel=" in loss.advice) == ("warning", True)
     [other] = [each for each in findings if "SensorCombined" in each.seen]
@@ -352,16 +352,16 @@ def test_topics_that_a_px4_loses_are_named(where: str) -> None:
 
 
 @pytest.mark.slow
-def test_two_that_are_alike_are_not_mixed(where: str) -> None:
-    """Two PX4s with equal keys and gids: the first is published until the second appears, then neither, and it says so.
+def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
+    """Of two PX4s with equal keys and gids the first is published until the second appears, then both are rejected.
 
-    A key with which the second one only announces itself is closed too. Nothing counts as lost or as a reboot.
+    A key that the second one only announces is rejected, too. Nothing counts as lost or as a reboot.
     """
     lines = list(read_recording(ALIKE))
     second = next(number for number, sent in enumerate(lines) if sent.px4 == 1)
     its_first = next(number for number, sent in enumerate(lines) if sent.px4 == 1 and sent.payload)
-    # Two sessions have no order between them: what the first one sent meanwhile may well have come later.
-    meanwhile = lines[second : its_first + 1]
+    # There is no order between two sessions: messages of the first one may have arrived later.
+    overlapping = lines[second : its_first + 1]
     alone = [sent for sent in lines[:second] if sent.payload]
     played = 0
     with (
@@ -371,20 +371,20 @@ def test_two_that_are_alike_are_not_mixed(where: str) -> None:
         Px4(where) as other,
     ):
         later = [sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"]
-        of_both = ([sent for sent in meanwhile if bool(sent.px4) == is_second] for is_second in (True, False))
+        of_both = ([sent for sent in overlapping if bool(sent.px4) == is_second] for is_second in (True, False))
         for part in (lines[:second], *of_both, later):
             played = play(bus, (first, other), part, played)
         received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
         assert sorted(received) == sorted(sent.cdr for sent in alone)
-        now = status_of_source(bus)
+        now = source_status(bus)
         assert (now.published, now.rejected) == (len(alone), played - len(alone))
         assert (now.lost, now.reboots, every.counts.lost) == (0, 0, 0)
         assert len(now.warnings) == 4
         assert all("with the same gid" in warning for warning in now.warnings)
 
 
-def test_restart_is_one_reboot(where: str) -> None:
-    """A PX4 that is shut down and started again is one reboot, however many topics it has, and nothing is lost."""
+def test_restarted_px4_counts_as_one_reboot(where: str) -> None:
+    """A PX4 that is restarted counts as one reboot, however many topics it has, and nothing is lost."""
     lines = list(islice(read_recording(FLIGHT), 1100))
     messages = [sent for sent in lines if sent.payload]
     assert len({sent.address for sent in messages}) == 4
@@ -392,7 +392,7 @@ def test_restart_is_one_reboot(where: str) -> None:
         for played in (0, len(messages)):
             with Px4(where) as px4:
                 play(bus, [px4], lines, played)
-        now = status_of_source(bus)
+        now = source_status(bus)
         assert (now.published, now.rejected, now.lost, now.reboots) == (2 * len(messages), 0, 0, 1)
 
 
@@ -418,9 +418,9 @@ def is_position(datagram: bytes) -> bool:
 
 
 def count_late_flags(name: str, rate: float) -> int:
-    """Return how many positions of a flight have a flag that the log has not, if a status comes at this rate.
+    """Return how many positions of a flight have a flag other than the logged one, with statuses at this rate.
 
-    The positions are those that a real PX4 sent, the flags of a status those of its log at that time.
+    The positions are those sent by a real PX4; a status has the flags logged at its time.
     """
     logged = {}
     for message in open_replay(f"ulog:{PX4 / name}.ulg").messages:
@@ -444,27 +444,27 @@ def count_late_flags(name: str, rate: float) -> int:
                 then = truth(1e6 * turn / rate)
                 bits = 2 * then.v_xy_valid | 4 * then.v_z_valid | 24 * then.xy_valid | 32 * then.z_valid
                 vehicle.handle(dialect.MAVLink_estimator_status_message(0, bits, *[0.0] * 6, 1.0, 1.0), now)
-            said = vehicle.handle(position, now)
-            assert isinstance(said, SourceMessage)
-            fields = said.fields
+            converted = vehicle.handle(position, now)
+            assert isinstance(converted, SourceMessage)
+            fields = converted.fields
             late += any(fields.get(flag, False) != getattr(truth(1000 * position.time_boot_ms), flag) for flag in FLAGS)
     return late
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
-def test_flags_are_hardly_late_at_the_rate_that_is_requested(name: str) -> None:
-    """Over a link of 57,600 baud a third, at most, of the positions have late flags that had with two a second."""
-    often, seldom = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
-    assert 0 < 3 * often <= seldom
+def test_requested_status_rate_reduces_late_flags(name: str) -> None:
+    """At 57,600 baud, at most a third as many positions have late flags as with two statuses per second."""
+    requested, slow = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
+    assert 0 < 3 * requested <= slow
 
 
 @pytest.mark.slow
-def test_mavlink_says_what_was_logged(port: int) -> None:
-    """Position and velocity equal the log's to the bit, and so do the flags, but for what is younger than their source.
+def test_converted_positions_equal_log(port: int) -> None:
+    """Position and velocity equal the log bit by bit, and so do the flags, except changes since the last status.
 
-    ESTIMATOR_STATUS comes once a second, so that a flag is up to a second late: here at the first status (after
-    1.15 s), and when GPS is used (3.15 s), lost (28.15 s) and back (30.15 s).
+    ESTIMATOR_STATUS arrives once a second, so a flag is up to a second late: here at the first status (after 1.15 s),
+    and when GPS is used (3.15 s), lost (28.15 s) and back (30.15 s).
     """
     names = ("timestamp", "x", "y", "z", "vx", "vy", "vz")
     logged = {}
@@ -485,7 +485,7 @@ def test_mavlink_says_what_was_logged(port: int) -> None:
             fields = upgrade(received.fields).__dict__
             row = logged.get(fields["timestamp"])
             if row is None:
-                continue  # the very last one, after the log was closed
+                continue  # the last one, sent after the log was closed
             compared += 1
             assert [fields[name] for name in names] == [row[name] for name in names]
             for flag in FLAGS:

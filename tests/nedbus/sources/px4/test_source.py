@@ -1,4 +1,4 @@
-"""PX4's Zenoh module, rebuilt from what it sends, and everything else that may be published on such keys."""
+"""A simulated Zenoh module of PX4, and other publishers on such keys."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from tests.flights.local_position import (
 from tests.flights.messages import VLP, message
 from tests.nedbus.bridges.test_ros2 import Peer, flight, peer, plain_session
 from tests.peers.command_line import run_command
-from tests.peers.listening import Listener, status_of_source
+from tests.peers.live_source import Listener, source_status
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Process, Start
-from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 __all__ = ["peer"]  # a fixture
 
@@ -49,7 +49,7 @@ def is_read(publisher: zenoh.Publisher) -> bool:
 
 
 class Px4:
-    """The Zenoh module of one PX4: it publishes as zenoh-pico does, one sequence for each topic, trailing garbage."""
+    """Zenoh module of a PX4: publishes like zenoh-pico, with a sequence per topic and trailing garbage."""
 
     def __init__(self, session: Session, *, domain: int = 0, namespace: str = "", layout: str = "1.16") -> None:
         self._session = session
@@ -65,7 +65,7 @@ class Px4:
     def put(
         self, each: VehicleLocalPosition | int, *, topic: str = VLP, attachment: bytes | None = None, skip: int = 0
     ) -> None:
-        """Send a message, or one of this time, as PX4 does: it counts from 1, from boot in us, with the board's gid."""
+        """Send a message, or one with this timestamp; the default attachment is like that of PX4."""
         sent = message(each) if isinstance(each, int) else each
         fields = downgrade(sent, self._layout)
         self._sequences[topic] = self._sequences.get(topic, 0) + 1 + skip
@@ -76,7 +76,7 @@ class Px4:
     def raw(self, payload: bytes, *, topic: str = VLP, attachment: bytes | None = None) -> None:
         """Send any payload."""
         if topic not in self._publishers:
-            # PX4 lets Zenoh drop what cannot be sent at once; this test sends faster than any PX4, and counts.
+            # PX4's messages are droppable; a test sends faster than any PX4, and counts.
             publisher = self._session.declare_publisher(
                 self.key(topic), congestion_control=zenoh.CongestionControl.BLOCK, express=True
             )
@@ -122,12 +122,12 @@ def times(messages: Iterable[SourceMessage]) -> list[object]:
     return [each.fields["timestamp"] for each in messages]
 
 
-def test_message_of_a_px4_reaches_readers(
-    serve: Callable[[], Process], raw: Session, every: nedbus.Subscription
+def test_message_of_px4_reaches_readers(
+    serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription
 ) -> None:
-    """A service publishes it under the vehicle's name, with the fields that its release does not have as missing."""
+    """A service publishes the message under the vehicle's name; `sample.missing` has the fields its release lacks."""
     serve()
-    px4 = Px4(raw, layout="1.14")
+    px4 = Px4(zenoh_session, layout="1.14")
     sent = message(1, x=0.1, xy_valid=True, y=-1.0, hagl_max_z=5.0)
     px4.put(sent)
     sample, expected = every.receive(DEADLINE), upgrade(downgrade(sent, "1.14"))
@@ -136,10 +136,10 @@ def test_message_of_a_px4_reaches_readers(
     assert sample.missing == frozenset(LAYOUTS["1.16"].fields) - expected.model_fields_set
 
 
-def test_every_layout_is_read_by_its_hash(listener: Listener, raw: Session) -> None:
-    """Messages of any release are received with exactly the fields that this release has."""
+def test_layout_is_selected_by_type_hash(listener: Listener, zenoh_session: Session) -> None:
+    """Messages of any release are received with exactly the fields of this release."""
     for domain, layout in enumerate(LAYOUTS):
-        px4 = Px4(raw, layout=layout, domain=domain)
+        px4 = Px4(zenoh_session, layout=layout, domain=domain)
         sent = [message(each, x=0.1 * each, xy_valid=True, y=-1.0, hagl_max_z=5.0) for each in range(1, 11)]
         for each in sent:
             px4.put(each)
@@ -149,9 +149,9 @@ def test_every_layout_is_read_by_its_hash(listener: Listener, raw: Session) -> N
         assert received == [(upgrade(downgrade(each, layout)), 0) for each in sent]
 
 
-def test_topics_and_instances(listener: Listener, raw: Session) -> None:
-    """All four topics, instances as users name them, and the names of versioned topics."""
-    px4 = Px4(raw)
+def test_topic_names_map_to_addresses(listener: Listener, zenoh_session: Session) -> None:
+    """All four topics, instances as users name them, and versioned topics have their addresses."""
+    px4 = Px4(zenoh_session)
     names = {
         "vehicle_local_position_v1": "1/vehicle_local_position",
         "vehicle_local_position_groundtruth": "1/vehicle_local_position_groundtruth",
@@ -174,14 +174,16 @@ def test_topics_and_instances(listener: Listener, raw: Session) -> None:
         ("?domain=5", ["1", "px4_1"]),
     ],
 )
-def test_vehicles_are_distinguished(listen: Listen, raw: Session, options: str, expected: list[str]) -> None:
-    """In SITL all have one gid: domain and namespace distinguish and options name them; one domain ignores others."""
+def test_vehicles_are_named_by_domain_and_namespace(
+    listen: Listen, zenoh_session: Session, options: str, expected: list[str]
+) -> None:
+    """All vehicles in SITL have one gid; `vehicles=` renames them, and `domain=` ignores other domains."""
     listener = listen(options)
     places = ((0, ""), (5, ""), (5, "px4_1"), (0, "px4_2"), (3, "swarm/px4_3"))
-    heard = [place for place in places if options != "?domain=5" or place[0] == 5]
-    fleet = [Px4(raw, domain=domain, namespace=namespace) for domain, namespace in heard]
-    for domain, namespace in set(places) - set(heard):
-        raw.put(Px4(raw, domain=domain, namespace=namespace).key(), payload_of(2))
+    expected_places = [place for place in places if options != "?domain=5" or place[0] == 5]
+    fleet = [Px4(zenoh_session, domain=domain, namespace=namespace) for domain, namespace in expected_places]
+    for domain, namespace in set(places) - set(expected_places):
+        zenoh_session.put(Px4(zenoh_session, domain=domain, namespace=namespace).key(), payload_of(2))
     for timestamp in range(1, 21):
         for px4 in fleet:
             px4.put(timestamp)
@@ -191,29 +193,31 @@ def test_vehicles_are_distinguished(listen: Listen, raw: Session, options: str, 
     assert not listener.rejections
 
 
-def test_loss_and_reboot_are_counted(listener: Listener, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
+def test_loss_and_reboot_are_counted(
+    listener: Listener, zenoh_session: Session, caplog: pytest.LogCaptureFixture
+) -> None:
     """Losses before the service are counted by PX4's sequence; a sequence that goes back is a reboot."""
     caplog.set_level("WARNING")
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.put(1)
     px4.put(2, skip=3)
     px4.reboot()
     px4.put(3)
     px4.put(4, skip=1)
-    px4.raw(payload_of(5))  # any Zenoh client: it has no attachment
+    px4.raw(payload_of(5))  # like any Zenoh client, without an attachment
     received = [(each.fields["timestamp"], each.lost, each.rebooted) for each in listener.receive(5)]
     assert received == [(1, 0, False), (2, 3, False), (3, 0, True), (4, 1, False), (5, 0, False)]
     assert not listener.rejections
     assert caplog.text.count("the vehicle rebooted") == 1
 
 
-def test_type_hash_not_supported(listen: Listen, raw: Session) -> None:
-    """A build without hashes is rejected with a hint, and received once the layout is configured."""
-    px4 = Px4(raw, layout="1.14")
+def test_key_without_type_hash_needs_layout(listen: Listen, zenoh_session: Session) -> None:
+    """A build without type hashes is rejected with a hint, and received once the layout is configured."""
+    px4 = Px4(zenoh_session, layout="1.14")
     px4.type_hash = NO_HASH
     first, second = listen(), listen("?layout=1.14")
     px4.put(1)
-    first.turn_until(lambda: first.rejections, what="the rejection")
+    first.step_until(lambda: first.rejections, what="the rejection")
     assert "choose a layout, as in px4-zenoh:?layout=1.14" in first.rejections[0].reason
     assert times(second.receive()) == [1]
 
@@ -221,46 +225,46 @@ def test_type_hash_not_supported(listen: Listen, raw: Session) -> None:
 WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuint8 COUNT = 2\n"
 
 
-def test_message_without_a_file_is_read_by_its_definition(
-    run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus, tmp_path: Path
+def test_user_definition_adds_a_message(
+    run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
-    """With msg= it is carried, range-checked as it is annotated, and readable without that file; else it is listed."""
+    """With msg= the message is published, range-checked, and readable without the file; without, it is listed."""
     (tmp_path / "WheelEncoders.msg").write_text(WHEELS)
     definition = define_msg("WheelEncoders", WHEELS)
     name = ros2_type(definition)
     key = f"0/fmu/out/wheel_encoders/{dds_type(name)}/{hash_of(definition.current, name)}"
     service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
-    wait_for_reader(raw, key)
-    token = raw.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
-    raw.put(key, b"")
-    wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the list")
-    assert status_of_source(bus).rejected == 0
+    wait_for_matching(zenoh_session, key)
+    token = zenoh_session.liveliness().declare_token(TopicKey.parse(key).token("MP", "px4", "px4", 1))
+    zenoh_session.put(key, b"")
+    wait_for(lambda: source_status(bus).not_carried == ("WheelEncoders",), what="the unsupported message")
+    assert source_status(bus).rejected == 0
     assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
     token.undeclare()
-    wait_for(lambda: status_of_source(bus).not_carried == (), what="the list to be empty")
+    wait_for(lambda: source_status(bus).not_carried == (), what="no unsupported message")
     service.kill()
     run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:?msg={tmp_path}")
-    wait_for_reader(raw, key)
+    wait_for_matching(zenoh_session, key)
 
     def put(speed: float) -> None:
         fields = {"timestamp": 1, "wheel_speed": (speed, 2.0)}
-        raw.put(key, encode_with(definition, fields, definition.current) + bytes(8))
+        zenoh_session.put(key, encode_with(definition, fields, definition.current) + bytes(8))
 
     with bus.subscribe("wheel_encoders") as wheels, repeating(lambda: put(1.5)):
         assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
     put(501.0)
-    wait_for(lambda: status_of_source(bus).rejected == 1, what="the message out of range")
+    wait_for(lambda: source_status(bus).rejected == 1, what="the message out of range")
 
 
-def test_newer_layout_is_read_by_its_definition(
-    listen: Listen, raw: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_user_definition_decodes_newer_layout(
+    listen: Listen, zenoh_session: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A 54th field is named once; without msg= the rejection says what to do, and another definition is named too."""
+    """An unknown field is logged once; without msg=, or with a wrong file, the rejection names the remedy."""
     caplog.set_level("WARNING")
     text = message_definition("1.16") + "bool altitude_good_for_lock\n"
     (tmp_path / "VehicleLocalPosition.msg").write_text(text)
     newer = define_msg("VehicleLocalPosition", text)
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.type_hash = hash_of(newer.current, ROS2_TYPE)
     without, given, other = listen(), listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"), listen(f"?msg={tmp_path}")
     fields = {**downgrade(message(1, x=0.5), "1.16"), "altitude_good_for_lock": True}
@@ -268,35 +272,35 @@ def test_newer_layout_is_read_by_its_definition(
         px4.raw(encode_with(newer, fields, newer.current))
     assert [upgrade(each.fields).x for each in given.receive(2)] == [0.5, 0.5]
     assert caplog.text.count("altitude_good_for_lock") == 1
-    without.turn_until(lambda: without.rejections, what="the rejection")
+    without.step_until(lambda: without.rejections, what="the rejection")
     for word in ("VehicleLocalPosition", px4.type_hash, "px4-zenoh:?msg=VehicleLocalPosition.msg"):
         assert word in without.rejections[0].reason
     own, px4.type_hash = px4.type_hash, "RIHS01_" + 64 * "0"
     px4.raw(b"", topic=f"{VLP}_groundtruth")
-    other.turn_until(lambda: other.rejections, what="the rejection")
+    other.step_until(lambda: other.rejections, what="the rejection")
     assert own in other.rejections[0].reason
     assert px4.type_hash in other.rejections[0].reason
 
 
-def test_topics_that_are_chosen(listen: Listen, raw: Session) -> None:
-    """Others are ignored without a word; a topic that is named and whose message is unknown is rejected with a hint."""
+def test_only_selected_topics_are_received(listen: Listen, zenoh_session: Session) -> None:
+    """Others are ignored silently; a selected topic whose message is unknown is rejected with a hint."""
     listener = listen("?topics=vehicle_local_position,wheel_encoders")
-    px4 = Px4(raw)
+    px4 = Px4(zenoh_session)
     px4.put(1, topic="estimator_local_position")
-    raw.put(f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b"")
-    raw.put(f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b"")
+    zenoh_session.put(f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b"")
+    zenoh_session.put(f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b"")
     px4.put(2)
     assert [str(each.address) for each in listener.receive()] == [f"1/{VLP}"]
     assert [each.count for each in listener.rejections] == [1]
     assert "px4-zenoh:?msg=WheelEncoders.msg" in listener.rejections[0].reason
-    assert listener.absence.not_carried == ()
+    assert listener.unavailable.unsupported == ()
 
 
-def test_message_of_another_type_is_rejected(listener: Listener, raw: Session) -> None:
-    """A position on the topic of attitudes is not taken for an attitude."""
-    px4 = Px4(raw)
+def test_message_of_another_type_is_rejected(listener: Listener, zenoh_session: Session) -> None:
+    """A position on the topic of attitudes is not decoded as an attitude."""
+    px4 = Px4(zenoh_session)
     px4.put(1, topic="vehicle_attitude")
-    listener.turn_until(lambda: listener.rejections, what="the rejection")
+    listener.step_until(lambda: listener.rejections, what="the rejection")
     assert "vehicle_attitude has messages of type VehicleAttitude" in listener.rejections[0].reason
 
 
@@ -310,8 +314,8 @@ def test_message_of_another_type_is_rejected(listener: Listener, raw: Session) -
         ("float32 x\n", "line 1, column 1", "timestamp"),
     ],
 )
-def test_definition_that_is_none_is_refused(tmp_path: Path, text: str, where: str, reason: str) -> None:
-    """The error names file, line and column; in a folder such a file is left out, and one that is missing is said."""
+def test_invalid_msg_file_raises(tmp_path: Path, text: str, where: str, reason: str) -> None:
+    """The error has file, line and column; in a folder such a file is skipped; a missing file raises."""
     file = tmp_path / "EscStatus.msg"
     file.write_text(text)
     with pytest.raises(ConfigError, match=rf"{file}: {where}: .*{reason}"):
@@ -320,40 +324,40 @@ def test_definition_that_is_none_is_refused(tmp_path: Path, text: str, where: st
     with pytest.raises(ConfigError, match=r"other\.msg: No such file"):
         parse_source(f"px4-zenoh:?msg={tmp_path},{tmp_path}/other.msg").open_source(vehicle="1")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ConfigError, match=r"empty: there is no \.msg file in this folder"):
+    with pytest.raises(ConfigError, match=r"empty: no \.msg file in this folder"):
         parse_source(f"px4-zenoh:?msg={tmp_path}/empty").open_source(vehicle="1")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
-def test_definition_in_any_encoding_is_read(tmp_path: Path, encoding: str) -> None:
-    """A byte order mark, and a degree sign of an old editor, also in the file of a nested message."""
+def test_msg_file_encoding_is_detected(tmp_path: Path, encoding: str) -> None:
+    """A byte order mark or Latin-1 is accepted, also in the file of a nested message."""
     (tmp_path / "Esc.msg").write_text("float32 rpm # 10 °\n", encoding=encoding)
     (tmp_path / "EscStatus.msg").write_text("uint64 timestamp # °\nEsc[2] esc\n", encoding=encoding)
     parse_source(f"px4-zenoh:?msg={tmp_path}/EscStatus.msg").open_source(vehicle="1")
 
 
-def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:
-    """Wrong hashes, lengths, attachments and random payloads: counted, and each key named, which the log does once."""
-    good = Px4(raw)
+def test_invalid_input_is_rejected_and_counted(listener: Listener, zenoh_session: Session) -> None:
+    """Wrong hashes, lengths, attachments and random payloads are counted; each key is reported for the log."""
+    good = Px4(zenoh_session)
     good.put(1)
-    unknown = Px4(raw, domain=1)
+    unknown = Px4(zenoh_session, domain=1)
     unknown.type_hash = "RIHS01_" + 64 * "0"
     for timestamp in range(10):
         unknown.put(timestamp)
-    short = Px4(raw, domain=2)
+    short = Px4(zenoh_session, domain=2)
     for payload in (b"\x00\x01\x00\x00" + bytes(100), b"", bytes(100_000)):
         short.raw(payload)
-    wrong = Px4(raw, domain=3)
+    wrong = Px4(zenoh_session, domain=3)
     for attachment in (b"x", bytes(33), bytes(34), bytes(Attachment(2**62, 0, GID))[:-1], 16 * b"\xff" + b"\x10" + GID):
         wrong.put(1, attachment=attachment)
-    noise, rng = Px4(raw, domain=4), random.Random(0)
+    noise, rng = Px4(zenoh_session, domain=4), random.Random(0)
     for each in range(2000):
         noise.raw(rng.randbytes(220) if each % 2 else b"\x00\x01\x00\x00" + rng.randbytes(rng.randrange(240)))
-    other = Px4(raw, domain=5)
+    other = Px4(zenoh_session, domain=5)
     other.raw(payload_of(1), topic="somebody/pose")
     for start in (f"0/{'x' * 200}", "ä"):
-        raw.put(f"{start}/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-    listener.turn_until(lambda: listener.rejected >= 18 + 2000 + 3, what="all rejections")
+        zenoh_session.put(f"{start}/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
+    listener.step_until(lambda: listener.rejected >= 18 + 2000 + 3, what="all rejections")
     good.put(2)
     assert times(listener.receive(2)) == [1, 2]
     assert (listener.rejected, listener.messages) == (18 + 2000 + 3, [])
@@ -361,13 +365,13 @@ def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:
     assert any("update nedbus" in each.reason for each in listener.rejections)
 
 
-def test_invalid_messages_are_reported(
-    serve: Callable[[], Process], raw: Session, every: nedbus.Subscription[Any]
+def test_invalid_values_are_reported(
+    serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription[Any]
 ) -> None:
-    """A payload that is CDR but violates the rules is reported with its reason, as from any source."""
+    """A payload that is valid CDR but violates a rule is reported with its reason, as from any source."""
     serve()
-    reports = raw.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
-    px4 = Px4(raw)
+    reports = zenoh_session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
+    px4 = Px4(zenoh_session)
     px4.raw(payload_of(1, xy_valid=True))
     px4.raw(payload_of(1, eph=-1.0) + b"too long")
     assert "must be finite while xy_valid is true" in reports.handler.recv().payload.to_string()
@@ -376,49 +380,51 @@ def test_invalid_messages_are_reported(
     assert every.receive(DEADLINE).message.timestamp == 2
 
 
-def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, raw: Session) -> None:
-    """Two ROS 2 nodes on one topic have different gids: the first one is received; the first number is 0."""
-    px4 = Px4(raw)
+def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, zenoh_session: Session) -> None:
+    """Two ROS 2 nodes on one topic have different gids: the first one is received; its sequence starts at 0."""
+    px4 = Px4(zenoh_session)
     for sequence in range(10):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
         px4.put(100 + sequence, attachment=bytes(Attachment(sequence, 0, GID[::-1])))
-    listener.turn_until(lambda: len(listener.messages) + listener.rejected == 20, what="all")
+    listener.step_until(lambda: len(listener.messages) + listener.rejected == 20, what="all messages")
     assert times(listener.receive(10)) == list(range(10))
 
 
-def test_hostile_keys_leave_the_status_readable(serve: Callable[[], Process], raw: Session, bus: nedbus.Bus) -> None:
-    """Long keys and long reasons do not make the status too long to be received."""
+def test_long_keys_do_not_break_the_status(
+    serve: Callable[[], Process], zenoh_session: Session, bus: nedbus.Bus
+) -> None:
+    """Long keys and reasons do not make the status too large to be received."""
     serve()
-    Px4(raw).put(1)
+    Px4(zenoh_session).put(1)
     for number in range(100):
-        raw.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-        raw.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-    wait_for(lambda: status_of_source(bus).rejected == 200, what="the status")
+        zenoh_session.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
+        zenoh_session.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
+    wait_for(lambda: source_status(bus).rejected == 200, what="the status")
 
 
-def test_what_waits_to_be_decoded_is_small(listener: Listener, raw: Session) -> None:
-    """Messages that are too long for ROS 2, and large payloads, do not wait; they are counted."""
+def test_oversized_samples_are_not_queued(listener: Listener, zenoh_session: Session) -> None:
+    """Keys that are too long for ROS 2, and large payloads, are not queued, but counted."""
     name = dds_type(ROS2_TYPE)
-    wait_for_reader(raw, f"0/a/{name}/hash")
+    wait_for_matching(zenoh_session, f"0/a/{name}/hash")
     for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):
-        raw.put(f"0/{topic}/{name}/hash", payload)
-    listener.turn_until(lambda: listener.rejected == 4, what="all rejections")
-    listener.turn()
+        zenoh_session.put(f"0/{topic}/{name}/hash", payload)
+    listener.step_until(lambda: listener.rejected == 4, what="all rejections")
+    listener.step()
     counts = Counter(each.where for each in listener.rejections for _ in range(each.count))
     assert counts == {"size": 2, f"0/a/{name}/hash": 1, f"0/last/{name}/hash": 1}
 
 
-def test_source_that_has_ended_receives_nothing(raw: Session, endpoint: str) -> None:
-    """A service lends it the session of its router: at its end it leaves no subscriber there."""
-    probe = raw.declare_publisher(Px4(raw).key())
+def test_ended_source_undeclares_its_subscriber(zenoh_session: Session, endpoint: str) -> None:
+    """A source borrows the service's session, and leaves no subscriber in it."""
+    probe = zenoh_session.declare_publisher(Px4(zenoh_session).key())
     with plain_session(endpoint) as lent:
         with Listener("px4-zenoh:", router=lent):
             wait_for(lambda: is_read(probe), what="the subscriber")
-        wait_for(lambda: not is_read(probe), what="the subscriber to go")
+        wait_for(lambda: not is_read(probe), what="the subscriber to be undeclared")
 
 
-def test_vehicle_connects_to_the_service(run_nedbus: Start) -> None:
-    """The source of a service that is a router itself listens on the router's own session, named or not."""
+def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
+    """If the service is the router, its source uses the router's session, with or without an explicit endpoint."""
     own = free_endpoint()
     service = run_nedbus("serve", "--listen", own, "-s", "px4-zenoh:", "-s", f"px4-zenoh:{own}?domain=3")
     wait_for(lambda: service.err.count("listening") == 2, what="both sources")
@@ -430,8 +436,8 @@ def test_vehicle_connects_to_the_service(run_nedbus: Start) -> None:
         assert len(json.loads(reply.ok.payload.to_bytes())["sessions"]) == 2
 
 
-def test_service_connects_to_its_own_router(run_nedbus: Start, tmp_path: Path) -> None:
-    """Vehicles are received at the service's router: one by file, or one that connects to another that is down."""
+def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: Path) -> None:
+    """The service's router may have a configuration file, or also connect to a router that is down."""
     own, down = free_endpoint(), free_endpoint()
     file = tmp_path / "router.json5"
     listen = f'listen: {{endpoints: ["{own}"]}}'
@@ -444,43 +450,43 @@ def test_service_connects_to_its_own_router(run_nedbus: Start, tmp_path: Path) -
         service.kill()
 
 
-def test_router_that_is_down_is_retried(run_nedbus: Start) -> None:
-    """A vehicle's router that does not answer is an error in the status, and retried; other sources go on."""
+def test_unreachable_router_is_retried(run_nedbus: Start) -> None:
+    """A router that does not answer is an error in the status, and retried; other sources continue."""
     endpoint, other = free_endpoint(), free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", f"px4-zenoh:{other}", "-s", "sim:")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(vehicle="7") as subscription:
-        wait_for(lambda: "no Zenoh router answers there" in service.err, what="the first try")
+        wait_for(lambda: "no Zenoh router answers:" in service.err, what="the first attempt")
         run_nedbus("router", "--listen", other)
         with plain_session(other) as vehicle:
             Px4(vehicle, namespace="7").put(1)
             assert subscription.receive(DEADLINE).message.timestamp == 1
 
 
-@pytest.mark.slow  # PX4's 3 s; nedbus/daemon/test_worker.py has them without waiting
+@pytest.mark.slow  # waits 3 s; nedbus/daemon/test_worker.py uses a fake clock
 def test_stale_vehicle_is_not_listed(
-    serve: Callable[[], Process], raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
+    serve: Callable[[], Process], zenoh_session: Session, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
     """A vehicle that sends nothing for 3 s is stale in the status and not listed; others are not affected."""
     service = serve()
-    px4, other = Px4(raw), Px4(raw, domain=1)
+    px4, other = Px4(zenoh_session), Px4(zenoh_session, domain=1)
     px4.put(1)
     every.receive(DEADLINE)
 
     def is_stale() -> bool:
         other.put(time.monotonic_ns())
-        return status_of_source(bus).stale == (f"1/{VLP}",)
+        return source_status(bus).stale == (f"1/{VLP}",)
 
-    assert status_of_source(bus).state == "running"
+    assert source_status(bus).state == "running"
     wait_for(is_stale, what="the status to be stale")
     assert list(bus.vehicles()) == ["domain1"]
     assert "is stale: no message for 3 s" in service.err
     px4.put(2)
-    wait_for(lambda: status_of_source(bus).stale == (), what="the vehicle to be back")
+    wait_for(lambda: source_status(bus).stale == (), what="the vehicle to return")
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
 
 
-def test_ros_2_publisher_that_restarts_is_received_at_once(listener: Listener, peer: Peer) -> None:
-    """A node of zenoh-ros2-sdk that is killed and started again has a new gid: no rejection, and one reboot."""
+def test_restarted_ros_2_publisher_is_received_at_once(listener: Listener, peer: Peer) -> None:
+    """A node of zenoh-ros2-sdk that is killed and restarted has a new gid: no rejection, and one reboot."""
     messages = flight()
     received: list[SourceMessage] = []
     for _ in range(2):
@@ -492,20 +498,20 @@ def test_ros_2_publisher_that_restarts_is_received_at_once(listener: Listener, p
     assert (sum(each.lost for each in received), listener.rejections) == (0, [])
 
 
-def test_ros_2_lists_the_source_as_a_subscriber(listener: Listener, peer: Peer, raw: Session) -> None:
-    """`ros2 topic info -v` shows it for as long as somebody publishes, as zenoh-ros2-sdk reads the tokens."""
+def test_ros_2_lists_source_as_subscriber(listener: Listener, peer: Peer, zenoh_session: Session) -> None:
+    """The tokens that `ros2 topic info -v` reads name the source as a subscriber while there is a publisher."""
 
     def subscriptions() -> list[dict[str, object]]:
-        tokens = raw.liveliness().get("@ros2_lv/4/*/*/*/MS/**")
+        tokens = zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/MS/**")
         return [_parse_liveliness_keyexpr(str(reply.ok.key_expr)) or {} for reply in tokens if reply.ok]
 
     node = peer("talk", "1.14", topic=f"/drone/{VLP}", rows=[], domain_id=4)
-    listener.turn_until(subscriptions, what="the subscription")
+    listener.step_until(subscriptions, what="the subscription")
     [found] = subscriptions()
     assert str(found["node_name"]).startswith("nedbus_px4_zenoh_")
     topic = (found["qualified_name"], found["dds_type"], found["type_hash"])
     assert topic == (f"/drone/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
-    nodes = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
+    nodes = [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
     assert any(name.endswith(f"/{found['node_name']}") for name in nodes)
     node.kill()
-    listener.turn_until(lambda: not subscriptions(), what="the subscription to be withdrawn")
+    listener.step_until(lambda: not subscriptions(), what="the subscription to be withdrawn")

@@ -1,4 +1,4 @@
-"""Whose a message of rmw_zenoh is, and what was lost before it, at times that the test gives; keys and attachments."""
+"""Ownership of addresses and loss counting for messages of rmw_zenoh, with a fake clock; keys and attachments."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ GID = bytes(range(16))
 @pytest.mark.parametrize(
     "key", ["", "0", "0/a/b", "x/fmu/out/a/b/c", "0//a/b/c", "0/*/a/b", f"{10**12}/a/b/c", "-1/a/b/c", "0/a/b/"]
 )
-def test_other_keys_are_rejected(key: str) -> None:
-    """A key that rmw_zenoh would not write raises DecodeError."""
+def test_invalid_key_raises(key: str) -> None:
+    """A key that rmw_zenoh would not use raises DecodeError."""
     with pytest.raises(DecodeError):
         TopicKey.parse(key)
 
 
 def test_key_and_attachment_round_trip() -> None:
-    """Parsing returns what was written."""
+    """Parsing a serialised key or attachment returns the original."""
     key = TopicKey(3, "px4_1/fmu/out/vehicle_local_position", dds_type(ROS2_TYPE), type_hash("V0"))
     assert TopicKey.parse(str(key)) == key
     for attachment in (Attachment(7, 123456789, GID), Attachment(0, 0, GID)):
@@ -33,7 +33,7 @@ def test_key_and_attachment_round_trip() -> None:
 
 
 def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16", way: str = "out") -> str:
-    """Return the key of vehicle_local_position, as PX4 writes it."""
+    """Return PX4's key of vehicle_local_position."""
     topic = f"{namespace and namespace + '/'}fmu/{way}/{VLP}"
     return str(TopicKey(domain, topic, dds_type(ROS2_TYPE), type_hash(layout)))
 
@@ -44,21 +44,21 @@ def streams() -> StreamRegistry:
     return StreamRegistry(Px4ZenohOptions.model_validate({}), vehicle="1")
 
 
-def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
-    """The first key owns an address until it is silent for 3 s; then another key may have it."""
-    first, second = streams.hear(key(), 100.0), streams.hear(key(layout="V0"), 100.0)
-    assert (streams.hear(key(), 100.0), str(second.address)) == (first, f"1/{VLP}")
+def test_address_is_released_after_3_s(streams: StreamRegistry) -> None:
+    """The first key owns an address until it is silent for 3 s; then another key may use it."""
+    first, second = streams.on_message(key(), 100.0), streams.on_message(key(layout="V0"), 100.0)
+    assert (streams.on_message(key(), 100.0), str(second.address)) == (first, f"1/{VLP}")
     streams.accept(first, None, 100.0)
-    with pytest.raises(NotAcceptedError, match="already: rename one of them with vehicles="):
+    with pytest.raises(NotAcceptedError, match="rename one of them with vehicles="):
         streams.accept(second, None, 102.9)
     streams.accept(second, None, 103.0)
     with pytest.raises(NotAcceptedError, match="already"):
         streams.accept(first, None, 104.0)
 
 
-def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
-    """The first publisher owns a key until it is silent for 3 s; the sequence of the next one starts anywhere."""
-    stream = streams.hear(key(), 100.0)
+def test_key_is_released_after_3_s(streams: StreamRegistry) -> None:
+    """The first publisher owns a key until it is silent for 3 s; the sequence of the next one may start anywhere."""
+    stream = streams.on_message(key(), 100.0)
     streams.accept(stream, Attachment(7, 0, GID), 100.0)
     other = Attachment(500, 0, GID[::-1])
     with pytest.raises(NotAcceptedError, match="two publishers share this key"):
@@ -69,16 +69,16 @@ def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
 @pytest.mark.parametrize(
     ("sequence", "lost", "rebooted"), [(11, 0, False), (15, 4, False), (10 + 1_000_001, 0, False), (1, 0, True)]
 )
-def test_gap_in_the_sequence_is_loss(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
-    """A gap is that many lost messages, unless it is absurdly large; a step back is a reboot."""
-    stream = streams.hear(key(), 100.0)
+def test_sequence_gap_counts_as_lost(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
+    """A gap is that many lost messages, unless it is implausibly large; a step back is a reboot."""
+    stream = streams.on_message(key(), 100.0)
     for each, expected in ((10, (0, False)), (sequence, (lost, rebooted)), (sequence + 1, (0, False))):
         assert streams.accept(stream, Attachment(each, 0, GID), 100.0) == expected
 
 
 def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry) -> None:
-    """One step back is a reboot; another one within 3 s is a second vehicle with the same gid."""
-    stream = streams.hear(key(), 100.0)
+    """One step back is a reboot; another one within 3 s means a second vehicle with the same gid."""
+    stream = streams.on_message(key(), 100.0)
     for sequence, now in ((10, 100.0), (1, 100.1), (20, 100.2)):
         streams.accept(stream, Attachment(sequence, 0, GID), now)
     with pytest.raises(NotAcceptedError, match="sequence numbers go back and forth"):
@@ -89,9 +89,9 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
 
 
 @pytest.mark.parametrize("namespace", ["", "px4_1"])
-def test_input_belongs_to_its_vehicle(streams: StreamRegistry, namespace: str) -> None:
-    """/fmu/in/... has the vehicle of /fmu/out/...; a companion that restarts is not a reboot of the vehicle."""
-    stream = streams.hear(key(namespace=namespace, way="in"), 100.0)
+def test_input_has_the_vehicle_of_its_namespace(streams: StreamRegistry, namespace: str) -> None:
+    """/fmu/in/... belongs to the vehicle of /fmu/out/...; a restart of its publisher is not a reboot of the vehicle."""
+    stream = streams.on_message(key(namespace=namespace, way="in"), 100.0)
     assert (str(stream.address), stream.is_input) == (f"{namespace or 1}/{VLP}", True)
     for sequence in (10, 1):
         assert streams.accept(stream, Attachment(sequence, 0, GID), 100.0) == (0, False)

@@ -1,4 +1,4 @@
-"""PX4's own words in logs: equal to pyulog and its decoder of events on real logs; hostile texts and metadata."""
+"""Log messages from logged strings and events: compared with pyulog on real logs, and with hostile input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pyulog import ULog
 from pyulog.px4_events import PX4Events
 
 import nedbus
-from nedbus.ulog import Texts, to_statement
+from nedbus.ulog import LogMessageBuilder, to_log_text
 from tests.flights.ulogs import LOGS, UlogWriter, log_messages_in
 
 REAL = [*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").rglob("*.ulg")]
@@ -58,7 +58,7 @@ FORMAT = b"event:uint64_t timestamp;uint32_t id;uint16_t event_sequence;uint8_t[
 
 
 class Log(UlogWriter):
-    """A log with PX4's texts and events."""
+    """A log with logged strings and events."""
 
     def __init__(self, metadata: bytes | Mapping[str, Any] = METADATA) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class Log(UlogWriter):
         self.sequence = 0
 
     def text(self, timestamp: int, text: bytes, level: int = 6) -> None:
-        """Add a logged text."""
+        """Add a logged string."""
         self.put("L", b"%d" % level + struct.pack("<Q", timestamp) + text)
 
     def event(
@@ -89,15 +89,15 @@ class Log(UlogWriter):
         """Add a vehicle_status."""
         self.put("D", struct.pack("<HQB", 2, 0, nav_state))
 
-    def said(self, texts: Texts | None = None) -> list[tuple[int, int, str]]:
-        """Return timestamp, severity and text of each message."""
+    def log_messages(self, texts: LogMessageBuilder | None = None) -> list[tuple[int, int, str]]:
+        """Return timestamp, severity and text of each log message."""
         return log_messages_in(bytes(self.data), texts)
 
 
 @pytest.mark.logs
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
-def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
-    """As pyulog has them: each text that is not sent as an event, and each event; all else are checks that failed."""
+def test_real_log_yields_each_string_and_event_once(path: Path) -> None:
+    """As pyulog decodes them, each event, and each string without an event, is one message; all others are checks."""
     log = ULog(str(path))
     logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
@@ -108,9 +108,9 @@ def test_every_text_and_event_of_a_real_log_is_said_once(path: Path) -> None:
         left.remove(one)
     unpaired = 0
     for each in logged:
-        statement = (each.timestamp, int(chr(each.log_level)), to_statement(each.message))
-        if statement in left:
-            left.remove(statement)
+        expected = (each.timestamp, int(chr(each.log_level)), to_log_text(each.message))
+        if expected in left:
+            left.remove(expected)
         else:
             assert has_metadata
             assert each.message.endswith("\t") or "Preflight" in each.message, each.message
@@ -129,33 +129,33 @@ CHECKS = {
 }  # fmt: skip
 
 
-def test_statement_in_two_forms_is_said_once() -> None:
-    """A text with a tab at its end is the event before it; one without is a statement of its own."""
+def test_string_that_duplicates_an_event_is_dropped() -> None:
+    """A logged string with a trailing tab duplicates the event before it; others are messages."""
     log = Log()
     log.event(5_000_000, 1, b"\2", twice=True)
     log.text(5_000_400, b"[commander] Armed by RC switch\t")
     log.text(5_000_500, b"[commander] \x1b[32mReady!\x1b[0m")
-    log.text(6_000_000, b"[commander] Armed by RC switch\t")  # no event: it is another statement
-    assert log.said() == [
+    log.text(6_000_000, b"[commander] Armed by RC switch\t")  # no event precedes it
+    assert log.log_messages() == [
         (5_000_000, 6, "Armed by RC switch"), (5_000_500, 6, "[commander] Ready!"),
         (6_000_000, 6, "[commander] Armed by RC switch"),
     ]  # fmt: skip
 
 
-def test_arguments_are_filled_in() -> None:
-    """Numbers with digits and unit, names of enumerations and bits, profiles, links and escapes."""
+def test_event_arguments_are_formatted() -> None:
+    """Numbers with digits and units, enums, bit fields, profiles, links and escapes follow libevents."""
     log = Log()
     log.event(1, 2, struct.pack("<fB", 2.25, 5))
     log.event(2, 2, struct.pack("<fB", float("nan"), 8))
     log.event(3, 1, b"\7")
     log.event(4, 99)
-    assert [text for *_, text in log.said()] == [
+    assert [text for *_, text in log.log_messages()] == [
         "At 2.2 m/s {one, fourb}", "At nan m/s {(unknown: 8)b}", "Armed by (unknown: 7)"
     ]  # fmt: skip
 
 
-def test_failed_check_is_said_when_it_is_new() -> None:
-    """PX4 reports all of them again with each change; one that does not concern the mode is information."""
+def test_failed_check_is_reported_once() -> None:
+    """PX4 repeats all failed checks in each report; one that does not affect the current mode has severity info."""
     log = Log()
     check = struct.pack("<IB", 1 << 14, 0)
     for time, mode in enumerate((4, 4, 14)):
@@ -168,7 +168,7 @@ def test_failed_check_is_said_when_it_is_new() -> None:
     log.event(3, 10, check, level=3)
     log.event(4, 3, struct.pack("<I", 393216), level=4)
     log.event(5, 3, struct.pack("<I", 1), level=4)
-    assert log.said() == [
+    assert log.log_messages() == [
         (0, 6, "No offboard signal"), (2, 3, "No offboard signal"), (4, 4, "Failsafe warning: No offboard signal"),
         (5, 4, "Failsafe warning:"),
     ]  # fmt: skip
@@ -197,53 +197,53 @@ def changed(change: Callable[[dict[str, Any]], object]) -> bytes:
     ],
     ids=map(str, range(15)),
 )  # fmt: skip
-def test_metadata_that_are_damaged_or_hostile_only_cost_the_events(metadata: bytes) -> None:
-    """Too large or deep, incomplete, of other types, with arguments beyond the 25 bytes: the texts remain."""
+def test_invalid_event_metadata_loses_only_events(metadata: bytes) -> None:
+    """Metadata that is too large or deep, incomplete or of wrong types disables events, but no logged strings."""
     log = Log(metadata)
     log.event(1, 1, b"\2")
     log.text(2, b"still here")
-    assert log.said() == [(2, 6, "still here")]
+    assert log.log_messages() == [(2, 6, "still here")]
 
 
-def test_second_metadata_are_ignored() -> None:
-    """Thousands of them in a log would cost a decompression each."""
+def test_only_first_event_metadata_is_used() -> None:
+    """Thousands of metadata messages in a log would each need a decompression."""
     log = Log()
     log.event(1, 1, b"\2")
     for piece in (b"", b"damaged", lzma.compress(b"{}")):
         key = f"uint8_t[{len(piece)}] metadata_events".encode()
         log.put("M", bytes([0, len(key)]) + key + piece)
         log.event(2, 1, b"\2")
-    assert [text for *_, text in log.said()] == ["Armed by RC switch"] * 4
+    assert [text for *_, text in log.log_messages()] == ["Armed by RC switch"] * 4
 
 
-def test_texts_are_one_printable_line_and_bounded_in_number() -> None:
-    """Controls, escapes of terminals and bidirectional marks go; 10,000 texts a second are counted, not published."""
+def test_log_messages_are_sanitised_and_rate_limited() -> None:
+    """Control characters, escape sequences and bidirectional marks are removed; of 10,000 texts a second 100 remain."""
     hostile = "a\nb\r\x1b[2Jc\x00\x07\x9b31m\u202ed\u2028e" + "\x1b]0;title\x07" + "µ" * 200
-    text = to_statement(hostile)
+    text = to_log_text(hostile)
     assert text.startswith("a b cd31m"[:5])
     assert text.isprintable()
     assert len(text.encode()) <= 127
     assert text.endswith("...")
-    log, texts = Log(), Texts()
+    log, texts = Log(), LogMessageBuilder()
     for number in range(10_000):
         log.text(50_000_000 + 100 * number, b"%d" % number)
     log.text(52_000_000, b"later")
-    assert len(said := log.said(texts)) == 101
-    assert said[-1] == (52_000_000, 6, "later")
+    assert len(log_messages := log.log_messages(texts)) == 101
+    assert log_messages[-1] == (52_000_000, 6, "later")
     assert texts.limit.omitted == 9_900
 
 
-def test_other_fields_under_px4s_names_are_ignored(tmp_path: Path) -> None:
-    """A topic `event` of another type costs nothing else; a logged log_message does not double the texts."""
+def test_topics_with_unexpected_fields_are_ignored(tmp_path: Path) -> None:
+    """A topic `event` with other fields is ignored, and a logged log_message does not duplicate the strings."""
     log = UlogWriter()
     log.put("F", b"event:float timestamp;")
     log.put("F", b"log_message:uint64_t timestamp;uint8_t severity;char[127] text;")
     for number, topic in enumerate((b"event", b"log_message")):
         log.put("A", struct.pack("<BH", 0, number) + topic)
     log.put("D", struct.pack("<Hf", 0, 1.0))
-    log.put("D", struct.pack("<HQB127s", 1, 5, 4, b"[ekf2] said\t"))
-    log.put("L", b"4" + struct.pack("<Q", 5) + b"[ekf2] said\t")
+    log.put("D", struct.pack("<HQB127s", 1, 5, 4, b"[ekf2] text\t"))
+    log.put("L", b"4" + struct.pack("<Q", 5) + b"[ekf2] text\t")
     messages = nedbus.read(log.write(tmp_path / "a.ulg"), "log_message")
-    assert messages.tolist() == [(5, 4, b"[ekf2] said")]
+    assert messages.tolist() == [(5, 4, b"[ekf2] text")]
     frame = nedbus.read(tmp_path / "a.ulg", "log_message", dataframe="pandas")
-    assert frame["text"].tolist() == ["[ekf2] said"]
+    assert frame["text"].tolist() == ["[ekf2] text"]

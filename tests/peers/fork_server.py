@@ -1,7 +1,7 @@
-"""Python processes within milliseconds: one that has imported nedbus forks for each that is asked for.
+"""A fork server: it has imported nedbus and forks one child per request, which saves half a second of imports each.
 
-What is forked is a process like any other, with an exit code, signals and streams of its own; what it saves is half a
-second of imports. No session is open here, so that Zenoh works in each. `tests/peers/processes.py` is the asking side.
+A child is an ordinary process with its own exit code, signals and streams. The server opens no Zenoh session, because
+Zenoh does not survive a fork. `tests/peers/processes.py` is the client.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from contextlib import suppress
 from typing import Any, Final
 
 _PRELOADED: Final = ("nedbus.cli.app", "numpy", "rich.console", "rich.live", "prometheus_client", "http.server")
-_SHOW: Final = signal.SIGRTMIN
-"""Makes a process write the stacks of all its threads to the terminal of pytest."""
+_DUMP_STACKS: Final = signal.SIGRTMIN
+"""Signal that makes a process write the stacks of all its threads to pytest's terminal."""
 _TERMINAL: Final = 100
-"""The descriptor of that terminal, above those that are closed."""
+"""File descriptor of that terminal, above the range that is closed."""
 
 
 def _watch(child: int, status: int) -> None:
-    """Say which process it is, and how it ended; show and end it when pytest is gone, as after a test's time limit."""
+    """Report the child's pid and exit code; if pytest exits first (test timeout), dump its stacks and kill it."""
     os.write(status, f"{child:10}".encode())
     ended = os.pidfd_open(child)
     poller = select.poll()
     poller.register(ended, select.POLLIN)
-    poller.register(status, 0)  # told of its end in any case
+    poller.register(status, 0)  # a hang-up is always reported
     if not any(descriptor == ended for descriptor, _ in poller.poll()):
-        os.kill(child, _SHOW)
+        os.kill(child, _DUMP_STACKS)
         poller.unregister(status)
-        poller.poll(1000)  # the stacks take a moment; what waited for pytest ends by itself
+        poller.poll(1000)  # time to write the stacks; a child that waited for pytest exits here
         os.kill(child, signal.SIGKILL)
     _, code = os.waitpid(child, 0)
     with suppress(BrokenPipeError):
@@ -45,9 +45,9 @@ def _watch(child: int, status: int) -> None:
 
 
 def _become(request: dict[str, Any], streams: list[int]) -> None:
-    """Take the place of a new process: its streams, directory, environment and arguments."""
+    """Set up the streams, working directory and environment of a new process."""
     os.dup2(2, _TERMINAL, inheritable=False)
-    faulthandler.register(_SHOW, file=_TERMINAL)
+    faulthandler.register(_DUMP_STACKS, file=_TERMINAL)
     for number, descriptor in enumerate(streams):
         os.dup2(descriptor, number)
     os.closerange(3, _TERMINAL)
@@ -60,21 +60,21 @@ def _become(request: dict[str, Any], streams: list[int]) -> None:
     sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115 - until the end
     faulthandler.enable(sys.stderr)
     if "COVERAGE_PROCESS_CONFIG" in os.environ:
-        import coverage  # noqa: PLC0415 - only where it is measured
+        import coverage  # noqa: PLC0415 - only if coverage is measured
 
         coverage.process_startup()
 
 
-def _serve(asked: socket.socket) -> dict[str, Any] | None:
-    """Fork for each request; return it in the child, and None in the end where all were asked for."""
+def _serve(requests: socket.socket) -> dict[str, Any] | None:
+    """Fork for each request; return it in the child, and None in the server at the end."""
     while True:
-        message, descriptors, *_ = socket.recv_fds(asked, 2**20, 4)
+        message, descriptors, *_ = socket.recv_fds(requests, 2**20, 4)
         if not message:
             return None
         *streams, status = descriptors
         if os.fork() == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            asked.close()
+            requests.close()
             child = os.fork()
             if child:
                 _watch(child, status)
@@ -105,10 +105,10 @@ if __name__ == "__main__":
     for _name in _PRELOADED:
         importlib.import_module(_name)
     gc.collect()
-    gc.freeze()  # else each process would copy all of these pages, to look for garbage as it ends
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # what ends here is waited for by nobody
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for pytest, which ends this by closing the socket
-    _asked = _serve(socket.socket(fileno=int(sys.argv[1])))
-    if _asked is not None:
+    gc.freeze()  # otherwise the final garbage collection of each child would copy all of these pages
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # reap children automatically
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for pytest, which stops the server by closing the socket
+    _request = _serve(socket.socket(fileno=int(sys.argv[1])))
+    if _request is not None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        _run(_asked)
+        _run(_request)

@@ -1,7 +1,7 @@
-"""PX4's own words in a log, its texts and its events, as messages of `log_message`: each statement once.
+"""PX4's logged strings and events as `log_message` messages, without duplicates.
 
-The metadata of events, which a log contains, make a sentence of an event's number and arguments.
-Their format: https://github.com/mavlink/libevents. Everything in them may be hostile.
+The event metadata in a log is untrusted; its format: https://github.com/mavlink/libevents. It turns the id and the
+arguments of an event into a sentence.
 """
 
 import json
@@ -19,29 +19,29 @@ from nedbus_msgs import field_type
 from .layout import BASIC_TYPES, PayloadField, PayloadLayout
 from .records import Data, Information, LoggedText, Record, Subscription
 
-_FORM: Final = struct.Struct("<QB127s")
+_STRUCT: Final = struct.Struct("<QB127s")
 _FIELDS: Final = (("timestamp", "uint64", 0), ("severity", "uint8", 8), ("text", "char[127]", 9))
-_LAYOUT: Final = PayloadLayout(tuple(PayloadField(a, field_type(b), c) for a, b, c in _FIELDS), _FORM.size, 0)
-SPOKEN: Final = Subscription(-1, 0, "log_message", _LAYOUT)
-"""The subscription of the messages that `Texts` makes."""
+_LAYOUT: Final = PayloadLayout(tuple(PayloadField(a, field_type(b), c) for a, b, c in _FIELDS), _STRUCT.size, 0)
+LOG_MESSAGE: Final = Subscription(-1, 0, "log_message", _LAYOUT)
+"""Subscription of the messages that `LogMessageBuilder` generates."""
 
-_READ: Final = ("", "event", "vehicle_status")
+_TOPICS: Final = ("", "event", "vehicle_status")
 _INFO: Final = 6
-_PROTOCOL: Final = 8  # log level from which an event is not for people
+_PROTOCOL: Final = 8  # log level; from here on, events are for ground stations, not for display
 _ALL_MODES: Final = 2**32 - 1
-_WINDOW: Final = 50_000  # us between two forms of a statement; 4 ms were seen
-_MAX_A_SECOND: Final = 100  # statements; PX4 makes 20 when it boots
+_WINDOW: Final = 50_000  # us between an event and its logged string; 4 ms were seen
+_MAX_A_SECOND: Final = 100  # messages; PX4 logs 20 at boot
 _MAX_BYTES: Final = 127
-_MAX_CHARACTERS: Final = 1000  # that are looked at, colours included
+_MAX_CHARACTERS: Final = 1000  # read, including colour codes
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
 _MAX_PACKED: Final = 2**18  # bytes; PX4's have 17,000
 _MAX_UNPACKED: Final = 2**21  # bytes; PX4's have 170,000
-_MAX_MEMORY: Final = 2**27  # bytes for the dictionary of xz
-_MAX_PARTS: Final = 64  # components, groups of events or modes, and modes of a group; PX4 has 30
-_MAX_TEXT: Final = 200  # characters of a template, and of one argument; PX4's longest template has 120
+_MAX_MEMORY: Final = 2**27  # bytes for the xz dictionary
+_MAX_PARTS: Final = 64  # components, event groups, mode groups, and modes per group; PX4 has 30
+_MAX_TEXT: Final = 200  # characters of a template, or of an argument; PX4's longest template has 120
 _CHECKS: Final = ("arming_check", "health")
-_MARK = re.compile(
+_MARKUP = re.compile(
     r"\\(?P<escaped>.)"
     r'|<(?P<tag>[a-z]+)(?: [a-z]+="(?P<value>[^"]*)")?>(?P<content>.*?)</(?P=tag)>'
     r"|\{(?P<number>\d{1,2})(?::(?:\.(?P<digits>\d))?)?(?P<unit>m_v|m/s|m\^2|m|C)?\}",
@@ -50,8 +50,8 @@ _MARK = re.compile(
 _DAMAGED: Final = (LookupError, TypeError, ValueError, AttributeError, RecursionError, struct.error, lzma.LZMAError)
 
 
-def to_statement(text: str) -> str:
-    """Return a text as one line of printable characters, in at most 127 bytes of UTF-8."""
+def to_log_text(text: str) -> str:
+    """Return a text as one printable line of at most 127 bytes in UTF-8."""
     short = _COLOUR.sub("", text[:_MAX_CHARACTERS])
     plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
     data = plain.encode()
@@ -59,10 +59,10 @@ def to_statement(text: str) -> str:
 
 
 class _Event(NamedTuple):
-    """An event as a sentence.
+    """A decoded event.
 
-    `modes`: navigation states for which a check fails, as bits; None for any other event.
-    `lists_checks_of`: the navigation states whose failed checks belong behind the text, as bits.
+    `modes`: bit mask of the navigation states for which a check fails; None for other events.
+    `lists_checks_of`: bit mask of the navigation states whose failed checks are appended to the text.
     """
 
     group: str
@@ -72,7 +72,7 @@ class _Event(NamedTuple):
 
 
 class _EventMetadata:
-    """The events of one firmware; raises ValueError for metadata that are damaged, or larger than any of PX4's."""
+    """Event definitions of one firmware; raises ValueError for damaged or oversized metadata."""
 
     def __init__(self, packed: bytes) -> None:
         try:
@@ -83,12 +83,12 @@ class _EventMetadata:
             self._components: Mapping[str, Any] = json.loads(unpacked)["components"]
             parts = [self._components, *(each["event_groups"] for each in self._components.values())]
             if max(map(len, parts)) > _MAX_PARTS:
-                raise ValueError(f"more than {_MAX_PARTS} components, or groups of events")
+                raise ValueError(f"more than {_MAX_PARTS} components or event groups")
         except _DAMAGED as exc:
-            raise ValueError(f"the metadata of events cannot be read: {str(exc) or type(exc).__name__}") from exc
+            raise ValueError(f"the event metadata cannot be read: {str(exc) or type(exc).__name__}") from exc
 
     def decode(self, number: int, arguments: bytes) -> _Event | None:
-        """Return the event with this id; None if it is unknown, or does not fit its arguments."""
+        """Return the event with this id; None if the id is unknown, or the arguments do not match."""
         try:
             component, key = self._components[str(number >> 24)], str(number & 0xFFFFFF)
             group = next(name for name, each in component["event_groups"].items() if key in each["events"])
@@ -106,7 +106,7 @@ class _EventMetadata:
             return None
 
     def _read(self, types: Sequence[str], namespace: str, data: bytes) -> tuple[list[Any], list[Any]]:
-        """Return the arguments as numbers, and as they are shown."""
+        """Return the arguments as numbers, and formatted for display."""
         values: list[Any] = []
         shown: list[Any] = []
         offset = 0
@@ -122,7 +122,7 @@ class _EventMetadata:
 
 
 def _describe(enum: Mapping[str, Any], value: int) -> str:
-    """Return the names of a value of an enumeration, or of its bits."""
+    """Return the name of an enum value, or of each bit set."""
     bits = [1 << bit for bit in range(64) if value >> bit & 1] if enum.get("is_bitfield") else [value]
     entries = enum["entries"]
     names = (entries[str(each)]["description"] if str(each) in entries else f"(unknown: {value})" for each in bits)
@@ -130,11 +130,11 @@ def _describe(enum: Mapping[str, Any], value: int) -> str:
 
 
 def _fill(template: str, values: Sequence[Any]) -> str:
-    """Return a text with its arguments, without marks."""
+    """Fill the arguments into a template, and remove its markup."""
 
     def replaced(found: re.Match[str]) -> str:
         if found["escaped"] or found["tag"]:
-            shows = {"profile": found["value"] == "dev", "a": True, "param": True}  # other profiles are of end users
+            shows = {"profile": found["value"] == "dev", "a": True, "param": True}  # other profiles are for end users
             return found["escaped"] or (_fill(found["content"], values) if shows.get(found["tag"]) else "")
         if not 0 < int(found["number"]) <= len(values):
             return found[0]
@@ -142,17 +142,17 @@ def _fill(template: str, values: Sequence[Any]) -> str:
         text = f"{value:.{found['digits']}f}" if found["digits"] and not isinstance(value, str) else str(value)
         return f"{text} {found['unit'].removesuffix('_v')}" if found["unit"] else text
 
-    return _MARK.sub(replaced, template).strip()
+    return _MARKUP.sub(replaced, template).strip()
 
 
-class TextLimit:
-    """Admits 100 statements a second; `omitted`: those beyond."""
+class RateLimit:
+    """Limit of 100 messages per second; `omitted`: number of messages above it."""
 
     def __init__(self) -> None:
         self.omitted = self._begin = self._count = 0
 
     def admits(self, time: int) -> bool:
-        """Return whether a statement of this time [us] is one of the first in its second."""
+        """Return whether a message at this time [us] is below the limit."""
         if abs(time - self._begin) >= 1_000_000:
             self._begin, self._count = time, 0
         self._count += 1
@@ -160,45 +160,45 @@ class TextLimit:
         return self._count <= _MAX_A_SECOND
 
 
-class Texts:
-    """Adds the messages of `log_message` to the records of a log or a stream.
+class LogMessageBuilder:
+    """Adds `log_message` messages to the records of a log or a stream.
 
-    A text that ends with a tab is sent as an event, too, which is logged before it and says more: the event is kept.
-    Failed checks are reported again with each change of any: they are messages when they are new, and information as
-    long as they do not concern the vehicle's mode.
+    A logged string with a trailing tab duplicates an event, logged before it in more detail: only the event is kept.
+    PX4 reports all failed checks when one changes: only new ones become messages, with severity info if they do not
+    affect the current mode.
 
-    `problem`: why the metadata cannot be used; "" if they can.
+    `problem`: why the event metadata is unusable; "" if it is usable.
     """
 
     def __init__(self) -> None:
-        self.limit = TextLimit()
+        self.limit = RateLimit()
         self.problem = ""
         self._packed = b""
         self._metadata: _EventMetadata | None = None
-        self._said: deque[tuple[int, str]] = deque(maxlen=100)  # events without their text: time, words of a check
-        self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log a topic twice
-        self._failed: dict[str, tuple[int, int]] = {}  # level, and modes that they prevent, of the last report's
-        self._before: dict[str, tuple[int, int]] = {}
+        self._events: deque[tuple[int, str]] = deque(maxlen=100)  # unmatched events: time, words of a check
+        self._seen: deque[tuple[object, ...]] = deque(maxlen=100)  # PX4 may log an event twice
+        self._failed: dict[str, tuple[int, int]] = {}  # checks in the current report: level, blocked modes
+        self._earlier: dict[str, tuple[int, int]] = {}
         self._nav_state = -1
 
     def merge(self, records: Iterable[Record]) -> Iterator[Record]:
-        """Yield the records, and each message of `SPOKEN` behind the last record that it is made of."""
+        """Yield the records, and each log message after the last record that it is derived from."""
         for record in records:
             name = record.subscription.name if isinstance(record, Data) else ""
-            if name != SPOKEN.name:  # which PX4 may log besides the texts
+            if name != LOG_MESSAGE.name:  # PX4 may log the topic itself, too
                 yield record
-            if name not in _READ:
+            if name not in _TOPICS:
                 continue
-            with suppress(LookupError, TypeError, ValueError, struct.error):  # a topic of this name with other fields
-                if (found := self._read(record)) and self.limit.admits(found.timestamp):
-                    yield Data(SPOKEN, _FORM.pack(found.timestamp, found.level, to_statement(found.text).encode()))
+            with suppress(LookupError, TypeError, ValueError, struct.error):  # the topic may have other fields
+                if (text := self._read(record)) and self.limit.admits(text.timestamp):
+                    yield Data(LOG_MESSAGE, _STRUCT.pack(text.timestamp, text.level, to_log_text(text.text).encode()))
 
     def _read(self, record: Record) -> LoggedText | None:
-        """Return the statement that a record completes, None if there is none or it is a repetition."""
+        """Return the text that a record completes; None without one, or for a duplicate."""
         if isinstance(record, LoggedText):
-            return None if self._is_said(record) else record
+            return None if self._is_duplicate(record) else record
         if isinstance(record, Information) and record.key == "metadata_events" and isinstance(record.value, bytes):
-            if self._metadata is None and not self.problem:  # the first metadata hold
+            if self._metadata is None and not self.problem:  # the first metadata is used
                 self._packed = ((self._packed if record.continued else b"") + record.value)[:_MAX_PACKED]
         elif isinstance(record, Data) and record.subscription.name == "event":
             return self._read_event(record.subscription.layout.decode(record.payload))
@@ -212,15 +212,15 @@ class Texts:
             return None
         self._seen.append((timestamp, *key))
         is_check = event.group in _CHECKS
-        if level >= _PROTOCOL and event.group == "arming_check":  # the begin of a report
-            self._failed, self._before = {}, self._failed
+        if level >= _PROTOCOL and event.group == "arming_check":  # starts a new report
+            self._failed, self._earlier = {}, self._failed
         if level >= _PROTOCOL or not (is_check or event.group == "default"):
             return None
         text = event.text
         if is_check:
             modes = _ALL_MODES if event.modes is None else event.modes
-            concerns_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
-            shown, known = level if concerns_mode else max(level, _INFO), self._failed.get(text, self._before.get(text))
+            affects_mode = modes == _ALL_MODES or (self._nav_state >= 0 and modes >> self._nav_state & 1)
+            shown, known = level if affects_mode else max(level, _INFO), self._failed.get(text, self._earlier.get(text))
             if len(self._failed) < _MAX_A_SECOND:
                 self._failed[text] = shown, modes if level < _INFO else 0
             if known and known[0] <= shown:
@@ -228,7 +228,7 @@ class Texts:
             level = shown
         elif event.lists_checks_of and text.endswith(":"):
             text += " " + ", ".join(name for name, (_, modes) in self._failed.items() if modes & event.lists_checks_of)
-        self._said.append((timestamp, _first_words(text) if is_check else ""))
+        self._events.append((timestamp, _first_words(text) if is_check else ""))
         return LoggedText(level, timestamp, text)
 
     def _decode(self, number: int, arguments: bytes) -> _Event | None:
@@ -239,16 +239,16 @@ class Texts:
                 self.problem = str(exc)
         return self._metadata.decode(number, arguments) if self._metadata else None
 
-    def _is_said(self, record: LoggedText) -> bool:
-        """Return whether an event has just said the same; each event counts for one text."""
+    def _is_duplicate(self, record: LoggedText) -> bool:
+        """Return whether an event has already reported this text; each event matches one text."""
         words = {_first_words(record.text), "" if record.text.endswith("\t") else "-"}
-        for each in self._said:
+        for each in self._events:
             if abs(each[0] - record.timestamp) <= _WINDOW and each[1] in words:
-                self._said.remove(each)
+                self._events.remove(each)
                 return True
         return False
 
 
 def _first_words(text: str) -> str:
-    """Return the first two words, without the module and what PX4 puts before a failed check."""
+    """Return the first two words, without the module name and PX4's prefix of failed checks."""
     return " ".join(_PREFIX.sub("", text).casefold().split()[:2])

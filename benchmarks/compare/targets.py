@@ -1,4 +1,4 @@
-"""Bars of nedbus, each as a ratio of two forms in one run, and what was measured."""
+"""Performance targets of nedbus, as ratios of two forms in one run, and their evaluation."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .results import FULL, KHZ, TEN, Load, Results
 
 
 @dataclass(frozen=True)
-class Bar:
-    """`key` of `form`, as a share of that of `other`, at this load; at least `bound`, or at most."""
+class Target:
+    """Bound on the ratio of `form` to `other` for one figure at one load: `bound` at most, or `at_least`."""
 
     form: str
     other: str
@@ -23,12 +23,12 @@ class Bar:
 
     @property
     def text(self) -> str:
-        """Say what is measured."""
+        """Description of the target."""
         sign = ">=" if self.at_least else "<="
         return f"{self.load.name}: {KEYS[self.key]} of {self.form} {sign} {self.bound} x {self.other}"
 
     def concerns(self, flight: str) -> bool:
-        """Return whether the form sends this flight: no tuple says which fields are missing."""
+        """Return whether the form can send this flight: tuples cannot mark fields as missing."""
         return self.form != "rows" or flight in COMPLETE
 
 
@@ -45,27 +45,27 @@ PACED: Final = (
     ("batches", "rows", "receive_cpu", 1.0),
     ("batches", "rows", "p50", 1.3),
 )
-BARS: Final = (
-    Bar("models", "straightforward", "rate", FULL, 1.4, at_least=True),
-    Bar("rows", "straightforward", "rate", FULL, 2.5, at_least=True),
-    Bar("batches", "raw", "rate", FULL, 0.5, at_least=True),
-    *(Bar(form, other, key, load, bound) for load in (KHZ, TEN) for form, other, key, bound in PACED),
+TARGETS: Final = (
+    Target("models", "straightforward", "rate", FULL, 1.4, at_least=True),
+    Target("rows", "straightforward", "rate", FULL, 2.5, at_least=True),
+    Target("batches", "raw", "rate", FULL, 0.5, at_least=True),
+    *(Target(form, other, key, load, bound) for load in (KHZ, TEN) for form, other, key, bound in PACED),
 )
 
 
-def judge(results: Results) -> Iterator[dict[str, object]]:
-    """Yield each bar, what was measured of it with each flight, and whether it holds with all of them."""
-    for bar in BARS:
+def evaluate(results: Results) -> Iterator[dict[str, object]]:
+    """Yield each target with the ratio for each flight, and whether it is met with all flights."""
+    for target in TARGETS:
         measured = {
-            flight: results.ratio(flight, bar.load, bar.form, bar.other, bar.key)
-            for flight in results.flights(bar.load)
-            if results.has(flight, bar.load, bar.form, bar.other) and bar.concerns(flight)
+            flight: results.ratio(flight, target.load, target.form, target.other, target.key)
+            for flight in results.flights(target.load)
+            if results.has(flight, target.load, target.form, target.other) and target.concerns(flight)
         }
         if measured:
-            worst = min(measured.values()) if bar.at_least else max(measured.values())
-            holds = worst >= bar.bound if bar.at_least else worst <= bar.bound
+            worst = min(measured.values()) if target.at_least else max(measured.values())
+            holds = worst >= target.bound if target.at_least else worst <= target.bound
             rounded = {flight: round(ratio, 3) for flight, ratio in measured.items()}
-            yield {"bar": bar.text, "measured": rounded, "holds": holds}
+            yield {"bar": target.text, "measured": rounded, "holds": holds}
     kept = {
         f"{form}, {load}, {flight}": min(run["kept"] for run in runs)
         for (flight, load, form), runs in results.runs.items()
@@ -76,11 +76,11 @@ def judge(results: Results) -> Iterator[dict[str, object]]:
         yield {"bar": "nothing lost by any form of nedbus", "measured": missing or {"all": 1.0}, "holds": not missing}
 
 
-def print_bars(results: Results) -> None:
-    """Print each bar in a line."""
-    print("\nbars, as medians of the rounds' ratios:")
-    for bar in judge(results):
-        measured = bar["measured"]
+def print_targets(results: Results) -> None:
+    """Print one line per target."""
+    print("\ntargets, as medians of the rounds' ratios:")
+    for target in evaluate(results):
+        measured = target["measured"]
         assert isinstance(measured, dict)
         numbers = ", ".join(f"{value:.2f} ({flight})" for flight, value in measured.items())
-        print(f"{'holds ' if bar['holds'] else 'MISSED'} {bar['bar']}: {numbers}")
+        print(f"{'met   ' if target['holds'] else 'MISSED'} {target['bar']}: {numbers}")

@@ -1,4 +1,4 @@
-"""`nedbus` in a process of its own with other timings: shorter where a test would wait, longer on a busy machine."""
+"""`nedbus` in a subprocess with other timings: shorter to save time, or longer for a busy machine."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ main()
 """
 
 
-def start_hasty(start: Start, timings: Timings, *arguments: str, **environment: str) -> Process:
-    """Start `nedbus` with these arguments and timings."""
+def start_with_timings(start: Start, timings: Timings, *arguments: str, **environment: str) -> Process:
+    """Start `nedbus` with these timings and arguments."""
     return start("-c", _SCRIPT, repr(timings), *arguments, **environment)

@@ -1,4 +1,4 @@
-"""Detect the events of all vehicles in logs and recordings, by replaying them."""
+"""Event detection in logs and recordings, by replaying them."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from typing import Final, cast
 
 from nedbus import recording
 from nedbus.errors import InvalidMessageError, SourceError
-from nedbus.events import AIR_DATA, EKF_SELECTOR, Account, Times
+from nedbus.events import AIR_DATA, EKF_SELECTOR, EventLog, Times
 from nedbus_msgs import BY_TOPIC, TOPICS, codec_of, upgrade_fields
 
 from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
 from .source import ReplayRun, ReplaySource, SourceMessage
 
-KEPT_OF_FILE: Final = 100_000  # events; the oldest are discarded
-_AHEAD: Final = 1000  # messages read for the start of a file
+MAX_FILE_EVENTS: Final = 100_000  # events; the oldest are discarded
+_LOOKAHEAD: Final = 1000  # messages read to determine the start time of a file
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
 
 
 @dataclass(frozen=True, slots=True)
-class FileAccount:
-    """The events of whole files. Times are seconds since their first message; `end` is the time of the last one."""
+class FileEvents:
+    """Events of complete files; `end`: time of the last message. Times are seconds since the first message."""
 
-    account: Account
+    event_log: EventLog
     times: Times
     end: float
     warnings: tuple[str, ...]
 
 
 class _EventOptions(RecordedOptions):
-    """Options of a replay for its events: all known topics, and two without a file that events need."""
+    """Replay options for event detection: all known topics, and two that nedbus does not define."""
 
     @property
     def chosen_topics(self) -> Collection[str]:
@@ -47,9 +47,9 @@ class _EventOptions(RecordedOptions):
 
 
 class Flights:
-    """The messages of one file, or those of several files on one axis of UTC.
+    """The messages of one file, or of several files merged by UTC.
 
-    A vehicle that is in several files is named after its file in each. `ended`: the vehicles whose file has ended.
+    A vehicle that is in several files is named after the file in each. `ended`: vehicles whose file has ended.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
@@ -64,21 +64,21 @@ class Flights:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Damage, what was left out, and names given to vehicles so far."""
+        """Damage, omissions and renamed vehicles so far."""
         found = []
         for path, run, names in self._files:
             reason = "here, as several files have a vehicle"
-            renamed = [f"vehicle {own} is {name} {reason} {own}" for own, name in names.items() if own != name]
+            renamed = [f"vehicle {own} is named {name} {reason} {own}" for own, name in names.items() if own != name]
             found += [f"{path}: {text}" for text in (*renamed, *run.warnings)]
         return tuple(found)
 
     @cached_property
     def times(self) -> Times:
-        """The offsets of each vehicle's time to UTC, if its messages contain UTC."""
+        """The UTC offset of each vehicle whose messages contain UTC."""
         return Times(offsets={name: utc.offset_us / 1e6 for name, utc in self._utc.items()})
 
     @cached_property
-    def _utc(self) -> dict[str, recording.UtcOffset]:  # which would load NumPy
+    def _utc(self) -> dict[str, recording.UtcOffset]:  # lazy, since it loads NumPy
         names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
         found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
         return {name: utc for name, utc in found if utc is not None}
@@ -94,13 +94,13 @@ class Flights:
 
     def _start(self, path: Path, run: ReplayRun, names: Mapping[str, str]) -> float:
         """Return the Unix time of the start of a file [s]."""
-        ahead = list(islice(run.messages, _AHEAD))
+        ahead = list(islice(run.messages, _LOOKAHEAD))
         run.messages = chain(ahead, run.messages)
         known = ((self._utc.get(names[each.address.vehicle]), each) for each in ahead if not each.error)
         times = ((utc.unix_us(cast("int", each.fields["timestamp"])), each.due) for utc, each in known if utc)
         found = [float(unix) / 1e6 - due for unix, due in times]
         if not found:
-            raise SourceError(str(path), "no message gives UTC, the axis of several files: read it alone")
+            raise SourceError(str(path), "no message gives UTC, which merging several files requires: read it alone")
         return median(found)
 
     def _shift(self, run: ReplayRun, names: Mapping[str, str], offset: float) -> Iterator[SourceMessage]:
@@ -110,34 +110,34 @@ class Flights:
         self.ended.update(names.values())
 
 
-def read_account(*paths: Path) -> FileAccount:
-    """Return the events of files, as `Flights` reads them; raise its errors."""
-    flights, account, due = Flights(paths), Account(KEPT_OF_FILE), 0.0
-    for message, _, _ in follow(flights.messages(), account, ended=flights.ended):
+def read_file_events(*paths: Path) -> FileEvents:
+    """Detect the events in files; raises like `Flights`."""
+    flights, event_log, due = Flights(paths), EventLog(MAX_FILE_EVENTS), 0.0
+    for message, _, _ in follow(flights.messages(), event_log, ended=flights.ended):
         due = message.due
-    account.label_first_events()
-    return FileAccount(account, flights.times, due, flights.warnings)
+    event_log.label_first_events()
+    return FileEvents(event_log, flights.times, due, flights.warnings)
 
 
 def follow(
-    messages: Iterable[SourceMessage], account: Account, *, ended: Collection[str] = ()
+    messages: Iterable[SourceMessage], event_log: EventLog, *, ended: Collection[str] = ()
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
-    """Add the messages of a replay to an account; yield each with its rejection reason or its payload.
+    """Detect events in a replay; yield each message with its rejection reason or its payload.
 
-    `ended`: the vehicles that have no more messages, which are not silent.
+    `ended`: vehicles without further messages, which do not count as silent.
     """
     checked = due = 0.0
 
     def update(time: float) -> None:
-        mains = (account.vehicles[name].main for name in ended if name in account.vehicles)
-        account.update(time, {main: "ended" for main in mains if main})
+        mains = (event_log.vehicles[name].main for name in ended if name in event_log.vehicles)
+        event_log.update(time, {main: "ended" for main in mains if main})
 
     for message in messages:
         if message.dropout:
-            account.add_dropout(message.address.vehicle, message.dropout, due)
+            event_log.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
-        if due - checked >= _CHECK_INTERVAL and account.vehicles.keys() <= set(ended):
-            checked = due  # between two files
+        if due - checked >= _CHECK_INTERVAL and event_log.vehicles.keys() <= set(ended):
+            checked = due  # no vehicle is active between two files
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
             update(checked)
@@ -146,11 +146,11 @@ def follow(
             try:
                 fields = upgrade_fields(definition, message.fields)
                 payload = codec_of(definition).encode_fields(fields)
-                account.add(message.address, fields, due)
+                event_log.add(message.address, fields, due)
             except InvalidMessageError as exc:
                 reason = exc.reason
         if reason is not None:
-            account.reject(message.address, reason, due)
+            event_log.reject(message.address, reason, due)
         yield message, reason, payload
     update(due)
-    account.settle(due + _SETTLE_TIME)
+    event_log.settle(due + _SETTLE_TIME)

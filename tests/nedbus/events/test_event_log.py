@@ -1,4 +1,4 @@
-"""Events of an account, from hand-made messages."""
+"""Events of an event log, from synthetic messages."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from nedbus.events import (
     MAX_VEHICLES,
     RECENT,
     WINDOW,
-    Account,
     Event,
+    EventLog,
 )
-from nedbus.events.account import MAX_GONE
+from nedbus.events.event_log import MAX_GONE
 from nedbus.events.rules import FLAPPING_CHANGES, PAUSE
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
@@ -42,21 +42,21 @@ def brief(events: Iterable[Event]) -> list[tuple[str, str, str]]:
     return [(event.kind, event.change, event.severity) for event in events]
 
 
-def test_first_message_is_no_event() -> None:
-    """Conditions of the first message are states without an event, until they end."""
+def test_conditions_in_first_message_are_not_events() -> None:
+    """Conditions active in the first message are state without an event, until they end."""
     flight = Flight()
     assert flight.send(xy_valid=False, dead_reckoning=True) == []
     assert (flight.severity, flight.kinds) == ("bad", ["xy_invalid", "dead_reckoning"])
     ended = flight.wait(0.1).send()
     assert [(event.text, event.lasted) for event in ended] == [
-        ("xy valid for the first time", None), ("dead reckoning ends", None),
+        ("xy valid for the first time", None), ("dead reckoning ended", None),
     ]  # fmt: skip
     assert (flight.severity, flight.kinds) == ("info", [])
 
 
 @pytest.mark.parametrize("kind", ["xy", "z", "v_xy", "v_z"])
-def test_validity_begins_and_ends(flight: Flight, kind: str) -> None:
-    """A flag of the position is bad from the message that clears it to the message that sets it."""
+def test_invalid_flag_begins_and_ends_condition(flight: Flight, kind: str) -> None:
+    """A validity flag is a bad condition from the message that clears it to the message that sets it."""
     begun = flight.wait(0.1).send(**dict[str, Any]({f"{kind}_valid": False}))
     assert brief(begun) == [(f"{kind}_invalid", "begin", "bad")]
     ended = flight.wait(2.5).send()
@@ -68,42 +68,42 @@ def test_validity_begins_and_ends(flight: Flight, kind: str) -> None:
 
 
 def test_reboot_is_reported_once(flight: Flight) -> None:
-    """Several streams go back, soon or late; the state is reset, and earlier conditions end without an event."""
+    """When several streams step back in time, one reboot is reported, and conditions end without an event."""
     flight.status(ARMED, failsafe=True)
     flight.gps(satellites_used=12)
     flight.wait(0.1).send(xy_valid=False)
     flight.wait(0.1).gps(satellites_used=3)
     assert {"xy_invalid", "few_satellites", "failsafe"} <= set(flight.kinds)
     flight.booted = flight.now
-    told = flight.wait(1.0).send()
-    assert brief(told) == [("reboot", "once", "bad")]
-    assert told[0].text == "rebooted: time since boot 1.0 s, was 10.1 s"
+    reported = flight.wait(1.0).send()
+    assert brief(reported) == [("reboot", "once", "bad")]
+    assert reported[0].text == "reboot: time since boot is 1.0 s, was 10.1 s"
     assert flight.kinds == ["reboot"]
-    assert flight.wait(1.0).gps() == []  # neither a second reboot, nor the end of what that receiver had
+    assert flight.wait(1.0).gps() == []  # neither a second reboot nor the end of few_satellites
     flight.fly(20)
     assert flight.status(DISARMED) == []
-    assert [each.kind for each in flight.account.events].count("reboot") == 1
+    assert [each.kind for each in flight.event_log.events].count("reboot") == 1
 
 
-def test_stream_that_returns_long_after_a_reboot(flight: Flight) -> None:
-    """Streams that go back later belong to the same reboot, in any order, and the state is kept."""
+def test_stream_resuming_long_after_reboot_is_not_another_reboot(flight: Flight) -> None:
+    """Streams that step back later belong to the same reboot, in any order, and state is kept."""
     streams: list[Callable[[], list[Event]]] = [flight.send, flight.gps, lambda: flight.status(ARMED)]
     for first in range(3):
         flight.wait(1000.0)
         for send in streams:
             send()
-        flight.take()
+        flight.new_events()
         flight.booted = flight.now
-        told = []
+        reported = []
         for index in range(3):
             flight.wait(8.0)
-            told += streams[(first + index) % 3]()
-        assert [each.kind for each in told if each.kind not in ("silent", "gone")] == ["reboot"]
-        assert flight.account.vehicles["1"].armed is True
+            reported += streams[(first + index) % 3]()
+        assert [each.kind for each in reported if each.kind not in ("silent", "gone")] == ["reboot"]
+        assert flight.event_log.vehicles["1"].armed is True
 
 
-def test_late_message_from_before_a_reboot_is_no_reboot(flight: Flight) -> None:
-    """Streams are not ordered among each other: an old message that arrives late is no reboot."""
+def test_delayed_message_from_before_reboot_is_not_a_reboot(flight: Flight) -> None:
+    """Streams are not ordered relative to each other: a delayed message from before a reboot is not a reboot."""
     flight.gps()
     flight.booted, before = flight.now, flight.booted
     assert brief(flight.wait(0.1).send()) == [("reboot", "once", "bad")]
@@ -113,159 +113,159 @@ def test_late_message_from_before_a_reboot_is_no_reboot(flight: Flight) -> None:
     assert flight.wait(0.1).gps() == []
 
 
-def test_disorder_is_no_reboot(flight: Flight) -> None:
-    """A time that goes back by up to a second is a reordered message."""
+def test_reordered_message_is_not_a_reboot(flight: Flight) -> None:
+    """A step back in time of up to a second is a reordered message, not a reboot."""
     flight.wait(5.0).send()
     flight.booted += 1.0
     assert flight.send() == []
 
 
-def test_silence_is_reported_by_updates(flight: Flight) -> None:
-    """A vehicle is silent since its last position, gone with its publisher, and back with the next position."""
+def test_silence_is_reported_until_next_position(flight: Flight) -> None:
+    """A vehicle is silent since its last position, gone with its publisher, and recovers with the next position."""
     flight.fly(1)
     last = flight.now
-    assert flight.wait(2.0).look() == []
-    begun = flight.wait(2.0).look("stale")
+    assert flight.wait(2.0).update() == []
+    begun = flight.wait(2.0).update("stale")
     assert brief(begun) == [("silent", "begin", "bad")]
     assert begun[0].text == "silent: no vehicle_local_position for 4.0 s"
-    assert flight.look("stale") == []
-    assert brief(flight.wait(1.0).look("gone")) == [("gone", "begin", "bad")]
-    assert flight.account.state("1", flight.now).since == last
-    assert flight.look("stale") == []  # gone stays gone
+    assert flight.update("stale") == []
+    assert brief(flight.wait(1.0).update("gone")) == [("gone", "begin", "bad")]
+    assert flight.event_log.state("1", flight.now).since == last
+    assert flight.update("stale") == []  # gone stays gone
     back = flight.wait(1.0).send()
     assert brief(back) == [("gone", "end", "info")]
     assert back[0].lasted == pytest.approx(6.0)
     assert flight.severity == "info"
 
 
-def test_silence_of_unknown_streams(flight: Flight) -> None:
-    """Without stream states, a vehicle is silent after three seconds without a position; other topics do not count."""
-    assert flight.wait(2.9).look(None) == []
+def test_vehicle_without_stream_states_is_silent_after_3_s(flight: Flight) -> None:
+    """Without stream states, a vehicle is silent after 3 s without a position, even if other topics arrive."""
+    assert flight.wait(2.9).update(None) == []
     flight.gps()
-    assert brief(flight.wait(0.2).look(None)) == [("silent", "begin", "bad")]
+    assert brief(flight.wait(0.2).update(None)) == [("silent", "begin", "bad")]
 
 
-def test_loss_is_reported_once(flight: Flight) -> None:
-    """A burst of losses is one event, with their number, at the time of the first one."""
+def test_burst_of_losses_is_one_event(flight: Flight) -> None:
+    """A burst of losses is one event with their number, at the time of the first loss."""
     flight.wait(1.0).send(lost=2)
     first = flight.now
     flight.wait(1.0).gps()
     flight.wait(1.0).send("vehicle_gps_position", lost=3, **GOOD_GPS)
-    assert flight.look() == []
-    told = flight.wait(6.0).look()
-    assert [(event.text, event.severity, event.time) for event in told] == [
+    assert flight.update() == []
+    reported = flight.wait(6.0).update()
+    assert [(event.text, event.severity, event.time) for event in reported] == [
         ("5 messages lost (vehicle_gps_position, vehicle_local_position)", "watch", first)
     ]
-    assert flight.wait(6.0).look() == []
+    assert flight.wait(6.0).update() == []
 
 
-def test_continuous_loss_is_reported(flight: Flight) -> None:
-    """Continuous losses are reported every twenty seconds, so that the state stays watch."""
-    told = []
+def test_continuous_loss_is_reported_every_20_s(flight: Flight) -> None:
+    """Continuous losses are reported every 20 s, and the state stays watch."""
+    reported = []
     for second in range(100):
         flight.wait(1.0).send(lost=1)
-        told += flight.look()
+        reported += flight.update()
         assert second <= 21 or flight.severity == "watch"
-    assert [event.numbers["messages"] for event in told] == [22, 22, 22, 22]
+    assert [event.numbers["messages"] for event in reported] == [22, 22, 22, 22]
 
 
-def test_rejection_begins_and_ends(flight: Flight) -> None:
-    """The first rejected message begins the condition, with its reason; five seconds without one end it."""
+def test_rejections_are_one_condition(flight: Flight) -> None:
+    """The first rejected message begins the condition, with its reason; 5 s without a rejection end it."""
     begun = flight.reject("x is NaN")
     assert brief(begun) == [("rejected", "begin", "watch")]
     assert begun[0].text == "vehicle_local_position rejected: x is NaN"
     assert flight.wait(1.0).reject("y is NaN") == []
     last = flight.now
     assert flight.severity == "watch"
-    ended = flight.wait(6.0).look()
+    ended = flight.wait(6.0).update()
     assert [(event.kind, event.text, event.time) for event in ended] == [
         ("rejected", "rejections stopped (2 messages) after 1.0 s", last)
     ]
     assert flight.severity == "info"
 
 
-def test_link_down_excuses_vehicles(flight: Flight) -> None:
-    """Without a link no vehicle is silent, and that time does not count; the link is an event of all vehicles."""
+def test_vehicle_is_not_silent_while_link_is_down(flight: Flight) -> None:
+    """While the link is down no vehicle becomes silent; the link is an event of all vehicles."""
     flight.fly(1)
     flight.link = "no link to tcp/host:7447"
-    begun = flight.look()
+    begun = flight.update()
     assert [(event.vehicle, event.text) for event in begun] == [(ALL, "no link to tcp/host:7447")]
-    assert flight.wait(60.0).look("disconnected") == []
+    assert flight.wait(60.0).update("disconnected") == []
     flight.link = ""
-    ended = flight.wait(60.0).look("unknown")
+    ended = flight.wait(60.0).update("unknown")
     assert [(event.vehicle, event.kind, event.change, event.text) for event in ended] == [
-        (ALL, "link_down", "end", "link is back after 2 min")
+        (ALL, "link_down", "end", "link restored after 2 min")
     ]
     assert flight.wait(1.0).send() == []
     assert flight.severity == "info"
 
 
-def test_message_before_the_update_that_finds_the_link(flight: Flight) -> None:
-    """A message that arrives before the link is polled again does not make the vehicle silent."""
+def test_message_before_link_update_prevents_silence(flight: Flight) -> None:
+    """A message that arrives before the restored link is polled does not make the vehicle silent."""
     flight.fly(1)
     flight.link = "no link"
-    flight.look()
+    flight.update()
     assert flight.wait(60.0).send() == []
     flight.link = ""
-    assert [event.kind for event in flight.look()] == ["link_down"]
+    assert [event.kind for event in flight.update()] == ["link_down"]
 
 
-def test_vehicle_that_does_not_return_with_the_link(flight: Flight) -> None:
-    """A vehicle is silent three seconds after the link is back, with the link as evidence."""
+def test_vehicle_missing_after_link_is_restored_is_silent(flight: Flight) -> None:
+    """A vehicle that does not resume is silent 3 s after the link is restored, with the link as evidence."""
     flight.fly(1)
     flight.link = "no link"
-    flight.look()
+    flight.update()
     flight.link = ""
-    assert [event.kind for event in flight.wait(60.0).look("unknown")] == ["link_down"]
-    assert flight.wait(2.0).look("unknown") == []
-    told = flight.wait(1.5).look("stale")
-    assert brief(told) == [("silent", "begin", "bad")]
-    assert [each.text for each in told[0].evidence] == ["link is back after 60.0 s"]
+    assert [event.kind for event in flight.wait(60.0).update("unknown")] == ["link_down"]
+    assert flight.wait(2.0).update("unknown") == []
+    reported = flight.wait(1.5).update("stale")
+    assert brief(reported) == [("silent", "begin", "bad")]
+    assert [each.text for each in reported[0].evidence] == ["link restored after 60.0 s"]
 
 
-def test_link_that_flaps(flight: Flight) -> None:
-    """Of more than four changes of the link in ten seconds the last is reported; the state is always current."""
-    told = []
+def test_flapping_link_is_suppressed(flight: Flight) -> None:
+    """After four changes of the link in 10 s, only the last is reported, with the number of suppressed ones."""
+    reported = []
     for index in range(9):
         flight.link = "no link" if index % 2 == 0 else ""
-        told += flight.wait(0.5).look("unknown")
-    assert brief(told) == [("link_down", "begin", "bad"), ("link_down", "end", "info")] * 2
-    told = flight.wait(6.0).look("unknown")
-    assert [event.text for event in told] == ["no link, the last of 5 suppressed changes"]
+        reported += flight.wait(0.5).update("unknown")
+    assert brief(reported) == [("link_down", "begin", "bad"), ("link_down", "end", "info")] * 2
+    reported = flight.wait(6.0).update("unknown")
+    assert [event.text for event in reported] == ["no link, the last of 5 suppressed changes"]
     flight.link = ""
-    assert brief(flight.wait(10.0).look("unknown")) == [("link_down", "end", "info")]
+    assert brief(flight.wait(10.0).update("unknown")) == [("link_down", "end", "info")]
 
 
-def test_overload(flight: Flight) -> None:
-    """Dropped messages are reported once, with their number after five seconds without a drop."""
-    assert flight.look(dropped=0) == []
-    begun = flight.look(dropped=10)
+def test_overload_ends_after_5_s_without_drops(flight: Flight) -> None:
+    """Drops begin one overload; 5 s without a drop end it, with their number."""
+    assert flight.update(dropped=0) == []
+    begun = flight.update(dropped=10)
     assert [(event.vehicle, event.kind, event.change) for event in begun] == [(ALL, "overload", "begin")]
     flight.fly(2)
-    assert flight.look(dropped=25) == []
+    assert flight.update(dropped=25) == []
     flight.fly(4.9)
-    assert flight.look(dropped=25) == []
+    assert flight.update(dropped=25) == []
     flight.fly(0.2)
-    ended = flight.look(dropped=25)
+    ended = flight.update(dropped=25)
     assert [(event.change, event.numbers) for event in ended] == [("end", {"messages": 25})]
     assert ended[0].lasted == pytest.approx(2.0)
 
 
-def test_overload_is_evidence_of_loss(flight: Flight) -> None:
-    """A condition of all vehicles is evidence for one of them, however long ago it began."""
+def test_overload_is_evidence_for_loss(flight: Flight) -> None:
+    """An active condition of all vehicles is evidence for an event of one, however long ago it began."""
     for dropped in range(1, 31):
         flight.fly(1)
-        flight.look(dropped=dropped)
+        flight.update(dropped=dropped)
     flight.wait(0.1).send(lost=3)
     flight.fly(4.5)
-    flight.look(dropped=31)
+    flight.update(dropped=31)
     flight.fly(1)
-    (lost,) = flight.look(dropped=32)
+    (lost,) = flight.update(dropped=32)
     assert [each.kind for each in lost.evidence] == ["overload"]
 
 
-def test_battery_warnings(flight: Flight) -> None:
-    """Low is watch, critical is bad; the last warning holds until it is 0."""
+def test_battery_warning_is_a_condition(flight: Flight) -> None:
+    """A low battery is watch, a critical one bad; the last warning is active until it is 0."""
     assert flight.wait(1.0).battery(0) == []
     assert brief(flight.wait(1.0).battery(1)) == [("battery", "begin", "watch")]
     critical = flight.wait(1.0).battery(2)
@@ -277,8 +277,8 @@ def test_battery_warnings(flight: Flight) -> None:
     assert flight.severity == "info"
 
 
-def test_receiver(flight: Flight) -> None:
-    """Fix, satellites, jamming by indicator or state, and spoofing have hysteresis."""
+def test_gps_conditions_have_hysteresis(flight: Flight) -> None:
+    """Satellites, jamming and spoofing begin and end at different thresholds; unknown values are ignored."""
     assert flight.gps() == []
     assert brief(flight.gps(fix_type=4)) == [("gps_fix", "once", "info")]
     assert brief(flight.gps(fix_type=2)) == [("gps_fix_lost", "begin", "watch")]
@@ -300,15 +300,15 @@ def test_receiver(flight: Flight) -> None:
     assert brief(flight.gps(spoofing_state=1)) == [("spoofing", "end", "info")]
 
 
-def test_receiver_that_never_had_a_fix(flight: Flight) -> None:
-    """Without a fix from the start there is an info state without an event; the first fix is an event."""
+def test_missing_first_fix_is_info(flight: Flight) -> None:
+    """A missing fix in the first message is info without an event; the first fix is an event."""
     assert flight.gps(fix_type=0, satellites_used=0) == []
     assert flight.severity == "info"
     assert brief(flight.gps()) == [("gps_fix_lost", "end", "info"), ("few_satellites", "end", "info")]
 
 
-def test_estimator_flags(flight: Flight) -> None:
-    """Flags that change in the same way in one message are one event that names them; each one ends by itself."""
+def test_flags_changed_in_one_message_are_one_event(flight: Flight) -> None:
+    """Equal flag changes in one message are one event that names them; each flag ends separately."""
     names = ["reject_hor_pos", "reject_hor_vel", "fs_bad_hdg", "cs_baro_fault", "cs_gnss_pos", "cs_baro_hgt"]
 
     def send(**changed: Any) -> list[Event]:
@@ -328,37 +328,37 @@ def test_estimator_flags(flight: Flight) -> None:
     assert flight.severity == "info"
     assert brief(send(fs_bad_hdg=True, cs_baro_fault=True)) == [("estimator_fault", "begin", "watch")]
     assert brief(send(cs_gnss_pos=True, cs_baro_hgt=True))[0] == ("estimator_fault", "end", "info")
-    assert brief(send(cs_gnss_pos=True)) == [("not_fused", "begin", "info")]  # another height is fused
+    assert brief(send(cs_gnss_pos=True)) == [("not_fused", "begin", "info")]  # another height source is fused
     assert brief(send()) == [("not_fused", "begin", "watch")]
 
 
-def test_flight_without_fix_or_global_reference() -> None:
-    """A lack of the first message is no state on the ground; once the vehicle is armed it is one since that message."""
+def test_missing_fix_and_reference_are_conditions_once_armed() -> None:
+    """A fix and global reference missing since the first message are conditions since then, but only once armed."""
     flight, since = Flight(), 100.0
     assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
     assert flight.wait(1.0).status(DISARMED) == []
-    assert (flight.severity, flight.account.vehicles["1"].initial[1:]) == ("info", [])  # few satellites are information
+    assert (flight.severity, flight.event_log.vehicles["1"].initial[1:]) == ("info", [])  # initial[0]: few_satellites
     assert brief(flight.wait(1.0).status(ARMED)) == [("armed", "once", "info")]
-    assert flight.wait(PAUSE - 0.1).look() == []
+    assert flight.wait(PAUSE - 0.1).update() == []
     assert flight.kinds == []
-    assert flight.wait(0.2).look() == []
-    held = flight.account.state("1", flight.now).conditions
+    assert flight.wait(0.2).update() == []
+    held = flight.event_log.state("1", flight.now).conditions
     assert [(each.text, each.severity, each.since, each.initial) for each in held] == [
         ("no GPS fix, 0 satellites", "watch", since, True), ("xy has no global reference", "watch", since, True),
     ]  # fmt: skip
-    assert set(held) <= set(flight.account.vehicles["1"].initial)
+    assert set(held) <= set(flight.event_log.vehicles["1"].initial)
     assert brief(flight.gps(satellites_used=0)) == [("gps_fix_lost", "end", "info")]
     flight.wait(1.0).status(DISARMED)
     assert flight.severity == "info"
     flight.booted = flight.now
     flight.wait(1.0).send()
     flight.wait(1.0).status(ARMED)
-    flight.wait(PAUSE).look()
+    flight.wait(PAUSE).update()
     assert flight.kinds == ["reboot"]
 
 
-def test_fix_before_arming_is_no_state() -> None:
-    """Receivers and estimators start without a fix and a global reference."""
+def test_fix_acquired_before_arming_leaves_no_condition() -> None:
+    """A fix and a global reference acquired before arming leave no condition."""
     flight = Flight()
     flight.status(DISARMED)
     flight.gps(fix_type=0, satellites_used=0)
@@ -366,20 +366,20 @@ def test_fix_before_arming_is_no_state() -> None:
     flight.wait(5.0).gps()
     flight.send()
     flight.wait(5.0).status(ARMED)
-    flight.wait(PAUSE).look()
+    flight.wait(PAUSE).update()
     assert flight.kinds == []
 
 
-def test_labels_are_words() -> None:
-    """No event shows the name of a field."""
+def test_flag_labels_are_words() -> None:
+    """Labels of flags are words, not field names."""
     for kind in KINDS.values():
         for name, label in kind.flags.items():
             assert "_" not in label
             assert not re.match(r"(fd|cs|fs|reject) |.*relaxed$", label), name
 
 
-def test_on_the_ground(flight: Flight) -> None:
-    """Faults of sensors and links are info while the vehicle is disarmed."""
+def test_gcs_loss_is_info_while_disarmed(flight: Flight) -> None:
+    """A lost GCS connection is info while the vehicle is disarmed, and watch while it is armed."""
     flight.status(DISARMED, gcs_connection_lost=False)
     assert brief(flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)) == [("gcs_lost", "begin", "info")]
     assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [("armed", "once", "info")]
@@ -390,15 +390,15 @@ def test_on_the_ground(flight: Flight) -> None:
     assert flight.severity == "info"
 
 
-def test_missing_flag_is_no_event() -> None:
+def test_flag_not_provided_is_not_an_event() -> None:
     """A field that the source does not provide is neither valid nor invalid, whatever its value."""
     flight = Flight()
     missing = ("z_valid", "v_z_valid", "heading_good_for_control", "dist_bottom_valid", "dead_reckoning")
     flight.send(missing=missing, z_valid=False, v_z_valid=False, dead_reckoning=True)
     assert flight.kinds == []
     assert flight.wait(0.1).send(missing=missing, heading_good_for_control=True) == []
-    told = flight.wait(0.1).send(missing=missing, xy_valid=False, z_valid=False, v_z_valid=False)
-    assert brief(told) == [("xy_invalid", "begin", "bad")]
+    reported = flight.wait(0.1).send(missing=missing, xy_valid=False, z_valid=False, v_z_valid=False)
+    assert brief(reported) == [("xy_invalid", "begin", "bad")]
 
 
 @pytest.mark.parametrize(
@@ -407,32 +407,32 @@ def test_missing_flag_is_no_event() -> None:
         ("vehicle_local_position_groundtruth", None), ("estimator_local_position", 1), ("estimator_local_position", 0),
     ],
 )  # fmt: skip
-def test_other_estimates_are_not_used(flight: Flight, topic: str, instance: int | None) -> None:
-    """A second EKF and the ground truth make no events, and change no state."""
+def test_other_estimates_are_ignored(flight: Flight, topic: str, instance: int | None) -> None:
+    """Other EKFs and the ground truth neither cause events nor change the state."""
     fields = message(1, **VALID).model_dump() | {"xy_valid": False, "dead_reckoning": True, "x": 500.0}
     for step in range(5):
         fields["timestamp"] = 100 - step
         assert flight.wait(0.1).send(topic, instance=instance, **fields) == []
         assert flight.send() == []
     assert flight.severity == "info"
-    assert flight.account.vehicles["1"].main == POSITION
+    assert flight.event_log.vehicles["1"].main == POSITION
 
 
-def test_other_estimate_is_used_if_it_is_the_only_one() -> None:
+def test_estimator_position_is_used_without_vehicle_position() -> None:
     """Without vehicle_local_position the first EKF is used, until the vehicle's own position arrives."""
     flight = Flight()
     fields = message(1, **VALID).model_dump() | {"xy_valid": False}
     flight.send("estimator_local_position", instance=1, **fields)
     flight.send("estimator_local_position", instance=0, **fields)
-    assert flight.account.vehicles["1"].main == Address("1", "estimator_local_position", 0)
+    assert flight.event_log.vehicles["1"].main == Address("1", "estimator_local_position", 0)
     assert flight.kinds == ["xy_invalid"]
     assert flight.send() == []
     assert flight.kinds == []
     assert flight.send("estimator_local_position", instance=0, **fields) == []
 
 
-def test_second_receiver_and_battery_are_not_used(flight: Flight) -> None:
-    """Of several sensors instance 0 is used, and vehicle_gps_position is preferred to any single receiver."""
+def test_second_receiver_and_battery_are_ignored(flight: Flight) -> None:
+    """Only instance 0 of a sensor is used, and vehicle_gps_position is preferred to sensor_gps."""
     flight.send("sensor_gps", instance=0, **GOOD_GPS)
     assert flight.send("sensor_gps", instance=1, **GOOD_GPS | {"fix_type": 0}) == []
     assert flight.send("battery_status", instance=1, warning=3, remaining=0.0, connected=True) == []
@@ -442,8 +442,8 @@ def test_second_receiver_and_battery_are_not_used(flight: Flight) -> None:
     assert flight.severity == "watch"
 
 
-def test_origin_that_only_has_a_new_time() -> None:
-    """An origin is set once, and moves by a centimetre or more; a new ref_timestamp alone is ignored."""
+def test_new_timestamp_alone_does_not_move_origin() -> None:
+    """An origin is set once, and moves by at least 1 cm; a new ref_timestamp alone is ignored."""
     flight = Flight()
     flight.send(xy_global=False, z_global=False)
     origin: dict[str, Any] = {
@@ -453,8 +453,8 @@ def test_origin_that_only_has_a_new_time() -> None:
         "ref_lon": 8.545594,
         "ref_alt": 488.0,
     }
-    told = flight.wait(0.1).send(**origin, ref_timestamp=1)
-    assert [event.kind for event in told if event.kind.startswith("origin")] == ["origin_set"]
+    reported = flight.wait(0.1).send(**origin, ref_timestamp=1)
+    assert [event.kind for event in reported if event.kind.startswith("origin")] == ["origin_set"]
     for stamp in range(2, 20):
         assert flight.wait(0.1).send(**origin, ref_timestamp=stamp) == []
     assert flight.wait(0.1).send(**origin | {"ref_alt": 488.005}, ref_timestamp=20) == []
@@ -463,8 +463,8 @@ def test_origin_that_only_has_a_new_time() -> None:
     assert moved[0].numbers["distance"] == pytest.approx(1.112, abs=1e-3)
 
 
-def test_jump_is_what_velocity_does_not_explain(flight: Flight) -> None:
-    """A position that moves over several messages is one jump, reported when it ends; flying is none."""
+def test_motion_unexplained_by_velocity_is_a_jump(flight: Flight) -> None:
+    """Unexplained motion over several messages is one jump, reported when it ends; motion by velocity is not."""
     for step in range(1, 20):
         assert flight.wait(0.1).send(x=2.0 * step, vx=20.0) == []
     flight = Flight()
@@ -472,30 +472,38 @@ def test_jump_is_what_velocity_does_not_explain(flight: Flight) -> None:
     begin = flight.now - flight.booted
     assert flight.wait(0.1).send(x=10.0, y=-10.0) == []
     assert flight.wait(0.1).send(x=30.0, y=-30.0) == []
-    told = flight.wait(0.1).send(x=30.0, y=-30.0)
-    assert brief(told) == [("jump", "once", "watch")]
-    assert told[0].numbers == pytest.approx(
+    reported = flight.wait(0.1).send(x=30.0, y=-30.0)
+    assert brief(reported) == [("jump", "once", "watch")]
+    assert reported[0].numbers == pytest.approx(
         {"distance": math.hypot(30, 30), "north": 30.0, "east": -30.0, "begin": begin}
     )
 
 
-def test_jump_that_is_a_reset(flight: Flight) -> None:
-    """A reset reported by the estimator is a reset with its size, and not a jump."""
-    told = flight.wait(0.1).send(
+def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
+    """A jump that the estimator reports as a reset is a reset with its size."""
+    reported = flight.wait(0.1).send(
         x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0), delta_z=-4.0
     )
-    assert brief(told) == [("reset", "once", "watch")]
-    assert told[0].names == ("xy", "z")
-    assert told[0].numbers == pytest.approx({"north": 30.0, "east": 0.0, "up": 4.0}, abs=1e-3)
+    assert brief(reported) == [("reset", "once", "watch")]
+    assert reported[0].names == ("xy", "z")
+    assert reported[0].numbers == pytest.approx({"north": 30.0, "east": 0.0, "up": 4.0}, abs=1e-3)
     assert flight.wait(0.1).send(x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)) == []
 
 
 @pytest.mark.parametrize(
     ("seconds", "fields", "size"),
     [
-        (0.1, {"z": -10.0, "z_reset_counter": 1, "delta_z": -6.0}, "height by 10.0 m"),  # the delta is not in the data
+        (
+            0.1,
+            {"z": -10.0, "z_reset_counter": 1, "delta_z": -6.0},
+            "height by 10.0 m",
+        ),  # the data contradicts the delta
         (0.1, {"z": 0.0, "z_reset_counter": 1, "delta_z": -489.6}, "height by 0.0 m"),  # an origin is set
-        (0.1, {"z": -12.0, "vz": -20.0, "z_reset_counter": 1, "delta_z": -10.2}, "height by 10.2 m"),  # and motion
+        (
+            0.1,
+            {"z": -12.0, "vz": -20.0, "z_reset_counter": 1, "delta_z": -10.2},
+            "height by 10.2 m",
+        ),  # delta plus motion
         (0.1, {"z": -12.0, "z_reset_counter": 1, "delta_z": math.nan}, "height by 12.0 m"),
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
         (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
@@ -504,56 +512,56 @@ def test_jump_that_is_a_reset(flight: Flight) -> None:
         (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
     ],
 )
-def test_size_of_a_reset_is_the_step_in_the_data(
+def test_reset_size_is_delta_or_observed_step(
     flight: Flight, seconds: float, fields: dict[str, Any], size: str
 ) -> None:
-    """It is the delta where the two samples agree with it, else their difference without motion, if they are near."""
+    """The size is the delta if both samples agree with it, else their difference minus motion if they are close."""
     reset = next(each for each in flight.wait(seconds).send(**fields) if each.kind == "reset")
     assert reset.text == f"reset of {size}"
 
 
-def test_flapping_is_reported_when_it_ends(flight: Flight) -> None:
-    """Of more than four changes in ten seconds the last is reported after five seconds, with their number."""
-    told, times = [], []
+def test_flapping_flag_is_reported_after_it_settles(flight: Flight) -> None:
+    """After four changes in 10 s, only the last is reported, 5 s later and with the number of suppressed changes."""
+    reported, times = [], []
     for index in range(21):
-        told += flight.wait(0.2).send(xy_valid=index % 2 == 1)
+        reported += flight.wait(0.2).send(xy_valid=index % 2 == 1)
         times.append(flight.now)
-        told += flight.look()
-    assert [event.time for event in told] == times[:4]
-    assert flight.kinds == ["xy_invalid"]  # the state is always true
+        reported += flight.update()
+    assert [event.time for event in reported] == times[:4]
+    assert flight.kinds == ["xy_invalid"]  # the state is never suppressed
     for _ in range(60):
-        told += flight.wait(0.1).send(xy_valid=False)
-        told += flight.look()
-    assert [event.time for event in told[4:]] == [times[-1]]
-    assert told[-1].text == "xy not valid, the last of 17 suppressed changes"
-    assert told[-1].change == "begin"
+        reported += flight.wait(0.1).send(xy_valid=False)
+        reported += flight.update()
+    assert [event.time for event in reported[4:]] == [times[-1]]
+    assert reported[-1].text == "xy not valid, the last of 17 suppressed changes"
+    assert reported[-1].change == "begin"
 
 
-def test_flapping_in_combinations_is_suppressed(flight: Flight) -> None:
-    """Flags of one kind that change in ever new combinations are reported twenty times, then when they rest."""
+def test_flapping_combinations_of_flags_are_suppressed(flight: Flight) -> None:
+    """Flags of one kind that change in new combinations are reported twenty times, then once they settle."""
     names = list(KINDS["failsafe_flag"].flags)[:8]
     flags: dict[str, Any] = dict.fromkeys(names, False)
-    told = flight.send("failsafe_flags", **flags)
+    reported = flight.send("failsafe_flags", **flags)
     for number in range(1, 256):
         gray = number ^ number >> 3
         flags |= {name: bool(gray >> bit & 1) for bit, name in enumerate(names)}
-        told += flight.wait(0.1).send("failsafe_flags", **flags)
-        told += flight.look()
-    assert FLAPPING_CHANGES[1] <= len(told) < 2 * FLAPPING_CHANGES[1]
-    told += flight.wait(PAUSE + 0.1).look()
-    assert "suppressed changes" in told[-1].text
-    assert len(told) < 2 * FLAPPING_CHANGES[1]
+        reported += flight.wait(0.1).send("failsafe_flags", **flags)
+        reported += flight.update()
+    assert FLAPPING_CHANGES[1] <= len(reported) < 2 * FLAPPING_CHANGES[1]
+    reported += flight.wait(PAUSE + 0.1).update()
+    assert "suppressed changes" in reported[-1].text
+    assert len(reported) < 2 * FLAPPING_CHANGES[1]
 
 
-def test_flapping_of_one_is_not_of_another(flight: Flight) -> None:
-    """Each kind of condition is counted separately."""
+def test_flapping_of_one_kind_does_not_suppress_another(flight: Flight) -> None:
+    """Changes are counted separately for each kind."""
     for index in range(20):
         flight.wait(0.1).send(xy_valid=index % 2 == 1)
     assert brief(flight.wait(0.1).send(z_valid=False)) == [("z_invalid", "begin", "bad")]
 
 
-def test_evidence_is_from_the_window(flight: Flight) -> None:
-    """Events up to ten seconds before are evidence; later ones, or ones of unrelated kinds, are not."""
+def test_evidence_is_at_most_10_s_old(flight: Flight) -> None:
+    """Events of related kinds up to 10 s before are evidence; older and unrelated ones are not."""
     flight.gps()
     flight.gps(jamming_indicator=100)
     flight.gps()
@@ -572,34 +580,34 @@ def test_evidence_is_from_the_window(flight: Flight) -> None:
     assert far[0].evidence == ()
 
 
-def test_evidence_that_goes_on(flight: Flight) -> None:
+def test_active_condition_is_evidence(flight: Flight) -> None:
     """An active condition is evidence, however long ago it began."""
     flight.gps()
     flight.gps(fix_type=0)
     flight.fly(10 * WINDOW)
-    told = flight.wait(0.1).send(dead_reckoning=True)
-    assert [each.kind for each in told[0].evidence] == ["gps_fix_lost"]
+    reported = flight.wait(0.1).send(dead_reckoning=True)
+    assert [each.kind for each in reported[0].evidence] == ["gps_fix_lost"]
 
 
-def test_evidence_of_others_does_not_count(flight: Flight) -> None:
-    """Events of other vehicles are no evidence."""
+def test_events_of_other_vehicles_are_not_evidence(flight: Flight) -> None:
+    """Events of other vehicles are not evidence."""
     flight.send("vehicle_gps_position", vehicle="2", **GOOD_GPS)
     flight.send("vehicle_gps_position", vehicle="2", **GOOD_GPS | {"fix_type": 0})
     assert flight.wait(0.1).send(xy_valid=False)[0].evidence == ()
 
 
-def test_evidence_has_none_of_its_own(flight: Flight) -> None:
-    """Evidence has no evidence of its own, so chains do not grow."""
+def test_evidence_is_not_nested(flight: Flight) -> None:
+    """Events that are evidence have no evidence themselves, so chains do not grow."""
     flight.gps()
     flight.gps(fix_type=0)
     flight.wait(0.1).send(dead_reckoning=True)
-    told = flight.wait(0.1).send(dead_reckoning=True, xy_valid=False)
-    assert [each.kind for each in told[0].evidence] == ["gps_fix_lost", "dead_reckoning"]
-    assert all(each.evidence == () for each in told[0].evidence)
+    reported = flight.wait(0.1).send(dead_reckoning=True, xy_valid=False)
+    assert [each.kind for each in reported[0].evidence] == ["gps_fix_lost", "dead_reckoning"]
+    assert all(each.evidence == () for each in reported[0].evidence)
 
 
 def test_state_is_worst_first(flight: Flight) -> None:
-    """Bad is shown before watch; a single event of severity watch counts for a minute."""
+    """Bad conditions precede watch conditions; a single watch event counts for a minute."""
     flight.wait(0.1).send(xy_reset_counter=1, delta_xy=(5.0, 0.0), x=5.0)
     assert (flight.severity, flight.kinds) == ("watch", ["reset"])
     flight.gps()
@@ -612,107 +620,107 @@ def test_state_is_worst_first(flight: Flight) -> None:
     flight.wait(RECENT - 1)
     assert flight.severity == "watch"
     flight.wait(1.5)
-    state = flight.account.state("1", flight.now)
+    state = flight.event_log.state("1", flight.now)
     assert (state.severity, state.text, state.since, state.conditions) == ("info", "ok", None, ())
-    assert flight.account.state("nobody", flight.now).severity == "info"
+    assert flight.event_log.state("nobody", flight.now).severity == "info"
 
 
-def test_memory_is_bounded() -> None:
-    """An account keeps the most recent events, a thousand vehicles, and a thousand streams per vehicle."""
+def test_number_of_vehicles_streams_and_events_is_bounded() -> None:
+    """An event log keeps the latest 2,000 events, 1,000 vehicles, and 1,000 streams per vehicle."""
     flight = Flight()
     for number in range(1100):
         flight.send(vehicle=f"v{number}")
-    assert len(flight.account.vehicles) == 1000
+    assert len(flight.event_log.vehicles) == 1000
     for number in range(1100):
         flight.send(f"unknown_{number}", vehicle="v1")
-    known = flight.account.vehicles["v1"]
+    known = flight.event_log.vehicles["v1"]
     assert len(known._detectors) <= 1000
     assert len(known.topics) <= 1000
     for number in range(KEPT + 100):
         flight.wait(0.1).status(DISARMED, vehicle="v2", nav_state=number % 2)
-    new, told = flight.account.events_since(0)
-    assert (len(new), told) == (KEPT, KEPT + 99)
-    assert flight.account.events_since(told - 1) == ([new[-1]], told)
+    new, reported = flight.event_log.events_since(0)
+    assert (len(new), reported) == (KEPT, KEPT + 99)
+    assert flight.event_log.events_since(reported - 1) == ([new[-1]], reported)
 
 
-def look(account: Account, now: float, *present: str, link: str = "") -> set[str]:
-    """Update an account of which these vehicles have a publisher; return the vehicles that it follows."""
-    account.update(now, {}, link=link, present=present)
-    return set(account.vehicles)
+def update(event_log: EventLog, now: float, *present: str, link: str = "") -> set[str]:
+    """Update an event log with these vehicles present; return the vehicles that it knows."""
+    event_log.update(now, {}, link=link, present=present)
+    return set(event_log.vehicles)
 
 
-def test_vehicle_beyond_the_limit_is_told_and_gets_the_place_of_one_that_left(
+def test_vehicle_beyond_limit_replaces_longest_gone_one(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A vehicle too many has no events and says so, once in the log; of those gone, the longest gone makes room."""
+    """A vehicle beyond the limit has no events, which is logged once, until it can replace the longest gone one."""
     flight = Flight()
     for number in range(MAX_VEHICLES):
         flight.send(vehicle=f"v{number}")
     for _ in range(3):
         flight.send(vehicle="more")
-    account = flight.account
-    assert account.state("more", flight.now).text == "no events: more than 1000 vehicles"
-    assert (account.refused, len(account.vehicles), len(caplog.records)) == (3, MAX_VEHICLES, 1)
+    event_log = flight.event_log
+    assert event_log.state("more", flight.now).text == "no events: more than 1000 vehicles"
+    assert (event_log.refused, len(event_log.vehicles), len(caplog.records)) == (3, MAX_VEHICLES, 1)
     flight.wait(RECENT + 1).send(vehicle="v0")
     flight.send(vehicle="more")
-    assert {"v0", "more"} <= account.vehicles.keys()
-    assert "v1" not in account.vehicles
-    assert account.state("more", flight.now).text == "ok"
+    assert {"v0", "more"} <= event_log.vehicles.keys()
+    assert "v1" not in event_log.vehicles
+    assert event_log.state("more", flight.now).text == "ok"
 
 
-def test_vehicle_that_is_gone_is_forgotten() -> None:
-    """After an hour without a publisher and with a link, a vehicle and its counts are forgotten; its events stay."""
+def test_gone_vehicle_is_forgotten_after_an_hour() -> None:
+    """After an hour without a publisher, with the link up, a vehicle and its counts are forgotten; its events stay."""
     flight = Flight()
     for vehicle in ("here", "gone"):
         flight.send(vehicle=vehicle)
         flight.send(vehicle=vehicle, xy_valid=False)
-    account, start = flight.account, flight.now
-    assert look(account, start + TIMINGS.forgotten, "here") == {"here", "gone"}
-    assert look(account, start + TIMINGS.forgotten + 1, link="no link") == {"here", "gone"}
-    assert look(account, start + 2 * TIMINGS.forgotten, "here") == {"here", "gone"}
-    assert look(account, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
-    assert {name for name, _ in account.counts} == {ALL, "here"}
-    assert [each.vehicle for each in account.events if each.kind == "xy_invalid"] == ["here", "gone"]
-    account.update(start + 9 * TIMINGS.forgotten, {})  # of a file
-    assert set(account.vehicles) == {"here"}
+    event_log, start = flight.event_log, flight.now
+    assert update(event_log, start + TIMINGS.forgotten, "here") == {"here", "gone"}
+    assert update(event_log, start + TIMINGS.forgotten + 1, link="no link") == {"here", "gone"}
+    assert update(event_log, start + 2 * TIMINGS.forgotten, "here") == {"here", "gone"}
+    assert update(event_log, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
+    assert {name for name, _ in event_log.counts} == {ALL, "here"}
+    assert [each.vehicle for each in event_log.events if each.kind == "xy_invalid"] == ["here", "gone"]
+    event_log.update(start + 9 * TIMINGS.forgotten, {})  # as for a file
+    assert set(event_log.vehicles) == {"here"}
 
 
-def test_of_many_that_left_the_last_fifty_are_known() -> None:
-    """Vehicles that come and go leave the last fifty behind, and those of the last minute."""
+def test_last_fifty_gone_vehicles_are_remembered() -> None:
+    """Of vehicles that come and go, the last fifty and those of the last minute are remembered."""
     flight = Flight()
     for number in range(3000):
         flight.wait(2.0).send(vehicle=f"v{number}")
-        known = look(flight.account, flight.now, f"v{number}")
+        known = update(flight.event_log, flight.now, f"v{number}")
     assert known == {f"v{number}" for number in range(3000 - MAX_GONE - 31, 3000)}
-    assert len(flight.account.counts) <= 3 * len(known)
+    assert len(flight.event_log.counts) <= 3 * len(known)
 
 
-def test_fleet_that_drops_at_once_is_remembered() -> None:
-    """Of 300 vehicles that vanish together behind a link that works, none is forgotten before an hour has passed."""
+def test_fleet_that_vanishes_at_once_is_remembered() -> None:
+    """300 vehicles that vanish together while the link is up are remembered for an hour."""
     flight, fleet = Flight(), [f"v{number}" for number in range(300)]
     for vehicle in fleet:
         flight.send(vehicle=vehicle)
-    assert look(flight.account, flight.now, *fleet) == set(fleet)
-    assert look(flight.account, flight.now + TIMINGS.forgotten - 1) == set(fleet)
-    assert look(flight.account, flight.now + TIMINGS.forgotten + 1) == set()
+    assert update(flight.event_log, flight.now, *fleet) == set(fleet)
+    assert update(flight.event_log, flight.now + TIMINGS.forgotten - 1) == set(fleet)
+    assert update(flight.event_log, flight.now + TIMINGS.forgotten + 1) == set()
 
 
-def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
-    """Reasons of ended rejections are not kept, as each one may be different."""
+def test_rejection_reasons_are_not_kept(flight: Flight) -> None:
+    """Reasons of ended rejections are not kept, as each may be different."""
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
-        flight.wait(6.0).look()
-    assert len(flight.account.vehicles["1"]._changes) < 5
+        flight.wait(6.0).update()
+    assert len(flight.event_log.vehicles["1"]._changes) < 5
 
 
-def test_state_is_the_current_one(flight: Flight) -> None:
-    """An active condition counts before single events of the last minute, and of those the largest."""
+def test_active_condition_precedes_single_events(flight: Flight) -> None:
+    """The state names an active condition before single events of the last minute, and of those the largest."""
     flight.send()
     flight.wait(1.0).send(xy_reset_counter=1, delta_xy=(20.0, 0.0), x=20.0)
     flight.wait(1.0).send(xy_reset_counter=2, delta_xy=(3.0, 0.0), x=23.0)
-    assert flight.account.state("1", flight.now).text.startswith("reset of xy by 20.0 m")
+    assert flight.event_log.state("1", flight.now).text.startswith("reset of xy by 20.0 m")
     flight.wait(1.0).send(xy_reset_counter=2, x=23.0, dead_reckoning=True)
-    assert flight.account.state("1", flight.now).text == "dead reckoning"
+    assert flight.event_log.state("1", flight.now).text == "dead reckoning"
 
 
 FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning", "heading_good_for_control", "xy_global")
@@ -734,7 +742,7 @@ ACTIONS: dict[str, tuple[Callable[[Flight, Any], object], st.SearchStrategy[Any]
     "battery": (Flight.battery, st.integers(0, 3)),
     "reject": (Flight.reject, st.sampled_from("ab")),
     "lose": (lambda flight, count: flight.send(lost=count), st.integers(1, 5)),
-    "look": (Flight.look, st.sampled_from([None, "stale", "gone", "ok"])),
+    "update": (Flight.update, st.sampled_from([None, "stale", "gone", "ok"])),
     "link": (lambda flight, link: setattr(flight, "link", link), st.sampled_from(["", "no link"])),
     "reboot": (lambda flight, ago: setattr(flight, "booted", flight.now - ago), st.just(0.001)),
     "wait": (Flight.wait, st.floats(0.01, 30.0)),
@@ -748,21 +756,21 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 @given(STEPS)
 @example([("send", {"xy_valid"}), ("send", set()), ("lose", 1), *[("send", set()), ("send", {"xy_valid"})] * 2])
-def test_events_are_consistent(steps: list[tuple[str, Any]]) -> None:
-    """An end follows a begin or an initial condition, at most once since the boot, whatever arrives.
+def test_begins_and_ends_are_consistent(steps: list[tuple[str, Any]]) -> None:
+    """For any messages, an end follows a begin or, at most once since boot, an initial condition.
 
-    The end of flapping repeats an end if an even number of changes was suppressed, which are only counted.
-    Nothing ends before it began, and evidence precedes the event.
+    The last event of flapping may repeat an end, if an even number of changes was suppressed.
+    No condition ends before it began, and evidence precedes the event.
     """
     flight = Flight()
     for name, value in steps:
         ACTIONS[name][0](flight.wait(0.05), value)
     flight.link = ""
-    for _ in range(3):  # reports flapping and losses that have ended
-        flight.wait(20.0).look()
+    for _ in range(3):  # reports ended flapping and losses
+        flight.wait(20.0).update()
     begun: dict[tuple[str, str], Event] = {}
-    initial: set[tuple[str, str]] = set()  # those that ended without a begin, which they can do once
-    for event in sorted(flight.account.events, key=lambda each: each.time):
+    initial: set[tuple[str, str]] = set()  # ended without a begin, which is possible once
+    for event in sorted(flight.event_log.events, key=lambda each: each.time):
         assert event.kind in KINDS
         assert all(each.time <= event.time for each in event.evidence)
         assert event.lasted is None or event.lasted >= 0

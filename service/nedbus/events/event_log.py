@@ -1,4 +1,4 @@
-"""The bounded event history and current conditions of all vehicles; no I/O."""
+"""Bounded event log of all vehicles and their current conditions; no I/O."""
 
 import logging
 import threading
@@ -21,26 +21,25 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 KEPT: Final = 2000
-"""Maximum number of events in an account; beyond, the vehicle with the most events loses its oldest."""
+"""Maximum number of events in an event log; beyond, the oldest of the vehicle with the most events is dropped."""
 
 MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an account; those gone longest make room."""
+"""Maximum number of vehicles in an event log; beyond, the one gone longest is forgotten."""
 
 MAX_GONE: Final = 50
-"""Vehicles gone for a minute that are remembered, or as many as were present at once; further ones are forgotten."""
+"""Number of gone vehicles remembered, or the maximum number ever present at once if that is larger."""
 
-_SHARE: Final = 20  # events that a vehicle keeps while others have more
+_SHARE: Final = 20  # events guaranteed to each vehicle while others have more
 _NONE: Final[frozenset[str]] = frozenset()
 
 
-class Account:
-    """The events of all vehicles. Thread-safe: one thread may add samples while others update and read.
+class EventLog:
+    """Events of all vehicles. Thread-safe: one thread may add samples while others update and read.
 
-    All times are of one clock that is never set, or of a file: a step would end or hide conditions.
+    All times come from one monotonic clock or one file: a clock step would end or hide conditions.
 
-    `reported`: the total number of events.
-    `counts`: the number of events by vehicle and severity, until the vehicle is forgotten.
-    `refused`: the number of messages of vehicles that are not followed, as there are too many.
+    `reported`: total number of events. `counts`: number of events by vehicle and severity, until it is forgotten.
+    `refused`: number of messages from vehicles beyond MAX_VEHICLES.
     """
 
     def __init__(self, keep: int = KEPT) -> None:
@@ -49,25 +48,25 @@ class Account:
         self.counts: Counter[tuple[str, Severity]] = Counter()
         self.reported = self.refused = 0
         self._keep = keep
-        self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # of its events, by vehicle
-        self._common = Vehicle(ALL, self._record)  # the link, and the reader itself
+        self._numbers: defaultdict[str, deque[int]] = defaultdict(deque)  # event numbers by vehicle
+        self._common = Vehicle(ALL, self._record)  # conditions of the link and the reader
         self._dropped = self._most_present = 0
         self._last_overload = self._settled = self._full_until = 0.0
         self._lock = threading.RLock()
 
     @property
     def events(self) -> list[Event]:
-        """The events kept, in the order they were reported."""
+        """The events kept, in the order of reports."""
         return self.events_since(0)[0]
 
     @property
     def is_full(self) -> bool:
-        """True if further vehicles are not followed."""
+        """True if further vehicles are ignored."""
         return len(self.vehicles) >= MAX_VEHICLES
 
     @property
     def overload(self) -> Condition | None:
-        """The overload condition of this reader, None if it keeps up."""
+        """Overload condition of this reader, None if it keeps up."""
         return self._common.conditions.get(("overload", ""))
 
     def add(
@@ -82,7 +81,7 @@ class Account:
                 vehicle.add(address, message, time, missing=missing, lost=lost)
 
     def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
-        """Record that the logger of a vehicle recorded nothing for some seconds from `time` on."""
+        """Record a logging dropout of a vehicle that starts at `time`."""
         with self._lock:
             if known := self._vehicle(vehicle, time):
                 known.add_dropout(seconds, time)
@@ -106,27 +105,26 @@ class Account:
         """Update the conditions of the link, of this reader, and of all vehicles.
 
         `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
-        `link`: the fault of the link, "" if it is up. `dropped`: messages dropped by this reader since it started.
-        `is_behind`: it has a backlog. `present`: vehicles that have a publisher; all others are forgotten once they
-        have been silent for an hour with a link, or earlier if more are gone than were ever present at once, and more
-        than 50. None: none is forgotten.
+        `link`: fault of the router link, "" if it is up. `dropped`: messages dropped by this reader since it started.
+        `is_behind`: the reader has a backlog. `present`: vehicles with a publisher. Others are forgotten after an hour
+        of silence with the link up, or earlier beyond MAX_GONE. With None, no vehicle is forgotten.
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:
             change: Change = "begin" if link else "end"
-            self._common.emit(Finding("link_down", change, link or "link is back", switch=True), "", time)
+            self._common.emit(Finding("link_down", change, link or "link restored", switch=True), "", time)
             if dropped > self._dropped or is_behind:
                 self._last_overload = time
-                text = "the reader is slower than the data: messages are dropped"
+                text = "reader overloaded: messages are dropped"
                 self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
             elif time - self._last_overload > PAUSE:
-                text = f"the reader keeps up again: {dropped} messages were dropped"
+                text = f"{dropped} messages dropped, reader caught up"
                 ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
                 self._common.emit(ended, "", time, changed=self._last_overload)
             self._dropped = dropped
             if present is not None:
                 for here in filter(None, map(self.vehicles.get, self.vehicles if link else present)):
-                    here.heard = time
+                    here.last_seen = time
                 self._most_present = max(self._most_present, len(present))
                 gone = self._gone(time)
                 beyond = gone[: -max(MAX_GONE, self._most_present)]
@@ -142,13 +140,13 @@ class Account:
                 vehicle.update(time, state, is_connected=not link)
 
     def settle(self, time: float) -> None:
-        """Report bursts of losses and rejections, and flapping, that have ended; call it at the end of a file."""
+        """Report bursts of losses and rejections, and flapping, that have ended; call it at the end of a file, too."""
         with self._lock:
             for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)
 
     def state(self, vehicle: str, time: float) -> State:
-        """Return the current state of a vehicle; `time` is now."""
+        """Return the current state of a vehicle; `time`: now."""
         with self._lock:
             known = self.vehicles.get(vehicle)
             if known is None and self.is_full:
@@ -156,20 +154,20 @@ class Account:
             return known.state(time) if known is not None else state_of(())
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
-        """Return the events after the first `seen` ones that are still kept, and the total number of events."""
+        """Return the events kept, without the first `seen` ever reported, and the number of events ever reported."""
         with self._lock:
             new = [self._events[number] for number in takewhile(lambda number: number >= seen, reversed(self._events))]
             return new[::-1], self.reported
 
     def label_first_events(self) -> None:
-        """Set the time since boot of events before the first message that gave it; for files."""
+        """Set the time since boot of events before the first message that contained it; for files."""
         for number, event in self._events.items():
             known = self.vehicles.get(event.vehicle)
             if event.boot is None and known is not None and known.boot is not None:
                 self._events[number] = replace(event, boot=known.boot + event.time - known.time)
 
     def _vehicle(self, name: str, time: float) -> Vehicle | None:
-        """Return the vehicle of a message, a new one if there is room, else None."""
+        """Return the vehicle of a message, creating it if there is room, else None."""
         known = self.vehicles.get(name)
         if known is None:
             if self.is_full and time >= self._full_until:
@@ -177,17 +175,17 @@ class Account:
                 self._forget(self._gone(time)[:1])
             if self.is_full:
                 if not self.refused:
-                    text = "more than %d vehicles: further ones have no events; follow some of them with --vehicle"
+                    text = "more than %d vehicles: further ones have no events; select vehicles with --vehicle"
                     _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
                 self.refused += 1
                 return None
             known = self.vehicles[name] = Vehicle(name, self._record, self._common)
-        known.heard = time
+        known.last_seen = time
         return known
 
     def _gone(self, time: float) -> list[tuple[float, str]]:
-        """Return when vehicles that have been gone for a minute were heard, and their names, the longest gone first."""
-        return sorted((each.heard, name) for name, each in self.vehicles.items() if time - each.heard > RECENT)
+        """Return time last seen and name of each vehicle gone for a minute, longest gone first."""
+        return sorted((each.last_seen, name) for name, each in self.vehicles.items() if time - each.last_seen > RECENT)
 
     def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:
         for _, name in vehicles:

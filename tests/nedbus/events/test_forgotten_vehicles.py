@@ -1,4 +1,4 @@
-"""State of vehicles that come and go for an hour, eight at a time, in a service, a reader and a page; fake clocks."""
+"""State kept about vehicles that come and go, in a service, a reader and a web page, with fake clocks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nedbus import Bus, Counts, Sample, Selection
 from nedbus.client import PublisherRegistry
 from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
-from nedbus.events.account import MAX_GONE
+from nedbus.events.event_log import MAX_GONE
 from nedbus.monitoring import Observer
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
@@ -25,7 +25,7 @@ AT_A_TIME: Final = 8
 
 
 class World:
-    """A service with a live source, a reader and its page; all messages arrive at all of them."""
+    """A service with a live source, a reader and its page, all of which receive every message."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.now, self.open, self.alive = 0.0, set[Address](), Counter[Address]()
@@ -34,7 +34,7 @@ class World:
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
         registry = SimpleNamespace(publisher=self._publisher, shared_vehicles=set, publishers=())
         self.daemon._registry = cast("PublisherRegistry", registry)
-        self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.account)
+        self.output = SourceOutput("px4", "px4-zenoh:", self.daemon._registry, lambda: self.now, self.daemon.event_log)
         bus = SimpleNamespace(
             connected=True,
             subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
@@ -48,27 +48,27 @@ class World:
         known: Any = {"publish": lambda _: None, "relabel": lambda _: None, "close": lambda: self.open.discard(address)}
         return SimpleNamespace(definition=BY_TOPIC[address.topic], **known)
 
-    def hear(self, address: Address) -> None:
+    def receive(self, address: Address) -> None:
         sent = message(round(self.now * 1e6) + 1, **VALID)
         self.output.publish_live(SourceMessage(0.0, address, sent.__dict__))
         sample = Sample(sent, address, 0, _sent=round(self.now * 1e9))
         self.reader.add(sample)
         self.fleet.add(sample, self.now)
 
-    def look(self, *alive: Address) -> None:
+    def poll(self, *alive: Address) -> None:
         self.alive = Counter(alive)
         self.daemon.update_events()
         self.output.expire_stale()
-        snapshot, account = self.reader.poll(), self.reader.account
-        states = {name: account.state(name, self.now) for name in account.vehicles}
+        snapshot, event_log = self.reader.poll(), self.reader.event_log
+        states = {name: event_log.state(name, self.now) for name in event_log.vehicles}
         self.fleet.update(snapshot, states)
 
     def sizes(self) -> dict[str, int]:
-        """Return the number of objects for each kind of state."""
-        accounts = self.daemon.account, self.reader.account
+        """Return the number of objects by kind of state."""
+        event_logs = self.daemon.event_log, self.reader.event_log
         return {
-            "vehicles": max(len(each.vehicles) for each in accounts),
-            "counts": max(len(each.counts) for each in accounts),
+            "vehicles": max(len(each.vehicles) for each in event_logs),
+            "counts": max(len(each.counts) for each in event_logs),
             "addresses": len(self.output.addresses + self.output.stale),
             "streams": len(self.reader.measure()),
             "page": len(self.fleet.streams),
@@ -76,16 +76,16 @@ class World:
         }
 
 
-def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After hundreds of vehicles, eight at a time, the state is that of the last fifty and the last minute."""
+def test_state_of_vehicles_that_come_and_go_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After hundreds of vehicles, eight at a time, state remains of the last fifty and of the last minute only."""
     world = World(monkeypatch)
     sizes = []
     for number in range(240):
         world.now += 2.0
         there = [Address(f"v{each}", VLP) for each in range(max(0, number - AT_A_TIME + 1), number + 1)]
         for address in there:
-            world.hear(address)
-        world.look(*there)
+            world.receive(address)
+        world.poll(*there)
         sizes.append(world.sizes())
     assert sizes[140:240:10] == [sizes[-1]] * 10
     most = AT_A_TIME + MAX_GONE + 31
@@ -94,24 +94,24 @@ def test_vehicles_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.Monk
     world.now += TIMINGS.forgotten
     for _ in range(10):  # after the pause the reader counts as overloaded
         world.now += 1.0
-        world.hear(there[-1])
-        world.look(there[-1])
+        world.receive(there[-1])
+        world.poll(there[-1])
     assert {name: number for name, number in world.sizes().items() if number != 1}.keys() == {"counts"}
 
 
-def test_stream_of_a_vehicle_that_is_there_is_forgotten_after_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A topic that a vehicle publishes no longer is stale for an hour, then it is unknown."""
+def test_unpublished_stream_of_present_vehicle_is_forgotten_after_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A topic that a vehicle no longer publishes is stale for an hour, then forgotten."""
     world, position, attitude = World(monkeypatch), Address("1", VLP), Address("1", "estimator_local_position", 0)
     for second in range(3):
         world.now = float(second)
-        world.hear(position)
-        world.hear(attitude)
-        world.look(position, attitude)
+        world.receive(position)
+        world.receive(attitude)
+        world.poll(position, attitude)
     for seconds, known in ((TIMINGS.forgotten - 9, {position, attitude}), (10, {position})):
         world.now += seconds
-        world.hear(position)
-        world.look(position)
-        world.hear(position)
+        world.receive(position)
+        world.poll(position)
+        world.receive(position)
         assert world.reader.measure().keys() == known
         assert {*world.output.addresses, *world.output.stale} == known
         assert world.fleet.streams.keys() == known
