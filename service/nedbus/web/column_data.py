@@ -19,6 +19,7 @@ _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "d
 _DOUBTFUL_LINE, _TRUTH_LINE = "doubtful", "truth"
 LINE_TYPES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBTFUL_LINE, _TRUTH_LINE)
 """Line types of tracks: valid positions in each vehicle colour, doubtful positions, and ground truth."""
+_COLUMNS: Final = ("east", *LINE_TYPES)
 
 Track = tuple[History, int]  # points, and colour number
 
@@ -49,7 +50,7 @@ class Tracks:
     """
 
     def __init__(self) -> None:
-        self.source = table("east", *LINE_TYPES)
+        self.source = table(*_COLUMNS)
         self._tracks: Mapping[Address, Track] = {}
         self._seen: list[int] = []  # points of each history that are in the data source
         self._step = self._slots = 1
@@ -64,10 +65,8 @@ class Tracks:
             written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
             self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
             self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
-            self.source.data = {
-                name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *LINE_TYPES)
-            }
-        cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *LINE_TYPES)}
+            self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in _COLUMNS}
+        cells: dict[str, dict[int, float]] = {name: {} for name in _COLUMNS}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
         if cells["east"]:
