@@ -100,17 +100,13 @@ class Flight(ExitStack):
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return the messages of each address, with a mask of the messages that lack a field, by field."""
-        found = dict[Address, tuple[MessageArray, Absent]]()
         if isinstance(self._file, UlogReader):
-            for address in addresses:
-                stream = self._file.streams[address]
-                found[address] = self._drop_invalid(address, _decode_ulog(stream, self._payloads[stream]))
-            return found
-        parts = self._converted or self._decode_recording(addresses)
-        for address in addresses:
-            decoded = _Decoded(*map(np.concatenate, zip(*parts[address], strict=True)))
-            found[address] = self._drop_invalid(address, decoded)
-        return found
+            streams = {address: self._file.streams[address] for address in addresses}
+            decoded = ((each, _decode_ulog(stream, self._payloads[stream])) for each, stream in streams.items())
+        else:
+            parts = self._converted or self._decode_recording(addresses)
+            decoded = ((each, _Decoded(*map(np.concatenate, zip(*parts[each], strict=True)))) for each in addresses)
+        return {address: self._drop_invalid(address, each) for address, each in decoded}
 
     def _decode_recording(self, addresses: Collection[Address]) -> dict[Address, list[_Decoded]]:
         parts = {address: [_Decoded.empty(self.definitions[address], 0)] for address in addresses}
