@@ -141,7 +141,7 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
     """Return for each time the row of its message (-1: none), the row of the next message, and its weight."""
-    if method == "own" or not len(stamps):  # by index, as messages may share a timestamp
+    if method == "own" or not len(stamps):  # by index, because messages may share a timestamp
         rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
         return rows, rows, np.zeros(len(times))
     order = np.argsort(stamps, kind="stable")

@@ -141,7 +141,7 @@ class Map:
         """Return a marker shaped by grade: filled at the current position, open at the last valid position."""
         last = view.main.stream.last
         heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
-        colour = self._style.vehicle(view.number)
+        colour = self._style.vehicle_colour(view.number)
         return {
             "east": round(at.east, 3), "north": round(at.north, 3), "angle": round(math.pi / 2 - heading, 3),
             "shape": MARKERS[view.grade], "colour": colour, "fill": colour if view.has_position else self._style.ground,
@@ -163,7 +163,7 @@ class Map:
         *valid, doubtful, truth = LINE_TYPES
         plot.line("east", truth, source=tracks, color=style.truth, line_dash="dotted", line_width=2)
         for number, name in enumerate(valid):
-            plot.line("east", name, source=tracks, color=style.vehicle(number), line_width=1.5)
+            plot.line("east", name, source=tracks, color=style.vehicle_colour(number), line_width=1.5)
         plot.line("east", doubtful, source=tracks, color=style.grades["watch"], line_dash="dashed", line_width=2)
         plot.circle(
             "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=style.text, line_dash="dashed"

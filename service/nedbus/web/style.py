@@ -43,8 +43,8 @@ class Style:
     truth: str
     chosen: str
 
-    def vehicle(self, number: int) -> str:
-        """Return the colour of a vehicle."""
+    def vehicle_colour(self, number: int) -> str:
+        """Return the colour of a vehicle, by its number."""
         return self.vehicles[number % PALETTE]
 
     @property

@@ -175,7 +175,7 @@ def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, zenoh
 def test_messages_have_the_layout_of_the_release(
     run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture, release: str
 ) -> None:
-    """Key, type hash and CDR fields of every topic in a real log are those of the selected release.
+    """Key, type hash and CDR fields of every topic in a real log match the selected release.
 
     Messages that the release lacks are logged once. Of streams without a rate, the last message is published.
     """
@@ -333,7 +333,7 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
     ],
 )
 def test_gid_matches_rmw_zenoh(type_hash: str, gid: str) -> None:
-    """The gids were computed by rmw_zenoh's code (simplified_xxhash3.cpp), for short and long inputs."""
+    """The gid equals the one computed by rmw_zenoh (simplified_xxhash3.cpp), for short and long inputs."""
     key = TopicKey(0, f"fmu/out/{VLP}", "px4_msgs::msg::dds_::VehicleLocalPosition_", type_hash)
     token = key.token("MP", "0123456789abcdef" * 2, "nedbus_4711", 1)
     assert gid_of_token(token).hex() == gid

@@ -130,7 +130,7 @@ def test_floats_are_not_interpolated_across_a_reset() -> None:
 
 
 def test_fields_select_the_columns() -> None:
-    """A field selects its column, without a stream that of every stream; time columns always remain; others raise."""
+    """`stream.field` selects one column, `field` one of every stream; time columns remain; unknown fields raise."""
     flight = {VLP: POSITIONS, "home_position": HOME}
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
     assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")

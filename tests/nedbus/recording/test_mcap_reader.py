@@ -254,7 +254,7 @@ def test_recording_without_readable_messages_raises(
 
 
 def test_bag_with_compressed_messages_is_read(tmp_path: Path) -> None:
-    """`ros2 bag record --compression-mode message` compresses each payload."""
+    """A bag of `ros2 bag record --compression-mode message`, which compresses each payload, is read."""
     assert_complete(write_bag(tmp_path / "a.mcap", change=zstandard.compress))
 
 
@@ -294,7 +294,7 @@ def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
 
 
 def test_compressed_recording_is_read(tmp_path: Path) -> None:
-    """`--compression-mode file` compresses a whole file; everything before damage is read, up to a size limit."""
+    """A file of `--compression-mode file`, compressed as a whole, is read up to the first damage or a size limit."""
     path = tmp_path / "a.mcap.zstd"
     data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
     path.write_bytes(data)

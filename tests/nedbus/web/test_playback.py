@@ -226,7 +226,7 @@ def test_url_of_a_recording_restores_the_moment(recording: Recording) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("clock")
 def test_invalid_time_in_the_url_is_ignored(recording: Recording) -> None:
-    """With an invalid time, or one outside the recording, the page opens at a moment within it."""
+    """If the time in the URL is invalid or outside the recording, the page opens at a time within it."""
     for query in ("time=nan", "time=1e300", "time=-5", "time=99:99", "time=inf", "time=x"):
         assert 0 <= open_page(recording, query=query).player.time <= recording.length
 

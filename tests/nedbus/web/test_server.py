@@ -210,7 +210,7 @@ def test_websocket_without_token_is_refused_without_traceback(
 def test_disconnect_during_a_message_logs_no_traceback(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A tab may close while its message waits for the document lock, which an update holds."""
+    """A tab that closes while its message waits for the document lock, which an update holds, logs nothing."""
     ran: list[None] = []
     is_free, is_waiting = threading.Event(), threading.Event()
 
