@@ -25,7 +25,7 @@ _SECTIONS: Final = {  # by title: the packages of the names
 }
 _CONSTANTS: Final = {  # without a docstring in the code
     "ANY": "Any topic, or any vehicle",
-    "Mode": "A slow reader gets the newest message of each key, or every message",
+    "Mode": "What a slow reader receives: the newest message of each key, or every message",
     "Quantity": "A quantity that an estimator can reset",
     "frames.Vector": "Three components",
     "Session": "Zenoh's own session, for features that nedbus does not cover",
@@ -68,8 +68,8 @@ def _section_of(value: Any) -> str:
 def _entry(name: str, value: Any) -> str:
     if inspect.isroutine(value):
         return section(f"`{name}`", _signature(name, value), docstring(value.__doc__), level=3)
-    made = "" if re.search("get one from|from `connect|returns one|yields them", value.__doc__ or "") else name
-    signature = _signature(made, value) if made and not issubclass(value, (Exception, nedbus.Message)) else ""
+    shown = "" if re.search("get one from|from `connect|returns one|yields them", value.__doc__ or "") else name
+    signature = _signature(shown, value) if shown and not issubclass(value, (Exception, nedbus.Message)) else ""
     return section(f"`{name}`", signature, docstring(value.__doc__), *map(str, _members(value)), level=3)
 
 

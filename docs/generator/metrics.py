@@ -18,8 +18,8 @@ def metrics_page() -> str:
     ]
     return page(
         "Metrics",
-        "A service exposes them at `/metrics` with `--http`, and `nedbus export` those of a reader; "
+        "A service with `--http` exposes its metrics at `/metrics`, and `nedbus export` those of a reader; "
         "dashboards and alerts: [Operations](../operate.md).",
-        "Metrics named `process_*` are the standard ones of Prometheus clients.",
+        "`process_*` are the standard metrics of Prometheus clients.",
         table(["metric", "kind", "labels", "meaning"], rows),
     )

@@ -68,7 +68,7 @@ def events_page() -> str:
         section(
             "Log events",
             "The `event` of each line with `--log-format json`. "
-            "Of each rate-limited kind, up to 50 lines are logged at once, then 6 a minute.",
+            "Up to 50 lines of each rate-limited event are logged at once, then 6 a minute.",
             table(["event", "meaning", "rate-limited"], rows),
         ),
         section(
@@ -129,8 +129,8 @@ def keys_page() -> str:
             "\nThe Zenoh encoding starts with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
             "mask with one bit for each field that was not provided, the lowest for `timestamp`."
             "\nFor any message that is not in this table, `;hash=...` follows the name: the first 32 hexadecimal "
-            "digits of its RIHS01 hash as ROS 2 computes it (`nedbus_msgs.short_hash`), as builds of PX4 may define "
-            "the same message differently."
+            "digits of its RIHS01 hash as ROS 2 computes it (`nedbus_msgs.short_hash`), because builds of PX4 may "
+            "define the same message differently."
             "\nA reader queries `nedbus/@schema/*/<Message>?hash=...`, computes the hash of the fields in each reply, "
             "and decodes a payload only with the fields that match its hash; without a match the message is invalid.",
             table(["message", "fields", "bytes", "encoding"], messages),

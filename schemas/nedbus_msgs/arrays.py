@@ -27,7 +27,7 @@ MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
 _MIN_COLUMNAR: Final = 20
-"""Number of messages from which column-wise rule checks are faster than one message at a time."""
+"""Minimum number of messages for which checking rules by column is faster than by message."""
 
 
 def _numpy_type(kind: FieldType) -> Any:
@@ -59,7 +59,7 @@ class Arrays(Generic[M]):
         self._value_mask = ~self._tag_mask
         self._has_text = any(kind.is_text for kind in types.values())
         checked = {name for rule in definition.rules for name in rule.fields}
-        # Struct that unpacks the fields with rules from an element's bytes, and an expression for each of them.
+        # A struct that unpacks only the fields with rules from an element, and an expression for each unpacked field.
         form, accessors, index = "=", dict[str, str](), 0
         for name, kind in types.items():
             form += kind.form if name in checked else f"{self.dtype[name].itemsize}x"
@@ -74,7 +74,7 @@ class Arrays(Generic[M]):
     def decode(self, payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
         """Decode concatenated full-width payloads; return the messages and a mask of the valid ones.
 
-        False in the mask is not final: such a payload may still be valid for the codec.
+        A payload masked as invalid may still be valid: decode it with the codec to find out.
         """
         # The XOR turns correct tags into 0, and bools into 0 or 1.
         wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
@@ -102,7 +102,7 @@ class Arrays(Generic[M]):
         return ~invalid
 
     def require_valid(self, array: MessageArray) -> None:
-        """Raise InvalidMessageError, with its index, for the first message that breaks a rule."""
+        """Raise InvalidMessageError with the index of the first message that breaks a rule."""
         for index in np.flatnonzero(~self.valid_mask(array)).tolist():
             try:
                 self._codec.encode_row(self.to_row(array[index]))
@@ -124,18 +124,18 @@ class Arrays(Generic[M]):
         return self.definition.validation.unpack(element.tobytes())
 
     def to_element(self, row: Values) -> Values:
-        """Convert a row for assignment to an array: text becomes UTF-8, as NumPy rejects non-ASCII strings."""
+        """Convert a row for assignment to an array: text becomes UTF-8, because NumPy rejects non-ASCII strings."""
         if not self._has_text:
             return row
         return tuple(encode_text(value) if isinstance(value, str) else value for value in row)
 
     def to_message(self, element: np.void) -> M:
         """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
-        fields: dict[str, Any] = self.definition.validation.name(self.to_row(element))
+        fields: dict[str, Any] = self.definition.validation.by_name(self.to_row(element))
         return self.definition.model(**fields)
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
-        """Return unvalidated CDR payloads, one per element; the model must have all fields of the layout."""
+        """Encode messages as CDR without validating them, one payload per element; the model must have all fields."""
         cdr = self._cdr(layout)
         payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), cdr)
         for name in layout.types:
@@ -146,7 +146,7 @@ class Arrays(Generic[M]):
         """Decode CDR payloads; return the messages and a mask of the valid ones.
 
         Fields that the model lacks are dropped; the others are converted to the model's types.
-        False in the mask is not final: such a payload may still be valid for `decode_with` and the model.
+        A payload masked as invalid may still be valid: decode it with `decode_with` and the model to find out.
         """
         zeros = cdr_layout(layout).zeros
         fits = np.array([len(each) == len(zeros) and each[:2] == HEADER[:2] for each in payloads], bool)

@@ -14,7 +14,7 @@ class NedbusError(Exception):
 
 
 def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...]) -> NedbusError:
-    return kind.__new__(kind, *arguments)  # from its final text, which the constructor would format again
+    return kind.__new__(kind, *arguments)  # bypasses the constructor, which would format the text again
 
 
 class ArgumentError(NedbusError, ValueError):
@@ -61,7 +61,7 @@ class InvalidMessageError(NedbusError, ValueError):
     """Raised when a message to publish has a wrong type or an unknown field, or breaks a rule.
 
     `reason`: one line with each invalid field, the broken rule and the value.
-    `violations`: field and broken rule of each, without the value; `index`: that of the message in an array.
+    `violations`: pairs of field and broken rule, without the value; `index`: position of the message in an array.
     """
 
     def __init__(

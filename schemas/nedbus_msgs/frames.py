@@ -120,12 +120,12 @@ class MapProjection:
         if not angle:
             return self.latitude, self.longitude
         sine, cosine = _sine_and_cosine(self.latitude)
-        near, far = math.cos(angle), math.sin(angle)
-        up = near * sine + x * far * cosine / angle
-        along, aside = cosine * near - x * sine * far / angle, y * far / angle
+        sine_angle, cosine_angle = math.sin(angle), math.cos(angle)
+        axial = cosine_angle * sine + x * sine_angle * cosine / angle
+        radial, eastward = cosine_angle * cosine - x * sine_angle * sine / angle, y * sine_angle / angle
         # PX4 uses an arc sine, which is inexact at the poles; elsewhere the result is the same.
-        latitude = math.degrees(math.atan2(up, math.hypot(along, aside)))
-        return latitude, math.remainder(self.longitude + math.degrees(math.atan2(aside, along)), 360.0)
+        latitude = math.degrees(math.atan2(axial, math.hypot(radial, eastward)))
+        return latitude, math.remainder(self.longitude + math.degrees(math.atan2(eastward, radial)), 360.0)
 
 
 class GlobalPosition(NamedTuple):

@@ -3,10 +3,10 @@
     application/msgpack;px4_msgs/VehicleLocalPosition;source=mavlink;missing=fffff00000000
     application/msgpack;px4_msgs/WheelEncoders;hash=0123456789abcdef0123456789abcdef;source=ulog
 
-`hash` identifies the definition, as builds of PX4 may differ (see `short_hash`); the twelve messages of the first
+`hash` identifies the definition: builds of PX4 may differ (see `short_hash`); the twelve messages of the first
 version of nedbus omit it.
 `missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; omitted if 0.
-Encoding and parsing are cached, as almost all messages of a publisher have the same encoding.
+Encoding and parsing are cached, because almost all messages of a publisher have the same encoding.
 """
 
 import math
@@ -66,7 +66,7 @@ def encoding_of(definition: Definition[Any], source: str | None, provided: froze
 
 
 def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
-    """Return the first 32 hex digits of the RIHS01 hash of a message with these fields: 128 bits in each encoding."""
+    """Return the first 32 hex digits (128 bits) of the RIHS01 hash of a message with these fields."""
     return hash_of(Layout("", "", types=types), f"{PACKAGE}/{name}").removeprefix("RIHS01_")[:32]
 
 

@@ -68,7 +68,7 @@ class ResetTracker:
     def add(self, message: Message) -> Continuous:
         """Add the next message of the stream and return its values without jumps.
 
-        All tracks restart when the timestamp goes back, as the vehicle has rebooted.
+        All tracks restart when the timestamp goes back, because the vehicle has rebooted.
         """
         last, self._last = self._last, message
         reset: set[Quantity] = set()

@@ -54,7 +54,7 @@ class Address:
 
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-        """Parse a key; raise AddressError if it is not the key of an address, as with wildcards."""
+        """Parse a key; raise AddressError if it is not the key of one address, for example if it has wildcards."""
         found = _STREAM.fullmatch(key.removeprefix(prefix)) if key.startswith(prefix) else None
         if found is None:
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
@@ -246,7 +246,7 @@ def _check_instance(topic: str, instance: int | None) -> None:
     if instance is None:
         return
     if get_topic(topic).instances is False:
-        raise AddressError("instance", instance, f"none, as {topic} has no instances")
+        raise AddressError("instance", instance, f"none ({topic} has no instances)")
     if type(instance) is not int or not 0 <= instance < _INSTANCES:
         raise AddressError("instance", instance, f"0 to {_INSTANCES - 1} for {topic}")
 

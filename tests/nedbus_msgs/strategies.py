@@ -35,7 +35,7 @@ WITHIN = {"heading": struct.unpack("<f", struct.pack("<f", math.pi))[0], "ref_la
 BEYOND = {"heading": float(np.nextafter(np.float32(math.pi), np.float32(4)))} | {
     name: math.nextafter(bound, 360.0) for name, bound in WITHIN.items() if name != "heading"
 }
-BREAKING: list[Mapping[str, object]] = [
+VIOLATIONS: list[Mapping[str, object]] = [
     *(
         {flag: True, **{other: 1.0 for other in names if other != name}, name: value}
         for flag, names in FLAG_FIELDS.items()
@@ -47,7 +47,7 @@ BREAKING: list[Mapping[str, object]] = [
     {"timestamp": 2**63, "timestamp_sample": 2**63 + 1},
 ]
 """For each rule, values that just break it; the last one breaks the rule."""
-KEEPING: list[Mapping[str, object]] = [
+EXTREMES: list[Mapping[str, object]] = [
     *({flag: True, **dict.fromkeys(names, 1.0)} for flag, names in FLAG_FIELDS.items()),
     *({flag: False, name: math.nan} for flag, names in FLAG_FIELDS.items() for name in names),
     *({name: value} for name in NOT_NEGATIVE for value in (math.nan, math.inf, -0.0)),
@@ -71,10 +71,12 @@ SAME_TYPE = {
     "float32": float32s | st.sampled_from([-1.0, 3.2, math.nan]),
     "float64": st.floats() | st.sampled_from([90.0, 90.5, -180.0, 181.0]),
 }
-FLAGGED = [name for names in FLAG_FIELDS.values() for name in names]
-RULED = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FLAGGED, *NOT_NEGATIVE, *WITHIN]
-BROKEN = st.sampled_from(RULED).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
-MANY = settings(max_examples=10 * settings().max_examples)
+FIELDS_WITH_FLAGS = [name for names in FLAG_FIELDS.values() for name in names]
+FIELDS_WITH_RULES = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FIELDS_WITH_FLAGS, *NOT_NEGATIVE, *WITHIN]
+POSSIBLE_VIOLATIONS = st.sampled_from(FIELDS_WITH_RULES).flatmap(
+    lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]])
+)
+MANY_EXAMPLES = settings(max_examples=10 * settings().max_examples)
 """For hostile input, which is fast to generate and needs many examples."""
 
 

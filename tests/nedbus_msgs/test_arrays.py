@@ -25,20 +25,20 @@ from tests.flights.local_position import (
     valid_mask,
 )
 from tests.nedbus_msgs.strategies import (
-    BREAKING,
-    BROKEN,
+    EXTREMES,
     FLAG_FIELDS,
     FLIGHTS,
-    KEEPING,
+    POSSIBLE_VIOLATIONS,
     REAL,
+    VIOLATIONS,
     messages,
     pack_full_width,
 )
 
-# On both sides of each length at which another algorithm is used.
+# Lengths around those at which the algorithm changes.
 SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
 Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and values that may break its rules
-CASES = st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4)
+CASES = st.lists(st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=2)), min_size=1, max_size=4)
 
 
 def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
@@ -50,7 +50,7 @@ def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
 
 @given(st.sampled_from(SIZES), CASES, st.randoms(use_true_random=False))
 def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
-    """Mixed valid and invalid messages are decoded as one by one, for any array length."""
+    """An array of valid and invalid messages is decoded exactly like each message alone, at any length."""
     choices = [*REAL, *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases)]
     payloads = order.choices(choices, k=size)
     rows = {payload: row_or_none(payload) for payload in choices}
@@ -63,7 +63,7 @@ def test_array_equals_its_rows(size: int, cases: list[Case], order: random.Rando
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize(("changes", "expected"), [(BREAKING, False), (KEEPING, True)], ids=["breaking", "keeping"])
+@pytest.mark.parametrize(("changes", "expected"), [(VIOLATIONS, False), (EXTREMES, True)], ids=["violation", "extreme"])
 def test_each_rule_is_checked_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
     """A message that breaks a rule is invalid, one on its bound is valid, and neither affects other messages."""
     for change in changes:
@@ -79,10 +79,10 @@ def test_each_rule_is_checked_at_any_length(size: int, changes: list[Mapping[str
 @given(st.sampled_from(SIZES), st.integers(0, PAYLOAD_SIZE - 1), st.integers(0, 255), st.sampled_from(REAL))
 def test_corrupt_payload_does_not_affect_others(size: int, offset: int, byte: int, flight: bytes) -> None:
     """A payload with one changed byte is valid only if it decodes; all other messages are unchanged."""
-    damaged = bytearray(flight)
-    damaged[offset] = byte
+    corrupt = bytearray(flight)
+    corrupt[offset] = byte
     payloads = [flight] * size
-    payloads[size // 2] = bytes(damaged)
+    payloads[size // 2] = bytes(corrupt)
     array, valid = decode_array(b"".join(payloads))
     row = row_or_none(payloads[size // 2])
     if valid[size // 2]:
@@ -114,10 +114,10 @@ def test_decoded_array_is_a_writable_copy(size: int) -> None:
 def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> None:
     """Reversed and strided views are supported."""
     payloads = [REAL[index % len(REAL)] for index in range(size * abs(step))]
-    part = decode_array(b"".join(payloads))[0][::step]
-    assert encode_array(part) == b"".join(payloads[::step])
-    part["eph"][size // 2] = -1.0
-    assert np.flatnonzero(~valid_mask(part)).tolist() == [size // 2]
+    view = decode_array(b"".join(payloads))[0][::step]
+    assert encode_array(view) == b"".join(payloads[::step])
+    view["eph"][size // 2] = -1.0
+    assert np.flatnonzero(~valid_mask(view)).tolist() == [size // 2]
 
 
 @pytest.mark.parametrize("excess", [-1, 1])

@@ -32,7 +32,7 @@ GUARDED = [
     for name, value in vars(definition.model).items()
     if isinstance(value, property) and "; None unless " in str(value.__doc__)
 ]
-EACH = pytest.mark.parametrize(
+EACH_PROPERTY = pytest.mark.parametrize(
     ("definition", "name", "flags"), GUARDED, ids=[f"{each[0].name}.{each[1]}" for each in GUARDED]
 )
 
@@ -59,7 +59,7 @@ def test_doubt_flags_are_validity_and_dead_reckoning() -> None:
         (GOOD | {"v_z_valid": 0.0001}, "vz invalid 99 %"),
     ],
 )  # fmt: skip
-def test_shares_are_described(shares: dict[str, float], text: str) -> None:
+def test_flag_shares_are_described_in_words(shares: dict[str, float], text: str) -> None:
     """Flags that are bad in all messages are grouped; others have a percentage, which is never 0 or 100 %."""
     assert describe_flags(shares) == text
 
@@ -76,9 +76,9 @@ def model_and_row(message: Message) -> tuple[Any, Any]:
     return message, tuple.__new__(message.DEFINITION.row, message.__dict__.values())
 
 
-@EACH
+@EACH_PROPERTY
 def test_property_is_none_unless_all_flags_are_true(definition: Definition[Any], name: str, flags: list[str]) -> None:
-    """Any flag that is false or not provided makes it None; zeros are returned if all flags are set."""
+    """A flag that is false or not provided makes the property None; if all flags are true, zeros are returned."""
     fields = {field: 0.0 for flag in flags for field in definition.flags[flag]}
     for each in model_and_row(definition.model(timestamp=1, **fields, **dict.fromkeys(flags, True))):
         assert getattr(each, name) is not None
@@ -89,7 +89,7 @@ def test_property_is_none_unless_all_flags_are_true(definition: Definition[Any],
                 assert getattr(each, name) is None, unset
 
 
-@EACH
+@EACH_PROPERTY
 def test_property_name_is_not_a_field(definition: Definition[Any], name: str, flags: list[str]) -> None:
     """No PX4 layout has a current or renamed field with the name of a property."""
     assert name not in definition.known_types.keys() | definition.older.keys()
@@ -120,8 +120,8 @@ def test_properties_return_the_fields(message: VehicleLocalPosition, as_row: boo
     assert either.global_position == (to_global(message) if has_position and has_origin else None)
 
 
-def test_properties_of_global_and_home_position() -> None:
-    """They return position and global position, and None while a flag is false."""
+def test_global_and_home_position_properties_follow_their_flags() -> None:
+    """A property whose flags are not all true is None; the others return the fields."""
     estimate = VehicleGlobalPosition(timestamp=1, lat=47.0, lon=8.0, alt=400.0, lat_lon_valid=True, alt_valid=True)
     assert (estimate.global_position, estimate.ground_altitude) == (GlobalPosition(47.0, 8.0, 400.0), None)
     home = HomePosition(timestamp=1, x=1.0, y=2.0, z=-3.0, lat=0.0, lon=0.0, alt=0.0, valid_lpos=True)

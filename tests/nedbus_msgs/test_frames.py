@@ -46,14 +46,14 @@ def with_origin(**fields: object) -> VehicleLocalPosition:
     return VehicleLocalPosition.model_validate({"timestamp": 1, **origin, **fields})
 
 
-def test_projection_of_one_degree_of_latitude() -> None:
-    """The distance is that on PX4's sphere."""
+def test_one_degree_of_latitude_has_px4_length() -> None:
+    """One degree of latitude is 111,194.93 m on PX4's sphere."""
     north, east = MapProjection(0.0, 0.0).project(1.0, 0.0)
     assert north == pytest.approx(111194.9266, abs=0.01)
     assert east == pytest.approx(0.0, abs=0.01)
 
 
-def test_global_and_local_positions_equal_px4s() -> None:
+def test_global_and_local_positions_match_px4() -> None:
     """Both directions reproduce the values of PX4's own tests."""
     position = to_global(with_origin(x=0.5, y=1.0, z=-2.0))
     assert position
@@ -91,7 +91,7 @@ def test_altitude_without_vertical_origin_is_nan() -> None:
 
 @pytest.mark.logs
 @pytest.mark.parametrize("name", ["sitl_1.15_events.ulg", "nxp_v0_ekf_failure.ulg"])
-def test_to_global_agrees_with_px4_in_real_logs(name: str) -> None:
+def test_to_global_matches_px4_in_real_logs(name: str) -> None:
     """At equal timestamp_sample, to_global and PX4's vehicle_global_position differ by less than 1e-10 degrees."""
     if not (LOGS / name).exists():
         pytest.skip(f"real logs not found: {LOGS}")
@@ -141,7 +141,7 @@ def unit(latitude: float, longitude: float) -> tuple[float, float, float]:
     return (math.cos(latitude) * math.cos(longitude), math.cos(latitude) * math.sin(longitude), math.sin(latitude))
 
 
-def test_known_frame_conversions() -> None:
+def test_frame_conversions_match_hand_computed_values() -> None:
     """Values worked out by hand from the conventions of PX4 and ROS."""
     assert ned_to_enu((1.0, 2.0, 3.0)) == (2.0, 1.0, -3.0)
     assert frd_to_flu((1.0, 2.0, 3.0)) == (1.0, -2.0, -3.0)
@@ -183,7 +183,7 @@ def rotate(q: Sequence[float], vector: tuple[float, float, float]) -> tuple[floa
 
 
 @given(angles, angles, angles)
-def test_converted_attitude_rotates_vectors_alike(roll: float, pitch: float, yaw: float) -> None:
+def test_converted_attitude_rotates_vectors_the_same_way(roll: float, pitch: float, yaw: float) -> None:
     """The converted attitude rotates an FLU vector as the original rotates the same vector in FRD."""
     q = euler_to_quaternion(roll, pitch, yaw)
     enu = quaternion_ned_to_enu(q)

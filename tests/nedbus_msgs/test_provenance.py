@@ -19,7 +19,7 @@ def test_provenance_round_trip(source: str | None, provided: set[str]) -> None:
 
 
 def test_encoding_without_missing_fields_has_no_mask() -> None:
-    """A source that provides all fields adds only its name, and no source adds nothing."""
+    """If all fields are provided, the encoding has no `missing` part, and without a source nothing is appended."""
     assert encoding_of(None) == ENCODING
     assert encoding_of("sim") == f"{ENCODING};source=sim" == encoding_of("sim", frozenset(FIELD_TYPES))
     assert encoding_of("x", frozenset(FIELD_TYPES.keys() - {"timestamp", "x"})) == f"{ENCODING};source=x;missing=41"
@@ -37,7 +37,7 @@ def test_invalid_parts_of_an_encoding_are_ignored(encoding: str) -> None:
 
 
 def test_mask_bits_beyond_the_last_field_are_ignored() -> None:
-    """They may belong to a newer layout."""
+    """The extra bits may belong to fields of a newer layout."""
     assert provenance_of(f"{ENCODING};missing={'f' * 14};new=1").missing == FIELD_TYPES.keys()
 
 

@@ -35,7 +35,7 @@ def addresses(draw: st.DrawFn) -> Address:
     return Address(draw(CHUNK), topic.name, instance)
 
 
-def test_vehicle_local_position_has_px4s_four_topics() -> None:
+def test_vehicle_local_position_has_four_topics() -> None:
     """Only estimator_local_position has instances, and vehicle_local_position is the default."""
     assert DEFAULT_TOPIC == "vehicle_local_position"
     alone = ("vehicle_local_position", "vehicle_local_position_groundtruth", "external_ins_local_position")

@@ -43,7 +43,7 @@ class WheelEncoders(nedbus.Message):
     wheel_speed: Float32 = field("Speed of the wheels [rad/s]")
 
 
-def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
+def subscribe_by_class_and_topic(bus: nedbus.Bus, any_topic: str) -> None:
     """By class, the message type is known; by topic name, it is any message."""
     for sample in bus.subscribe(nedbus.VehicleAttitude):
         assert_type(sample, nedbus.Sample[nedbus.VehicleAttitude])
@@ -62,7 +62,7 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
     assert_type(bus.latest(), list[nedbus.Sample[nedbus.VehicleLocalPosition]])
 
 
-def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
+def use_rows_as_messages(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
     """Functions that accept a message also accept a row."""
     assert_type(nedbus.frames.to_global(sample.message), nedbus.frames.GlobalPosition | None)
     assert_type(nedbus.frames.to_global(row.message), nedbus.frames.GlobalPosition | None)

@@ -23,8 +23,8 @@ _PX4_TRAILER: Final = 24  # PX4 sends 4 + sizeof(struct) + 24 bytes, and its str
 class CdrLayout:
     """CDR form of one layout: the struct of the body, and the payload offset of each field.
 
-    `limit`: maximum payload size [bytes]. `bool_mask`: bits that are 0 in valid bools, in the payload read as a
-    little-endian integer.
+    `limit`: maximum payload size [bytes].
+    `bool_mask`: the bits that must be 0 because bools are 0 or 1, with the payload read as a little-endian integer.
     """
 
     body: struct.Struct
@@ -59,7 +59,7 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
         offset = ((wrong & -wrong).bit_length() - 1) // 8
         name = next(name for name, first in reversed([*cdr.offsets.items()]) if first <= offset)
         raise DecodeError(f"{name}: {payload[offset]} is not a bool (0 or 1)", definition.name)
-    return cdr.validation.name(cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER))))
+    return cdr.validation.by_name(cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER))))
 
 
 def encode_with(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> bytes:

@@ -20,7 +20,7 @@ from nedbus_msgs.model.px4_types import BASES, FieldType
 from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
-"""Maximum size of a payload, and so of a message [bytes]."""
+"""Maximum size of a payload [bytes]."""
 
 NewerLayouts = Mapping[int, Sequence[str]]
 """Field names of layouts unknown to this version, by layout number."""
@@ -49,7 +49,7 @@ class Codec(Generic[M]):
     """The codec of one message.
 
     `size`: payload size [bytes].
-    `tags`: the payload with zeros for values, as an integer; `tag_mask`: its bits that are not values.
+    `tags`: the payload with all values zero, as an integer; `tag_mask`: a mask of the bits that are not values.
     `offsets`: field, array index and payload offset of every value.
 
     `encode(message)`: return the payload of a message; float32 fields are rounded.
@@ -82,7 +82,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     name, types, model = definition.name, definition.types, definition.model
     validation, make_row = definition.validation, definition.row
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
-    name_values, template, flatten = validation.name, validation.template, validation.flatten
+    by_name, template, flatten = validation.by_name, validation.template, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
     tags, tag_mask, packed, offsets = _payload_parts(types, head)
     size, pack_flat, unpack_flat = packed.size, packed.pack, packed.unpack
@@ -109,13 +109,13 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         if len(values) != count:
             raise EncodeError(f"{len(values)} values, expected {count}", name)
         row = check_row(values)
-        return encode(to_model(name_values(values))) if row is None else encode_valid(row)
+        return encode(to_model(by_name(values))) if row is None else encode_valid(row)
 
     def encode_valid(row: Values) -> bytes:
         try:
             return pack(row)
         except OverflowError:  # beyond float32; the model raises the error
-            return encode(to_model(name_values(row)))
+            return encode(to_model(by_name(row)))
 
     def to_model(fields: Mapping[str, object]) -> M:
         try:
@@ -171,7 +171,7 @@ def _payload_parts(
     for name, kind in types.items():
         field_tags, field_code, field_bits = full_width(kind)
         tags, values, code = tags + field_tags, values + field_bits, code + field_code
-        tag = 3 * kind.is_text or int(kind.base != "bool")  # bytes of the tag besides the value
+        tag = 3 * kind.is_text or int(kind.base != "bool")  # tag bytes before each value
         step = tag + kind.size
         offsets += [(name, part, len(tags) - (kind.values - part) * step + tag) for part in range(kind.values)]
     mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
@@ -214,7 +214,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
         if any(isinstance(part, tuple) for part in parts):
             raise reject(f"{name}: nested array")
         is_text = name in definition.types and definition.types[name].is_text
-        # The model accepts "NaN" and the like, from JSON.
+        # The model would accept the float names of JSON, such as "NaN".
         if not is_text and any(isinstance(part, str) for part in parts):
             raise reject(f"{name}: text, expected numbers or bools")
     return dict(zip(names, values, strict=True))

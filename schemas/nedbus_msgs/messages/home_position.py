@@ -10,7 +10,7 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field, w
 class HomePosition(Message):
     """Home position of a vehicle, the point to which it returns, in global coordinates and in local NED.
 
-    Latitude and longitude, altitude, and local position have a validity flag; invalid values are mostly 0, not NaN.
+    Horizontal position, altitude and local position each have a validity flag; invalid values are mostly 0, not NaN.
     PX4 publishes it when home is set or moved, which may be minutes apart: keep the last one.
     valid_attitude exists in main only; up to 1.18 the validity of roll, pitch and yaw is unknown.
     x, y and z become outdated when the estimator moves the origin of local NED.

@@ -8,7 +8,7 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Ui
 
 
 def _integer(value: float, scale: float) -> int:
-    """Convert a value to an integer in units of 1/scale; NaN and infinity become 0."""
+    """Convert a value to an integer in units of 1 / scale; NaN and infinity become 0."""
     return round(value * scale) if math.isfinite(value * scale) else 0
 
 
@@ -128,6 +128,6 @@ class SensorGps(Message):
 
     @property
     def velocity(self) -> Ned | None:
-        """Velocity [m/s] [NED]; None without a fix, and unless vel_ned_valid."""
+        """Velocity [m/s] [NED]; None without a fix, or while vel_ned_valid is false."""
         is_valid = self.vel_ned_valid and self.fix_type >= SensorGps.FIX_TYPE_2D
         return Ned(self.vel_n_m_s, self.vel_e_m_s, self.vel_d_m_s) if is_valid else None

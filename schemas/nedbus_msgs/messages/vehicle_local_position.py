@@ -25,7 +25,7 @@ class VehicleLocalPosition(Message):
     x, y, z, vx, vy and vz hold numbers even while they are invalid: check the flags.
 
     Numbers in float32 fields are rounded to the nearest float32, like a C float, so a message is received bit for bit
-    as it was created; numbers beyond the range of float32 (1e39) are rejected.
+    as it was created; numbers beyond the range of float32, such as 1e39, are rejected.
     An omitted field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
     Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a broken rule.
@@ -159,7 +159,7 @@ def describe_flags(shares: Mapping[str, float]) -> str:
     """Describe the flags that cast doubt on messages, given each flag's share of messages with it set (0 to 1).
 
     "xy z invalid, dead reckoning" applies to all messages, "xy invalid 20 %" to some of them; "ok" if there is none.
-    The validity of a quantity without a share is unknown: "vz unknown", or "validity unknown" if no flag has one.
+    A flag without a share is unknown: "vz unknown", or "validity unknown" if all are.
     """
     bad = {name: 1.0 - shares[name] for name in _VALID if name in shares}
     bad |= {name: shares[name] for name in _WARNINGS if name in shares}

@@ -1,4 +1,4 @@
-"""What a message class declares besides its fields: topics, layouts and renamed fields."""
+"""Declarations in a message class, other than fields: topics, layouts and renamed fields."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ class Topic:
 
     `rate`: nominal rate at which PX4 publishes or logs it [Hz]; 0 if there is none.
     `doc`: its publisher.
-    `on_change`: PX4 publishes it on change, otherwise at `rate`; bursts and pauses are not faults.
+    `on_change`: True if PX4 publishes it on change, so bursts and pauses are normal; False if it does so at `rate`.
     `instances`: True if it has uORB instances, one per EKF or sensor; None if unknown.
     `plain_first`: the ROS 2 topic of instance 0 has no suffix, as in PX4's defaults.
     `priority`: Zenoh priority; higher ones are sent first on a congested link.
@@ -74,7 +74,7 @@ class Layout:
 def cached_on_owner(make: _F) -> _F:
     """Cache up to 1,024 results of a function in its first argument, a Definition or Layout, and free them with it.
 
-    A global cache would keep every definition that a peer sends.
+    A global cache would keep alive every definition that a peer sends.
     """
 
     @wraps(make)
@@ -92,7 +92,7 @@ class RenamedField:
     """A field of older layouts that the model has under another name or in another unit.
 
     `new`: the model's fields with its value, or an element such as `position[0]`.
-    `up`, `down`: conversions of its value to the model and back; None if only the name changed.
+    `up`, `down`: functions that convert its value to the model's and back; None if only the name changed.
     `type`: its PX4 type, if different; `doc`: its unit and meaning.
     """
 
@@ -106,5 +106,5 @@ class RenamedField:
     @property
     def targets(self) -> list[tuple[str, int | None]]:
         """The model's fields with its value, each with an element index or None."""
-        parts = [place.rstrip("]").partition("[") for place in self.new.split()]
+        parts = [target.rstrip("]").partition("[") for target in self.new.split()]
         return [(field, int(index) if index else None) for field, _, index in parts]

@@ -12,7 +12,7 @@ from functools import cached_property
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
-from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic, cached_on_owner
+from .declaration import ALL, RELEASES, Layout, Topic, cached_on_owner
 from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values
 
@@ -46,11 +46,11 @@ class Row(tuple[Any, ...]):
 
 
 class UpgradePlan(NamedTuple):
-    """How the fields of a layout fill those of the model.
+    """Mapping from the fields of a layout to those of the model.
 
-    `provided`: the filled fields of the model, which are also the keys of `names` and `converted`.
-    `names`: the source field with the same value.
-    `converted`: the source fields (None for a missing array element) and the function that converts their values.
+    `provided`: the model's fields that get a value: the keys of `names` and `converted`.
+    `names`: the source field, for each field whose value is copied.
+    `converted`: for each other field, the source fields (None for a missing array element) and the conversion.
     """
 
     provided: frozenset[str]
@@ -134,9 +134,9 @@ class Definition(Generic[M_co]):
         return known
 
     def recorded_layout(self, provided: frozenset[str]) -> Layout:
-        """Return the layout to record messages in, given the provided fields of the model.
+        """Return the layout for recording messages that have these fields of the model.
 
-        This is the current layout; if no PX4 layout has all fields, it is the PX4 layout with exactly these, if any.
+        If the current layout is not one of PX4's, return PX4's layout with exactly these fields, if there is one.
         """
         return self.current if self.current.name != ALL else self.find_layout(provided) or self.current
 
@@ -148,7 +148,8 @@ class Definition(Generic[M_co]):
         for old in (self.older[name] for name in names if name in self.older):
             for base, index in old.targets:
                 if index is not None and base not in direct:
-                    converted.setdefault(base, ([None] * self.types[base].values, _elements))[0][index] = old.name
+                    sources, _ = converted.setdefault(base, ([None] * self.types[base].values, lambda *values: values))
+                    sources[index] = old.name
                 elif old.up and base not in direct:
                     converted.setdefault(base, ([old.name], old.up))
                 elif base not in converted:
@@ -172,7 +173,7 @@ class Definition(Generic[M_co]):
         return found
 
     def meaning(self, name: str) -> str:
-        """Return unit and meaning of a field in any layout."""
+        """Return unit and meaning of a field of any layout."""
         field = self.model.model_fields.get(name)
         return (field.description if field else self.older[name].doc if name in self.older else "") or ""
 
@@ -198,8 +199,7 @@ class Definition(Generic[M_co]):
         """Return the error text for an unknown field, with suggestions."""
         base, bracket, _ = name.partition("[")
         near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
-        schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
-        hint = f"did you mean {' or '.join(near)}?" if near else f"'{schema}' lists the fields"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"'nedbus schema {self.name}' lists the fields"
         return f"unknown field {name!r}: {hint}"
 
     def __repr__(self) -> str:
@@ -217,12 +217,12 @@ class Definition(Generic[M_co]):
             fields = list(map(self._field, base.split()))
         for change in changes:
             if change.startswith("without "):
-                gone = change.split()[1:]
-                fields = [field for field in fields if field[0] not in gone]
+                removed = change.split()[1:]
+                fields = [field for field in fields if field[0] not in removed]
             else:
                 after, _, names = change.partition(":")
-                place = [name for name, _ in fields].index(after) + 1
-                fields[place:place] = map(self._field, names.split())
+                index = [name for name, _ in fields].index(after) + 1
+                fields[index:index] = map(self._field, names.split())
         return dict(fields)
 
     def _field(self, text: str) -> tuple[str, FieldType]:
@@ -238,7 +238,7 @@ class Definition(Generic[M_co]):
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
     """Build a message from the fields of any PX4 release; arrays are tuples.
 
-    RenamedField names are mapped to current ones, and unknown names are ignored.
+    Old names of fields are mapped to current ones, and unknown names are ignored.
     A missing field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
     Raises pydantic.ValidationError for an invalid message.
@@ -257,10 +257,6 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
         except (TypeError, OverflowError):  # not a number, which the model rejects
             (upgraded[name],) = values
     return upgraded
-
-
-def _elements(*values: object) -> tuple[object, ...]:
-    return values
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:

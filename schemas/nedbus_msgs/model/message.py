@@ -17,10 +17,10 @@ _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
 class Message(BaseModel):
-    """One message of one vehicle; each subclass declares the fields of one PX4 message.
+    """A message of a vehicle; each subclass declares the fields of one PX4 message.
 
     Numbers in float32 fields are rounded to the nearest float32, like a C float, so a message is received bit for bit
-    as it was created; numbers beyond the range of float32 (1e39) are rejected.
+    as it was created; numbers beyond the range of float32, such as 1e39, are rejected.
     An omitted field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
     Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a broken rule.
@@ -49,7 +49,7 @@ class Message(BaseModel):
             # A subclass may have its own validators, which only Pydantic runs.
             row = validation.row_of(fields) if type(self) is definition.model else None
             try:
-                values = None if row is None else validation.name_rounded(row)
+                values = None if row is None else validation.rounded_by_name(row)
             except OverflowError:
                 values = None
             if values is None:
@@ -57,7 +57,7 @@ class Message(BaseModel):
             else:
                 fill(self, values, definition.all_fields if len(fields) == len(values) else frozenset(fields))
 
-        # Pydantic's mark for its own constructor: validation of dicts and JSON bypasses it.
+        # Marks this constructor as Pydantic's own, so that validation of dicts and JSON bypasses it.
         __init__.__pydantic_base_init__ = True
 
     @classmethod
@@ -89,7 +89,7 @@ class Message(BaseModel):
         values, validation = self.__dict__, self.DEFINITION.validation
         row = validation.values_of(values)
         try:
-            values.update(validation.name_rounded(row))
+            values.update(validation.rounded_by_name(row))
         except OverflowError:
             raise self._error(validation.overflows(values)) from None
         if not validation.passes_rules(row):
@@ -159,7 +159,7 @@ def fill(message: _M, values: dict[str, object], given: Set[str]) -> _M:
     return message
 
 
-# The slots that Pydantic's own validator sets (2.12 to 2.x); set directly, as the models are frozen.
+# The slots that Pydantic's own validator sets (2.12 to 2.x); set directly because models are frozen.
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
     for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")

@@ -48,7 +48,7 @@ ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 class FieldType(str):
     """A PX4 field type by its name, such as `float32[4]`, with derived properties; `field_type` creates it.
 
-    `base`: the type of one value; `length`: the elements of an array, None for a single value.
+    `base`: the type of one value; `length`: number of elements of an array, None for a single value.
     `is_text`: True for a char array. `char[127]` is a single value, a `str` of at most 127 bytes of UTF-8, which ends
     at the first NUL; bytes that are not UTF-8 become "?".
     `is_array`: True for a type whose value is a tuple. `values`: number of values.

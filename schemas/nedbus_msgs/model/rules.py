@@ -1,6 +1,6 @@
 """Validation rules between fields, as Python expressions on values and on NumPy columns.
 
-Every rule holds on all real flights examined; docs/messages.md has the counts.
+Every rule holds in all examined real flights; docs/messages.md has the counts.
 """
 
 import math
@@ -12,7 +12,7 @@ from string import Formatter
 from typing import Any, Final, NamedTuple, cast
 
 FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
-"""The largest angle that PX4 sends: float32(pi), which is above the double pi."""
+"""The largest angle that PX4 sends: float32(pi), which exceeds pi as a double."""
 
 _QUATERNION: Final = struct.Struct("<4f")
 
@@ -110,7 +110,7 @@ class UnitQuaternion(Rule):
 def compile_rules(rules: Sequence[Rule], accessors: Mapping[str, str]) -> Callable[[Any], bool]:
     """Compile all rules to one predicate on `values`; `accessors`: the expression for each field.
 
-    A single expression costs no more than its comparisons.
+    A single expression avoids a function call per rule.
     """
     passed = []
     for rule in rules:

@@ -1,7 +1,7 @@
 """Fast path of validation: all fields of a message as one tuple, in a fifth of the model's time.
 
 It checks the model's types and rules, and accepts nothing that the model rejects.
-Anything it does not accept is passed to the model, which decides and reports the reasons.
+The model decides on anything else, and reports the reasons.
 """
 
 import math
@@ -41,7 +41,7 @@ class Validation:
         self.template: dict[str, object] = dict.fromkeys(names)
         self._types = types
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
-        # Not the model's schema: Pydantic needs 20 ms to build it for all messages, and swallows Ctrl-C meanwhile.
+        # Not the model's schema: Pydantic takes 20 ms to build it for all messages, during which it swallows Ctrl-C.
         tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
         self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
         self._struct = struct.Struct("=" + "".join(kind.form for kind in kinds))
@@ -69,16 +69,16 @@ class Validation:
         except KeyError:  # an unknown field in place of a missing one
             return None
 
-    def name(self, row: Values) -> dict[str, object]:
+    def by_name(self, row: Values) -> dict[str, object]:
         """Return the values of all fields by name."""
         values = self.template.copy()
         values.update(zip(self.template, row, strict=True))
         return values
 
-    def name_rounded(self, row: Values) -> dict[str, object]:
+    def rounded_by_name(self, row: Values) -> dict[str, object]:
         """Return the values of all fields by name, rounded to float32; raise OverflowError beyond its range."""
         packed = self._struct.pack(*self.flatten(row))
-        return self.name(self.unflatten(self._struct.unpack(packed)))
+        return self.by_name(self.unflatten(self._struct.unpack(packed)))
 
     def unpack(self, packed: bytes) -> Values:
         """Unpack the values of all fields from consecutive native values."""
@@ -94,18 +94,20 @@ class Validation:
 
 def _flatten_functions(kinds: Sequence[FieldType]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:
     """Return functions that flatten and restore rows with fields of these types."""
-    flat, nested, index, place = [], [], 0, 0  # first value after the last array: in the row, and in the flat tuple
+    flat, nested = [], []
+    index = flat_index = 0  # of the first value after the last array, in the row and in the flat tuple
     for position, kind in enumerate(kinds):
         if kind.length is not None:
-            start = place + position - index
+            start = flat_index + position - index
             one, back = f"*row[{position}]", f"row[{start}:{start + kind.values}]"
             if kind.is_text:
                 one, back = f"encode_text(row[{position}])", f"decode_text(row[{start}])"
             flat += [f"*row[{index}:{position}]", one]
-            nested += [f"*row[{place}:{start}]", back]
-            index, place = position + 1, start + kind.values
+            nested += [f"*row[{flat_index}:{start}]", back]
+            index, flat_index = position + 1, start + kind.values
     if not flat:
         return tuple, tuple
-    functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ((flat, index), (nested, place))]
+    ends = ((flat, index), (nested, flat_index))
+    functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ends]
     flatten, unflatten = (compile_lambda(each, encode_text=encode_text, decode_text=decode_text) for each in functions)
     return flatten, unflatten

@@ -32,5 +32,5 @@ from .subscription import AsyncSubscription, Subscription
 if TYPE_CHECKING:
     from .receiving.batch import Batch
 else:
-    # Lazy, as importing NumPy takes longer than everything else.
+    # Lazy: importing NumPy takes longer than all other imports together.
     __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})

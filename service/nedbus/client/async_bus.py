@@ -23,29 +23,29 @@ from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
 
 _WAKE_INTERVAL: Final = 1.0  # s between checks for Ctrl-C while connecting
-_MAX_QUERIES: Final = 32  # of a bus at a time, each in a thread; further ones wait
+_MAX_QUERIES: Final = 32  # concurrent queries of a bus, each in a thread; further ones wait
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
 def _awaited(
-    method: Callable[Concatenate[Any, _P], _T], *, waits: Callable[[Any], bool] = lambda _: True
+    method: Callable[Concatenate[Any, _P], _T], *, may_block: Callable[[Any], bool] = lambda _: True
 ) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _T]]:
-    """Wrap a method of the blocking class as a coroutine; it runs in a thread if `waits` returns True."""
+    """Wrap a method of the blocking class as a coroutine, which runs in a thread if `may_block` returns True."""
 
     @wraps(method)
-    async def call(twin: Any, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        if waits(twin):
-            result: _T = await twin._in_thread(method, twin._blocking, *args, **kwargs)
+    async def call(wrapper: Any, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        if may_block(wrapper):
+            result: _T = await wrapper._in_thread(method, wrapper._blocking, *args, **kwargs)
             return result
-        return method(twin._blocking, *args, **kwargs)
+        return method(wrapper._blocking, *args, **kwargs)
 
     return call
 
 
 class AsyncBus:
-    """A Bus for asyncio, from `connect_async`: the same methods, awaited if they wait.
+    """The asyncio version of Bus, from `connect_async`: methods that wait are coroutines.
 
     It has no `open_session`, because Zenoh sessions are blocking.
     """
@@ -63,7 +63,7 @@ class AsyncBus:
 
     @property
     def closed(self) -> bool:
-        """True until the bus is opened, and once it is closed."""
+        """True before the bus is opened and after it is closed."""
         return self._bus is None or self._bus.closed
 
     @property
@@ -88,8 +88,8 @@ class AsyncBus:
     @overload
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
-        """Return a subscription for `async for`; see `Bus.subscribe`. It opens with the first wait."""
-        return Bus.subscribe(cast("Bus", self), *message, **options)  # it calls `subscribe_to`
+        """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # only calls `self.subscribe_to`
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -131,20 +131,20 @@ class AsyncBus:
         return AsyncPublisher(await self._in_thread(call, lossless=lossless, source=source))
 
     async def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
-        """Close the bus; see `Bus.close`. Cancelling it ends the wait for readers, and closes at once."""
-        if (bus := self._bus) is not None:  # in a new thread, as all others may wait
+        """Close the bus; see `Bus.close`. If cancelled, it closes at once, without waiting for readers."""
+        if (bus := self._bus) is not None:  # in a new thread: those of the pool may be blocked
             thread = ThreadPoolExecutor(1, "nedbus-close")
-            await _run(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
+            await _run_cancellable(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
         opening = asyncio.create_task(self._in_thread(self._open_bus, cancelled))
         try:
-            while not opening.done():  # asyncio can miss a Ctrl-C just before it blocks, so it wakes up regularly
+            while not opening.done():  # asyncio can miss a Ctrl-C just before it blocks: wake it regularly
                 await asyncio.wait({opening}, timeout=_WAKE_INTERVAL)
             self._bus = opening.result()
         except asyncio.CancelledError:
-            cancelled.set()  # else the thread keeps trying, and blocks the exit of the interpreter
+            cancelled.set()  # otherwise the thread keeps connecting and blocks interpreter exit
             opening.cancel()
             raise
         return self
@@ -161,8 +161,8 @@ def _stop_waiting(bus: Bus) -> None:
         publisher._flow_control.cancelled.set()
 
 
-async def _run(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
-    """Run a call in a thread; when cancelled, `cancel` has to end it soon."""
+async def _run_cancellable(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
+    """Run a call in a thread; on cancellation, call `cancel`, which must end it soon."""
     running = asyncio.get_running_loop().run_in_executor(thread, call)
     try:
         return await asyncio.shield(running)
@@ -186,12 +186,12 @@ def connect_async(
 
 
 class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
-    """A Publisher for asyncio; get one from `await bus.publisher(...)`.
+    """The asyncio version of Publisher; get one from `await bus.publisher(...)`.
 
-    Attributes and errors are those of Publisher; all methods are awaited.
+    Attributes and errors are those of Publisher; all methods are coroutines.
     Methods that may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) run in a thread of this
-    publisher and do not block the event loop. Cancelling one, as a timeout does, ends its wait: `published` then has
-    the number of messages sent, and a cancelled `close` has closed without waiting. Await each call before the next.
+    publisher and do not block the event loop. Cancelling one, for example by a timeout, ends its wait: `published` then
+    holds the number of messages sent, and a cancelled `close` closes without waiting. Await each call before the next.
     """
 
     def __init__(self, publisher: Publisher) -> None:
@@ -210,8 +210,8 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
         """The number of messages published."""
         return self._blocking.published
 
-    publish = _awaited(Publisher.publish, waits=attrgetter("lossless"))
-    publish_row = _awaited(Publisher.publish_row, waits=attrgetter("lossless"))
+    publish = _awaited(Publisher.publish, may_block=attrgetter("lossless"))
+    publish_row = _awaited(Publisher.publish_row, may_block=attrgetter("lossless"))
     publish_many = _awaited(Publisher.publish_many)
     flush = _awaited(Publisher.flush)
     close = _awaited(Publisher.close)
@@ -227,4 +227,4 @@ class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
             finally:
                 flow_control.cancelled = threading.Event()
 
-        return await _run(self._thread, run, cancel=cancelled.set)
+        return await _run_cancellable(self._thread, run, cancel=cancelled.set)

@@ -51,8 +51,8 @@ class Bus(AbstractContextManager["Bus"]):
         self._directory = VehicleDirectory(Selection().alive_key_expr(prefix=prefix), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
-        closing = ExitStack()  # in reverse order; closing the session ends an open query for layouts
-        heartbeats = self._publishers.heartbeats  # the registry references publishers, and they the bus
+        closing = ExitStack()  # runs in reverse order; closing the session ends an open query for layouts
+        heartbeats = self._publishers.heartbeats  # not the registry: its publishers reference the bus
         for close in (self._layouts.close, session.close, heartbeats.close, self._queries.close):
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
@@ -86,8 +86,8 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Subscription[Any]:
         """Return a subscription to iterate over, which starts with the last message of each key.
 
-        `message`: a class, such as VehicleAttitude, whose fields type checkers then know; its first topic, or the one
-        of its topics in `topic`, such as "estimator_attitude". Or the name of a topic, or "*" for all.
+        `message`: a message class such as VehicleAttitude, for its first topic or the one in `topic`, such as
+        "estimator_attitude"; samples are typed then. Or the name of a topic, or "*" for all topics.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
         about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
@@ -96,7 +96,7 @@ class Bus(AbstractContextManager["Bus"]):
         The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`; rates below 1 are
         downsampled further by the reader. Messages left out by downsampling count as neither lost nor dropped.
 
-        Raises ArgumentError for another `mode`, or if `max_rate` is not a finite number above 0.
+        Raises ArgumentError for an invalid `mode`, or if `max_rate` is not a finite number above 0.
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
         return self.subscribe_to(selection, mode=mode, max_rate=max_rate)
@@ -126,8 +126,8 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> list[Sample[Any]]:
         """Query the last sample of each key, sorted by address; its `latency` is its age. Topics as in `subscribe`.
 
-        Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and left out.
-        Samples from a storage have `stored` set, and are only returned without a reply of the publisher.
+        Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and omitted.
+        A sample from a storage has `stored` set; it is returned only if the publisher does not reply.
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
         key_expr = selection.key_expr(prefix=self.prefix)
@@ -146,8 +146,8 @@ class Bus(AbstractContextManager["Bus"]):
         """Return the published addresses by vehicle; use `latest` for their messages.
 
         The first call subscribes to the liveliness tokens of the publishers, and waits up to `timeout` seconds until
-        the router has sent them. If that takes longer, it returns those that have arrived, `complete` is False, and
-        the next call waits again.
+        the router has sent them. On timeout it returns the addresses received so far, with `complete` False, and the
+        next call waits again.
         """
         publishers = self.publishers(timeout=timeout)
         by_vehicle = groupby(sorted(publishers), key=attrgetter("vehicle"))
@@ -156,7 +156,7 @@ class Bus(AbstractContextManager["Bus"]):
         return vehicles
 
     def publishers(self, *, timeout: float = 2.0) -> Publishers:
-        """Return the number of publishers of each address, like `vehicles`; readers of several get a mixture."""
+        """Return the number of publishers of each address; waits as `vehicles` does. More than one is a conflict."""
         publishers = self._directory.publishers(self._session, timeout=timeout)
         publishers.complete = publishers.complete and self.connected
         return publishers
@@ -166,11 +166,11 @@ class Bus(AbstractContextManager["Bus"]):
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
 
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
-        """Query the accounts of all nedbus services: events of the last `within` seconds, and states of vehicles."""
+        """Query the event reports of all nedbus services: events of the last `within` seconds, and vehicle states."""
         return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
-        """Subscribe to the reports of messages that services on this network reject."""
+        """Subscribe to reports of the messages that services on this network reject."""
         return Rejections(self._session, prefix=self.prefix, owner=self)
 
     def publisher(
@@ -185,12 +185,12 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Publisher:
         """Return a publisher for one address.
 
-        Its declarations have reached the router: readers that subscribe after this call get the last message.
-        `lossless`: flow control for replays at the speed of the readers. `publish` waits while a reader of mode "every"
-        has more than 2,000 unread messages, and sends 10 messages per second meanwhile; `close` waits until the readers
-        have all messages.
+        It returns once the router has processed its declarations: later subscribers receive the last message.
+        `lossless`: flow control for replays as fast as the readers. `publish` slows down to 10 messages per second
+        while a reader of mode "every" has more than 2,000 unread messages; `close` waits until the readers have all
+        messages.
         `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
-        `definition`: of a message of your own, from `define_msg`; readers query it from the publisher.
+        `definition`: of a custom message, from `define_msg`; readers query it from the publisher.
 
         Raises AddressInUseError if this bus already has a publisher for the address.
         """
@@ -201,14 +201,14 @@ class Bus(AbstractContextManager["Bus"]):
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
-        """Open another Zenoh session, at the same routers or at `endpoint`; the caller closes it."""
+        """Open another Zenoh session, to the same routers or to `endpoint`; the caller closes it."""
         return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Close the bus with its subscriptions and publishers. Idempotent.
 
         Lossless publishers are flushed first, for at most `timeout` seconds, unless a `with` block ends with an
-        exception. Ctrl-C ends the wait, and closes.
+        exception. Ctrl-C ends the wait and closes the bus.
         """
         try:
             if not self.closed and timeout > 0:
@@ -246,7 +246,7 @@ class Bus(AbstractContextManager["Bus"]):
         else:
             receiver = Receiver(self._session, pending_queue)
         self._receivers.add(receiver)
-        if self.closed:  # by another thread
+        if self.closed:  # by another thread, in the meantime
             receiver.close()
             raise ClosedError
         return receiver
@@ -263,10 +263,10 @@ def connect(
     """Connect to a router and return a bus. Use it as a context manager; it also closes when it is garbage-collected.
 
     `endpoint`: a Zenoh endpoint such as tcp/192.168.1.5:7447, or several; the first one that answers is used.
-    The default is NEDBUS_CONNECT, `connect` in nedbus.toml, or else the router of `nedbus serve` on this host.
+    The default is NEDBUS_CONNECT, then `connect` in nedbus.toml, then the router of `nedbus serve` on this host.
     `timeout`: seconds to wait for a router; None waits until Ctrl-C. A broken link is reconnected automatically.
-    `tls`: for tls/ endpoints, by default from the settings. `config`: the path of a file to use for nedbus.toml.
-    With an endpoint, only `prefix`, and for tls/ the files of TLS, are read from it, unless they are given.
+    `tls`: for tls/ endpoints, by default from the settings. `config`: path of a file to read instead of nedbus.toml.
+    With `endpoint`, only `prefix` and the TLS files are read from the file, unless passed as arguments.
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
@@ -274,6 +274,6 @@ def connect(
 
 
 def _close_all(receivers: Iterable[Receiver]) -> None:
-    with ExitStack() as closing:  # closes all of them, even if one fails
+    with ExitStack() as closing:  # closes all, even if one fails
         for receiver in list(receivers):
             closing.callback(receiver.close)

@@ -13,14 +13,14 @@ from nedbus.transport import is_forked
 
 from .io_thread import CallThread
 
-_DRAIN: Final = 2.0  # s that the exit of the process waits for pending closes
-_START_PAUSE: Final = 0.005  # s between looks at a thread that is about to run
+_DRAIN: Final = 2.0  # s that process exit waits for pending closes
+_START_PAUSE: Final = 0.005  # s between checks whether a thread has started
 _closer = CallThread("nedbus-closer")
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 
 
 def join_thread(thread: threading.Thread, timeout: float) -> None:
-    """Wait up to `timeout` seconds for a thread to end, also if Ctrl-C interrupted its start and it is yet to run."""
+    """Wait up to `timeout` seconds for a thread to end, even if Ctrl-C interrupted its start and it has yet to run."""
     end = time.monotonic() + timeout
     while (left := end - time.monotonic()) > 0:
         try:
@@ -32,10 +32,10 @@ def join_thread(thread: threading.Thread, timeout: float) -> None:
 
 
 class Finalizer:
-    """Call `close` once: from `close_now`, after garbage collection of the owner, or at exit of the process.
+    """Call `close` once: from `close_now`, after garbage collection of the owner, or at process exit.
 
-    The garbage collector runs on any thread, perhaps one that holds a lock `close` needs, and closing waits for Zenoh:
-    a separate thread therefore closes collected objects.
+    Collected objects are closed on a separate thread, because closing waits for Zenoh, and the garbage collector runs
+    on any thread, perhaps one that holds a lock `close` needs.
     `close` must not reference the owner.
     """
 

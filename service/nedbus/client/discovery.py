@@ -1,4 +1,4 @@
-"""Discovery of vehicles, services, accounts and rejected messages; peers are not trusted."""
+"""Discovery of vehicles, services, event reports and rejected messages; peers are untrusted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
-_MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
+_MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
 _POLL: Final = 0.002  # s between polls for tokens
 
@@ -43,14 +43,14 @@ class Publishers(Counter[Address]):
 class Vehicles(dict[str, list[Address]]):
     """The published addresses by vehicle.
 
-    `complete`: False if the router has not listed all of them yet, there are more than 10,000, or no router is there.
+    `complete`: False without a router, until the router has listed all addresses, and above 10,000 of them.
     """
 
     complete = True
 
 
 class VehicleDirectory:
-    """The addresses and their publishers, by the liveliness tokens on a key expression, from the first call on."""
+    """Addresses and their publishers, from the liveliness tokens on a key expression; subscribes on the first call."""
 
     def __init__(self, key_expr: str, *, prefix: str) -> None:
         self._prefix, self._key_expr = prefix, key_expr
@@ -80,8 +80,8 @@ class VehicleDirectory:
             publishers = Publishers(self._addresses.values())
             publishers.complete = self._tokens.complete
             if self._tokens.is_listing and timeout and not self._logged:
-                text = "the router has not listed all vehicles within %g s, only %d streams: it is slow, or refuses"
-                _log.warning(text, timeout, len(publishers), extra=about("incomplete"))
+                text = "the router listed only %d streams within %g s, not all: it is slow, or forbids listing"
+                _log.warning(text, len(publishers), timeout, extra=about("incomplete"))
             self._logged = self._tokens.is_listing and (self._logged or timeout > 0)
             return publishers
 
@@ -94,7 +94,7 @@ class StreamStatus:
     health: Health
 
 
-class _FromPeer:
+class _UntrustedReply:
     """Base of untrusted replies: an invalid value becomes the default, and invalid rows of a list are dropped."""
 
     __slots__ = ()
@@ -114,7 +114,7 @@ class _FromPeer:
 
 
 @dataclass(frozen=True, slots=True)
-class LogStreamStatus(_FromPeer):
+class LogStreamStatus(_UntrustedReply):
     """The ULog stream of one vehicle over MAVLink, of a source with `log=`.
 
     `state`: "streaming" while messages are published from the stream; otherwise they are converted from MAVLink.
@@ -123,8 +123,8 @@ class LogStreamStatus(_FromPeer):
     by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
     `header_time`: duration of the header [s]; the vehicle's own log has a gap of this length.
     `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds of the number of
-    ULog messages in them, which the protocol does not tell. `undecodable`: data without a usable definition.
-    `saved`: the file that it is saved to.
+    ULog messages in them, which MAVLink does not report. `undecodable`: data without a usable definition.
+    `saved`: the path of the saved log.
     """
 
     vehicle: str = ""
@@ -143,7 +143,7 @@ class LogStreamStatus(_FromPeer):
 
     @property
     def text(self) -> str:
-        """All of it but the vehicle in one line; the reason and the file are text from a peer."""
+        """All values except the vehicle, in one line; the reason and the file name are untrusted text."""
         lost = f"{self.lost_at_least} to {self.lost_at_most} messages lost"
         parts = (
             self.state,
@@ -159,7 +159,7 @@ class LogStreamStatus(_FromPeer):
 
 
 @dataclass(frozen=True, slots=True)
-class SourceStatus(_FromPeer):
+class SourceStatus(_UntrustedReply):
     """The status of one source.
 
     `state`: starting, waiting, running, retrying, done or failed; empty if not reported.
@@ -201,13 +201,13 @@ class SourceStatus(_FromPeer):
 
 
 @dataclass(frozen=True, slots=True)
-class ServiceStatus(_FromPeer):
+class ServiceStatus(_UntrustedReply):
     """The status of a service, from `bus.services()`.
 
     `service`: its id. `host`: the name of its host or container. `role`: "router" or "client".
     `started`, `now`: seconds since the epoch by its clock.
     `refused`: vehicles whose messages the access rules of its router drop.
-    Services may have any version: absent and invalid fields have their default.
+    Services may have any version: absent and invalid fields get their defaults.
     """
 
     service: str = ""
@@ -221,7 +221,7 @@ class ServiceStatus(_FromPeer):
     sources: tuple[SourceStatus, ...] = ()
 
     def split(self, _: int) -> list[ServiceStatus]:
-        """Return a status of each source; of a single one without the health of its streams; none without streams."""
+        """Split into one status per source; omit the stream health of a single source; return [] if it has none."""
         if len(self.sources) > 1:
             return [replace(self, sources=(each,)) for each in self.sources]
         return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
@@ -231,7 +231,7 @@ _STATUS: Final = TypeAdapter(ServiceStatus)
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
-    """Query the status of all nedbus services; replies that are too large are ignored."""
+    """Query the status of all nedbus services; oversized replies are ignored."""
     found: dict[str, ServiceStatus] = {}
     for key, content in parse_replies(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
         if isinstance(content, dict):
@@ -241,7 +241,7 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
-    """Query the accounts of all services for the last `within` seconds; invalid and too large replies are ignored."""
+    """Query the event reports of all services for the last `within` seconds; invalid or oversized ones are ignored."""
     selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[str, list[AccountReport]] = {}
     for key, content in parse_replies(query(session, selector, timeout=timeout)):
@@ -251,16 +251,16 @@ def find_accounts(session: Session, *, prefix: str, within: float, timeout: floa
 
 
 def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
-    """Yield the JSON texts of a report that readers accept and join; log a part that is too large, and leave it out."""
-    text = to_json(report, inf_nan_mode="constants")
-    if len(text) <= MAX_REPLY_BYTES:
-        yield text
-    elif parts := report.split(5 * len(text) // (4 * MAX_REPLY_BYTES) + 1):
+    """Yield a report in JSON parts small enough for readers, which join them; log and omit an oversized part."""
+    content = to_json(report, inf_nan_mode="constants")
+    if len(content) <= MAX_REPLY_BYTES:
+        yield content
+    elif parts := report.split(5 * len(content) // (4 * MAX_REPLY_BYTES) + 1):
         for part in parts:
             yield from reply_parts(part)
     else:
-        reason = "left out %d bytes of a reply, as readers accept at most %d in one part: use fewer or shorter names"
-        _log.warning(reason, len(text), MAX_REPLY_BYTES, extra=about("incomplete"))
+        text = "omitted %d bytes of a reply: readers accept at most %d per part; use fewer or shorter names"
+        _log.warning(text, len(content), MAX_REPLY_BYTES, extra=about("incomplete"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,24 +312,24 @@ class Rejections:
 
 
 def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
-    """Yield key and content of JSON replies within the memory limit; log all others in one line per reason."""
-    room, too_large, invalid = _MAX_MEMORY, 0, ""
+    """Yield key and content of JSON replies within the memory limit; log the discarded ones, one line per reason."""
+    free, oversized, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
-        # Upper estimate of its memory when parsed, measured with CPython 3.11.
+        # Upper bound of its memory when parsed, measured with CPython 3.11.
         size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
-        if len(text) > MAX_REPLY_BYTES or size > room:
-            too_large += 1
+        if len(text) > MAX_REPLY_BYTES or size > free:
+            oversized += 1
             continue
-        room -= size
+        free -= size
         try:
             content = json.loads(text)
         except (ValueError, RecursionError):
             invalid = invalid or key
         else:
             yield key, content
-    if too_large:
-        _log.warning("ignored %d replies that are too large", too_large, extra=about("incomplete"))
+    if oversized:
+        _log.warning("ignored %d oversized replies", oversized, extra=about("incomplete"))
     if invalid:
         extra = about("invalid", reason="no JSON")
         _log.warning("%r: ignored a reply that is not JSON", invalid[:_MAX_TEXT], extra=extra)

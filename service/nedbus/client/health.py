@@ -1,7 +1,7 @@
 """Stream health: rate, jitter, latency, age, gaps, order, reboots, resets and flags, and the stream's state; no I/O.
 
 Used by `nedbus hz`, the status of services and scripts.
-Rates and ages use a monotonic clock, as the wall clock may be set at any time.
+Rates and ages use a monotonic clock, because the wall clock may be set at any time.
 """
 
 import logging
@@ -32,7 +32,7 @@ _MIN_STEPS: Final = 5  # steps before gaps are counted
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual step and the usual rate
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
-_SELDOM: Final = 1.0  # Hz; a topic without a file that comes less often may be one of events
+_MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
 _COUNTER_MODULUS: Final = 256  # modulus of reset counters
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
 _MAX_STREAMS: Final = 4096  # per monitor
@@ -47,9 +47,9 @@ class Health:
     """Health of one stream; values are None while there are too few messages to measure them.
 
     Over the last full second: `rate` [Hz], `jitter` (standard deviation of arrival intervals) [s], `latency` (median)
-    and `latency_max` [s], and `flags`, the share of messages with each flag set, 0 to 1, without unknown ones.
+    and `latency_max` [s], and `flags`, the share of messages with each flag set, 0 to 1; unknown flags do not count.
     Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's time above three times the usual step),
-    `out_of_order`, `reboots` (PX4's time stepped back by more than 1 s), `resets` per quantity, and `flags_ever`.
+    `out_of_order`, `reboots` (PX4's time stepped back by more than 1 s), `resets` per quantity, `flags_ever` (shares).
     `nominal`: PX4's rate of this topic [Hz], 0 if it has none; logs and links are usually slower.
     `age`: seconds since the last message.
     `usual_rate`: smoothed rate so far [Hz]; a `rate` far below it means that the stream has become slow.
@@ -79,15 +79,15 @@ class Health:
         """Seconds without a message until this stream is stale: at least 3, infinity if it may pause forever."""
         if self.on_change:
             return max(TIMINGS.stale, 2 / self.nominal) if self.nominal else math.inf
-        if not self.nominal and (self.usual_rate or 0) < _SELDOM:
+        if not self.nominal and (self.usual_rate or 0) < _MIN_PERIODIC_RATE:
             return math.inf
         return max(TIMINGS.stale, 2 / self.usual_rate) if self.usual_rate else TIMINGS.stale
 
 
-_FlagCounts = Counter[tuple[str, bool]]  # messages by flag and its value, if it is known
+_FlagCounts = Counter[tuple[str, bool]]  # messages by flag and value; unknown values are not counted
 
 
-def _shares(counts: _FlagCounts) -> dict[str, float]:
+def _flag_shares(counts: _FlagCounts) -> dict[str, float]:
     known = {flag: counts[flag, True] + counts[flag, False] for flag in DOUBT_FLAGS}
     return {flag: counts[flag, True] / total for flag, total in known.items() if total}
 
@@ -104,7 +104,7 @@ class _Window:
 
     @property
     def mean(self) -> float:
-        """Mean interval [s], 0 if there is none."""
+        """Mean interval [s]; 0 without intervals."""
         return sum(self.intervals) / len(self.intervals) if self.intervals else 0.0
 
     @property
@@ -115,22 +115,20 @@ class _Window:
 
 
 class Histogram:
-    """Histogram of measurements; `limits` are the upper bounds of all buckets but the last, which is unbounded."""
+    """Histogram of measurements; `limits` are the upper bounds of all buckets but the last, which is unbounded.
+
+    `counts`: number of measurements in each bucket.
+    """
 
     def __init__(self, limits: Sequence[float]) -> None:
         self.limits = tuple(limits)
         self.sum = 0.0
-        self._counts = [0] * (len(self.limits) + 1)
+        self.counts = [0] * (len(self.limits) + 1)
 
     def add(self, value: float) -> None:
         """Count one measurement."""
-        self._counts[bisect_left(self.limits, value)] += 1
+        self.counts[bisect_left(self.limits, value)] += 1
         self.sum += value
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """Number of measurements in each bucket, the unbounded one last."""
-        return tuple(self._counts)
 
 
 class StreamHealth:
@@ -163,7 +161,7 @@ class StreamHealth:
         lost: int = 0,
         missing: Collection[str] = (),
     ) -> None:
-        """Add a valid message without its `missing` fields, or its fields by name, received at `received` [ns]."""
+        """Add a valid message or a mapping of its fields, received at `received` [ns]; `missing` fields are unknown."""
         names = _FIELDS if self._is_position else _FIELDS[:1]
         if isinstance(message, Mapping):
             timestamp, *seen = (cast("int", message.get(name, 0)) for name in names)
@@ -217,8 +215,8 @@ class StreamHealth:
             gaps=self._gaps,
             out_of_order=self._out_of_order,
             reboots=self._reboots,
-            flags=_shares(window.flags) if self._is_position and window.messages else None,
-            flags_ever=_shares(self._flags) if self._is_position and self._messages else None,
+            flags=_flag_shares(window.flags) if self._is_position and window.messages else None,
+            flags_ever=_flag_shares(self._flags) if self._is_position and self._messages else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,
@@ -244,9 +242,9 @@ class StreamHealth:
 
 
 class Monitor:
-    """Measure all streams of a subscription, at most 4096; beyond, the least recently updated one is evicted.
+    """Measure all streams of a subscription, at most 4096; beyond that the least recently updated one is evicted.
 
-    Retained samples do not count.
+    Retained samples are ignored.
     `evicted`: the number of evicted streams.
     """
 
@@ -255,24 +253,24 @@ class Monitor:
         self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample received now, or at `received` [ns] of another clock; return True if it counts."""
+        """Add a sample received now, or at `received` [ns] of another clock; return False for a retained one."""
         if sample.retained:
             return False
         address, now = sample.address, time.monotonic_ns() if received is None else received
         stream = self._streams.pop(address, None)
         if stream is None and len(self._streams) >= _MAX_STREAMS:
             if not self.evicted:
-                text = "more than %d streams: the health of those that are silent longest is forgotten"
+                text = "more than %d streams: the health of the least recently updated ones is discarded"
                 _log.warning(text, _MAX_STREAMS, extra=about("incomplete"))
             self.evicted += 1
             del self._streams[next(iter(self._streams))]
         self._streams[address] = stream = StreamHealth(sample.topic) if stream is None else stream
-        lacking = sample.provenance.missing
-        stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=lacking)
+        missing = sample.provenance.missing
+        stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=missing)
         return True
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
-        """Return the health of each stream, sorted by address, now or at `now` [ns] of the other clock."""
+        """Return the health of each stream, sorted by address, now or at `now` [ns] of the clock used in `add`."""
         streams = sorted(self._streams.items(), key=itemgetter(0))
         return {address: stream.snapshot(now) for address, stream in streams}
 
@@ -282,7 +280,7 @@ class Monitor:
         return stream.latencies if stream is not None else None
 
     def forget(self, address: Address) -> None:
-        """Remove a stream; it starts over if it comes back."""
+        """Remove a stream; its next sample starts a new measurement."""
         self._streams.pop(address, None)
 
 
@@ -295,7 +293,7 @@ class StreamState:
 
     @property
     def severity(self) -> int:
-        """Index among the states; 0 is the worst."""
+        """Index in the list of states; 0 is the worst."""
         return get_args(StateName).index(self.name)
 
     def __str__(self) -> str:
@@ -335,7 +333,7 @@ def describe_stream(health: Health, state: StreamState) -> str:
 
 
 def health_of_last(sample: Sample[Message]) -> Health:
-    """Return the health of a stream with only its last message known; the age is by the wall clock."""
+    """Return the health of a stream from its last message alone; the age is by the wall clock."""
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
     return stream.snapshot(0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent))

@@ -1,7 +1,6 @@
-"""The I/O thread of the process, which polls the channels of all its sessions, and threads that call functions in turn.
+"""The I/O thread of the process, which polls the channels of all sessions, and worker threads with a call queue.
 
-Its cost grows with what happens: jobs that wait for something to happen are due at common ticks, so that a hundred idle
-sessions wake the process as often as one.
+Idle jobs are due at common ticks: a hundred idle sessions wake the process as often as one.
 """
 
 from __future__ import annotations
@@ -20,22 +19,22 @@ from nedbus.log_event import about
 _log = logging.getLogger(__name__)
 
 TICK: Final = 0.06
-"""Pauses of this length and longer [s] end at common multiples of it, less than one tick earlier."""
+"""Pauses of at least this length [s] are cut to end at a multiple of it, common to all jobs."""
 
 _MIN_PAUSE: Final = 0.002  # s between two calls of a job
 _RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
 
 _jobs: dict[Job, None] = {}
 _start = threading.Lock()
-# At most one item. Not an Event, which is written in Python: Ctrl-C inside one leaves its lock held forever.
+# At most one item. Not an Event, which is Python code: Ctrl-C inside it can leave its lock held forever.
 _woken: queue.SimpleQueue[None] = queue.SimpleQueue()
 _sleeps_until = math.inf
 
 
 class Job:
-    """A function that the I/O thread calls until `end`, from now on.
+    """A function that the I/O thread calls repeatedly until `end`.
 
-    It takes the monotonic time [s], and returns the seconds until its next call. It must not block, as it delays all
+    It gets the monotonic time [s] and returns the seconds until its next call. It must not block: that would delay all
     sessions of the process.
     """
 
@@ -61,19 +60,19 @@ class Job:
             _woken.put(None)
 
     def end(self) -> None:
-        """Call the job no more, and wait until it no longer runs. Idempotent."""
+        """Stop the job, and wait until a running call has returned. Idempotent."""
         self._ended = True
         _jobs.pop(self, None)
         with self._running:
             pass
 
     def run(self, now: float) -> None:
-        """Call the job; the I/O thread alone calls this."""
+        """Call the job; only for the I/O thread."""
         self._requested = math.inf
         try:
             with self._running:
                 pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
-        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; other jobs must go on
+        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; other jobs must continue
             pause = _RETRY_PAUSE
             if not self._failed:
                 _log.exception("unexpected error in a background job (logged once)", extra=about("internal_error"))
@@ -82,15 +81,15 @@ class Job:
 
 
 class CallThread:
-    """A daemon thread that calls functions one after another; the first call starts it."""
+    """A daemon thread that calls queued functions one after another."""
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._calls: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # `put` has to be reentrant
+        self._calls: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # `put` must be reentrant
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Start the thread, unless it runs."""
+        """Start the thread unless it is running."""
         if self._thread is None or not self._thread.is_alive():
             with _start:
                 if self._thread is None or not self._thread.is_alive():
@@ -98,11 +97,11 @@ class CallThread:
                     self._thread.start()
 
     def put(self, call: Callable[[], object]) -> None:
-        """Call a function on the thread, which has been started."""
+        """Queue a call; the thread must have been started."""
         self._calls.put(call)
 
     def drain(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds until all calls so far have ended."""
+        """Wait up to `timeout` seconds until all queued calls have returned."""
         if self._thread is not None and self._thread.is_alive():
             drained = threading.Event()
             self.put(drained.set)
@@ -115,7 +114,7 @@ class CallThread:
                 call()
             except Exception:  # noqa: BLE001 - one failed call must not stop the others
                 _log.debug("unexpected error in thread %s", self._name, exc_info=True)
-            del call  # what it references may be collected now
+            del call  # release its references before blocking
 
 
 def _run_jobs() -> None:
@@ -125,7 +124,7 @@ def _run_jobs() -> None:
         for job in tuple(_jobs):
             if job.due <= now:
                 job.run(now)
-        _sleeps_until = math.inf  # `wake` puts an item from here on, and from the next line on only if it is earlier
+        _sleeps_until = math.inf  # from here `wake` puts an item; after the next line only for an earlier time
         _sleeps_until = due = min((job.due for job in tuple(_jobs)), default=math.inf)
         with suppress(queue.Empty):
             _woken.get(timeout=None if due == math.inf else max(0.0, due - time.monotonic()))

@@ -16,7 +16,7 @@ class RateGate:
 
     def __init__(self, rate: float) -> None:
         self._period = math.ceil(1e9 / rate)  # ns
-        # Due times are up to 2.5 ms early, so jitter has no effect: from 100 Hz to 5 Hz every 20th message passes.
+        # Due times are up to 2.5 ms early, so jitter has no effect: 100 Hz limited to 5 Hz passes every 20th message.
         self._early = min(2_500_000, self._period // 10)
         self._due = math.inf
 
@@ -25,10 +25,10 @@ class RateGate:
         due = self._due
         if due - 2 * self._period <= now < due:
             return False
-        if now < due:  # the first message, or the clock was set back, as when a vehicle restarts
+        if now < due:  # the first message, or the clock was set back, for example by a reboot
             self._due = now + self._period - self._early
         else:
-            # One period after the due time, not after this message: 100 Hz at 30 Hz gives 30 Hz, 30 or 40 ms apart.
+            # One period after the due time, not after this message: 100 Hz limited to 30 Hz stays 30 Hz on average.
             self._due = max(due + self._period, now - self._early)
         return True
 

@@ -42,13 +42,12 @@ class Sample(Generic[M_co]):
 
     `message`: the validated message; from `rows()`, a Row with the same fields.
     `address`: vehicle, topic and instance, also available as attributes.
-    `received`: time at which it left Zenoh's ring, ns since the epoch by this host's clock: not when it was read.
+    `received`: time at which it left Zenoh's ring, ns since the epoch by this host's clock (not the time of reading).
     `stamp`: Zenoh's timestamp with its clock id; None if the publisher sent none, and in copies.
     `lost`: messages of this key lost in transit just before this one.
     `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
-    `retained`: True if it was published before the subscription, which begins with the last message of each publisher;
-    also from `bus.latest()`.
-    `stored`: True if it came from a storage, as no publisher answered for the address; `bus.latest()` only.
+    `retained`: True for the last message of a publisher from before the subscription, and from `bus.latest()`.
+    `stored`: True if it came from a storage because no publisher of the address replied; `bus.latest()` only.
     """
 
     message: M_co
@@ -59,7 +58,7 @@ class Sample(Generic[M_co]):
     provenance: Provenance = _UNKNOWN
     retained: bool = False
     stored: bool = False
-    _sent: int | None = None  # in copies, as Zenoh's timestamp cannot be pickled
+    _sent: int | None = None  # in copies, because Zenoh's timestamp cannot be pickled
 
     @property
     def sent(self) -> int | None:
@@ -124,8 +123,7 @@ class Counts:
     `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
-    `forgotten`: keys forgotten, those silent longest, because there were more than 10,000; their next gap is not in
-    `lost`.
+    `forgotten`: least recently active keys, evicted as there were more than 10,000; their next gap is not in `lost`.
     """
 
     received: int = 0

@@ -23,7 +23,7 @@ from .sample import Counts, M_co, Sample
 if TYPE_CHECKING:
     from .receiving.batch import Batch
 
-_YIELD_AFTER: Final = 64  # samples between two turns for other tasks of the event loop
+_YIELD_AFTER: Final = 64  # samples after which other tasks of the event loop get a turn
 _T = TypeVar("_T")
 
 
@@ -45,7 +45,7 @@ class _SubscriptionBase(Generic[M_co]):
 
     @property
     def waiting(self) -> int:
-        """Number of messages that have arrived and are unread."""
+        """Number of received messages not yet read."""
         return self._queue.waiting
 
 
@@ -156,7 +156,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         if self._opening is not None:
             await asyncio.wait([self._opening])
         if self._finalizer is not None:
-            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new one, as all others may wait
+            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new one: those of the pool may be blocked
             await asyncio.get_running_loop().run_in_executor(thread, self._finalizer.close_now)
 
     def __aiter__(self) -> AsyncIterator[Sample[M_co]]:
@@ -178,7 +178,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
     async def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
         self._received += 1
         if self._received % _YIELD_AFTER == 0:
-            await asyncio.sleep(0)  # else a reader that never has to wait would starve other tasks
+            await asyncio.sleep(0)  # otherwise a reader that never waits would starve other tasks
         try:
             async with asyncio.timeout(timeout):
                 await self._open()
@@ -219,6 +219,6 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
 
 def _wake(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> None:
-    """Wake the reader from any thread; a function, as a bound method would keep the subscription alive."""
+    """Wake the reader from any thread; a bound method would keep the subscription alive."""
     with suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(arrival.set)

@@ -203,7 +203,7 @@ class Worker:
         if source.options.wait and last is None:
             self._state = "waiting"
             _log.info("%s: waiting for a subscriber", self._name, extra=about("replay_waiting", source=self._name))
-            while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
+            while not self._registry.has_subscriber(run.addresses) and not self._clock.wait(_READER_POLL):
                 pass
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=speed is None)

@@ -1,1 +1,1 @@
-"""Tests of the bus and its messages through a real router."""
+"""Tests of the client through a real router."""

@@ -1,4 +1,4 @@
-"""Fixtures of tests that read messages without a file."""
+"""Fixtures for tests that look up message definitions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from tests.waits import DEADLINE, changing_timings
 
 
 @pytest.fixture(scope="module")
-def patient_lookups() -> Iterator[None]:
-    """Let readers wait for definitions until the deadline: a message whose lookup takes too long is invalid."""
+def long_lookup_timeout() -> Iterator[None]:
+    """Let definition lookups last until the test's deadline: a message whose lookup times out is invalid."""
     with changing_timings() as timings:
         timings.definition_timeout = DEADLINE
         yield

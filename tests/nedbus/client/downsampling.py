@@ -15,13 +15,13 @@ from nedbus.client.publishing import downsampler
 from tests.flights.messages import message
 from tests.waits import wait_for
 
-from .numbered import take
+from .numbered import receive_timestamps
 
 MS = 1_000_000  # ns
 
 
 class Link:
-    """A TCP link to a router; `carried` counts its bytes, and it blocks while `flows` is not set."""
+    """A TCP proxy to a router; `carried`: bytes forwarded. It pauses while `flows` is not set."""
 
     def __init__(self, endpoint: str) -> None:
         self.carried = 0
@@ -35,7 +35,7 @@ class Link:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self) -> None:
-        """Break all connections, and accept no others until `broken` is false again."""
+        """Break all connections, and refuse new ones until `broken` is False."""
         self.broken = True
         for each in self._sockets:
             with suppress(OSError):
@@ -58,9 +58,9 @@ class Link:
                 far = socket.create_connection((self._to[0], int(self._to[1])))
                 self._sockets += [near, far]
                 for source, target in ((near, far), (far, near)):
-                    threading.Thread(target=self._carry, args=(source, target), daemon=True).start()
+                    threading.Thread(target=self._forward, args=(source, target), daemon=True).start()
 
-    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+    def _forward(self, source: socket.socket, target: socket.socket) -> None:
         with suppress(OSError):  # closed
             while data := source.recv(4096):
                 self.flows.wait()
@@ -69,7 +69,7 @@ class Link:
 
 
 class Clock:
-    """The fake clock of publishers."""
+    """A fake clock for publishers."""
 
     def __init__(self) -> None:
         self.now = 10**18
@@ -80,7 +80,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Downsample with a fake clock in the publishers of this process."""
+    """Make the publishers of this process downsample by a fake clock."""
     clock = Clock()
     monkeypatch.setattr(downsampler, "time", clock)
     return clock
@@ -93,20 +93,20 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
         publisher.publish(message(timestamp))
 
 
-def is_wanted(publisher: nedbus.Publisher) -> bool:
-    """Return True if a publisher is matched by a downsampling reader of its vehicle."""
-    return publisher._downsampler.vehicle.is_matched()  # what it does about that shows only once it publishes
+def has_downsampling_reader(publisher: nedbus.Publisher) -> bool:
+    """Return True if a reader has requested downsampled streams of the publisher's vehicle."""
+    return publisher._downsampler.vehicle_listener.is_matched()  # visible otherwise only once it publishes
 
 
-def wait_for_demand(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher is matched by a downsampling reader."""
-    wait_for(partial(is_wanted, publisher), what="the demand for a downsampled stream")
+def wait_for_downsampling_reader(publisher: nedbus.Publisher) -> None:
+    """Wait until a reader has requested downsampled streams of the publisher's vehicle."""
+    wait_for(partial(has_downsampling_reader, publisher), what="a reader of downsampled streams")
 
 
 def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any]) -> None:
-    """Wait until a subscription is open and matched: take message 0, which was published before.
+    """Receive message 0, published earlier, and wait until the publisher is matched.
 
-    The last message is queried, and one published meanwhile may be overtaken by the reply.
+    The reply with the last message may overtake messages published before it arrives.
     """
-    assert take(subscription, 1) == [0]
-    wait_for_demand(publisher)
+    assert receive_timestamps(subscription, 1) == [0]
+    wait_for_downsampling_reader(publisher)

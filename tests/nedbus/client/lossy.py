@@ -1,4 +1,4 @@
-"""Subscriptions that miss messages, and their retransmission requests; loopback itself is lossless."""
+"""Subscriptions that lose messages, and their retransmission requests; loopback itself is lossless."""
 
 from __future__ import annotations
 
@@ -10,53 +10,53 @@ import nedbus
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
 from nedbus.transport import RawSample, RetransmitRequest, Session
 
-from .numbered import publish, take
+from .numbered import publish, receive_timestamps
 
 
 class LossyQueue(PendingQueue):
-    """A queue that does not receive the messages `missing`, by sequence number."""
+    """A queue that loses the messages whose sequence numbers are in `missing`."""
 
     def __init__(self, key_expr: str) -> None:
         super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name=key_expr)
         self.missing: Collection[int] = ()
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        left = [raw for raw in batch if raw.source_info is None or raw.source_info.source_sn not in self.missing]
-        super().put(left, overflowed=overflowed)
+        rest = [raw for raw in batch if raw.source_info is None or raw.source_info.source_sn not in self.missing]
+        super().put(rest, overflowed=overflowed)
 
 
 class Lossy:
-    """A subscription with a lossy queue, and its requests; the first `unanswered` get no reply."""
+    """A subscription with a lossy queue. `requests`: retransmission requests; the first `unanswered` get no reply."""
 
     def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
         self.session = session
         self.publish = partial(publish, publisher)
         self.queue = queue
         self.subscription = nedbus.Subscription(receiver, queue, owner=None)
-        self.receive = partial(take, self.subscription)
-        self.asked: list[tuple[str, int, int]] = []
+        self.receive = partial(receive_timestamps, self.subscription)
+        self.requests: list[tuple[str, int, int]] = []
         self.unanswered = 0
-        self.open = self.most = 0
+        self.open = self.max_open = 0
 
-    def ask(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
-        self.asked.append((key, numbers.start, numbers.stop))
-        if len(self.asked) <= self.unanswered:
+    def request(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
+        self.requests.append((key, numbers.start, numbers.stop))
+        if len(self.requests) <= self.unanswered:
             return SimpleNamespace(ended=True, take=dict)
         self.open += 1
-        self.most = max(self.most, self.open)
-        return Counted(RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self)
+        self.max_open = max(self.max_open, self.open)
+        return CountedRequest(RetransmitRequest(session, key, publisher, numbers, timeout=timeout), self)
 
 
-class Counted:
-    """The replies to a request, which counts as open until they have ended."""
+class CountedRequest:
+    """A retransmission request, which counts as open until its last reply."""
 
     def __init__(self, answers: RetransmitRequest, lossy: Lossy) -> None:
         self._answers = answers
         self._lossy = lossy
 
-    def take(self) -> dict[int, RawSample]:
-        was, taken = self._answers.ended, self._answers.take()
-        self._lossy.open -= self._answers.ended and not was
+    def receive_timestamps(self) -> dict[int, RawSample]:
+        had_ended, taken = self._answers.ended, self._answers.take()
+        self._lossy.open -= self._answers.ended and not had_ended
         return taken
 
     @property

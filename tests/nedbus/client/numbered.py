@@ -1,4 +1,4 @@
-"""Publishers of numbered messages, which start once a reader is subscribed."""
+"""Messages with consecutive timestamps, and waiting until a publisher has a subscriber."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
         publisher.publish(message(timestamp))
 
 
-def is_read(publisher: nedbus.Publisher) -> bool:
-    """Return True if a publisher is matched by a subscriber."""
-    probe = publisher._writer.session.declare_publisher(publisher.key)  # no other session knows what this one does
+def has_subscriber(publisher: nedbus.Publisher) -> bool:
+    """Return True if a publisher has a matching subscriber."""
+    probe = publisher._writer.session.declare_publisher(publisher.key)  # other sessions have another matching status
     status = cast("zenoh.MatchingStatus", probe.matching_status)
     probe.undeclare()
     return status.matching
 
 
 def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher is matched by a subscriber; earlier messages would go nowhere."""
-    wait_for(partial(is_read, publisher), what=f"a subscriber of {publisher.key}")
+    """Wait until a publisher has a matching subscriber, which would not receive earlier messages."""
+    wait_for(partial(has_subscriber, publisher), what=f"a subscriber of {publisher.key}")
 
 
-def take(subscription: nedbus.Subscription[Any], count: int) -> list[int]:
-    """Wait for `count` messages, and return their timestamps."""
+def receive_timestamps(subscription: nedbus.Subscription[Any], count: int) -> list[int]:
+    """Receive `count` messages and return their timestamps."""
     return [subscription.receive(DEADLINE).message.timestamp for _ in range(count)]

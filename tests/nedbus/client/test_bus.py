@@ -1,4 +1,4 @@
-"""Publish, subscribe and query: the same behaviour of the blocking and the asyncio client, through a real router."""
+"""Publish, subscribe and query through a real router: the blocking and the asyncio client behave the same."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from nedbus.transport.queries import Replies
 from nedbus_msgs import DEFAULT, Address
 from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.downsampling import Link, wait_for_demand
-from tests.nedbus.client.numbered import publish, take, wait_for_subscriber
+from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
+from tests.nedbus.client.numbered import publish, receive_timestamps, wait_for_subscriber
 from tests.peers.ports import free_endpoint
 from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for
@@ -40,7 +40,7 @@ SCHEMA = "nedbus/@schema/peer/VehicleLocalPosition"
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode) -> None:
+def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode) -> None:
     """A published message arrives with its type, bit for bit, with its address and times."""
     publisher = bus.publisher("estimator_local_position", vehicle=7, instance=1)
     sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
@@ -57,13 +57,15 @@ def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mo
 
 @pytest.mark.parametrize("max_rate", [None, 50])
 @pytest.mark.parametrize("mode", BOTH)
-def test_retained_sample(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_rate: float | None) -> None:
-    """The message from before a subscription is retained, also in a pickle and from `latest`; the next one is not."""
+def test_sample_from_before_the_subscription_is_retained(
+    client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_rate: float | None
+) -> None:
+    """A sample from before the subscription is retained, even after pickling and from `latest`; the next one is not."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     subscription = client.subscribe(mode=mode, max_rate=max_rate)
     first = subscription.receive(DEADLINE)
-    wait_for_subscriber(publisher) if max_rate is None else wait_for_demand(publisher)
+    wait_for_subscriber(publisher) if max_rate is None else wait_for_downsampling_reader(publisher)
     publish(publisher, 2)
     second = subscription.receive(DEADLINE)
     assert [(each.message.timestamp, each.retained) for each in (first, second)] == [(1, True), (2, False)]
@@ -72,13 +74,13 @@ def test_retained_sample(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_ra
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_time_of_reading_does_not_count_as_latency(
+def test_latency_does_not_include_the_time_until_reading(
     client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`received` is when a sample left Zenoh's ring: a script that reads it late adds nothing to its latency."""
+    """`received` is the time at which a sample left Zenoh's ring: a script that reads late does not add latency."""
     subscription, publisher = client.subscribe(mode=mode), bus.publisher(VLP, vehicle="1")
     with suppress(nedbus.NoDataError):
-        subscription.receive(0.01)  # opens it, and starts the thread that empties the ring
+        subscription.receive(0.01)  # opens the subscription, and starts the thread that drains the ring
     wait_for_subscriber(publisher)
     publish(publisher, 1)
     wait_for(lambda: subscription.waiting, what="the message")
@@ -90,24 +92,24 @@ def test_time_of_reading_does_not_count_as_latency(
 
 
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
-    """A publisher is known to the router before its first message, which a new reader else misses once in 300 times."""
+    """A publisher is declared at the router before its first message; otherwise a new reader misses one in 300."""
     with nedbus.connect(endpoint) as other:
         for vehicle in range(100):
             publish(bus.publisher(VLP, vehicle=vehicle), 1)
-            assert take(other.subscribe(vehicle=vehicle), 1) == [1]
+            assert receive_timestamps(other.subscribe(vehicle=vehicle), 1) == [1]
 
 
-def test_subscription_is_a_choice(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """A subscription is selected by topic, vehicle name or MAVLink number, and instance; the default is the estimate.
+def test_topic_vehicle_and_instance_select_streams(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """Topic, vehicle (name or MAVLink system id) and instance select streams; the default is the position estimate.
 
-    The estimate is mixed neither with the ground truth nor with single EKFs. A subscription starts with the last value
-    of each key, even if nothing is published any more.
+    The estimate is mixed neither with the ground truth nor with single EKFs. A subscription starts with the last
+    message of each key, even if publishing has stopped.
     """
     for vehicle in ("1", "2"):
         for topic in reversed(tuple(DEFAULT.topics.values())):
             for instance in (0, 1) if topic.instances else (None,):
                 publish(bus.publisher(topic.name, vehicle=vehicle, instance=instance), 1)
-    wait_for(lambda: len(client.latest("*")) == 10, what="everything")
+    wait_for(lambda: len(client.latest("*")) == 10, what="all last messages")
     for arguments, options, addresses in (
         ([], {}, [f"1/{VLP}", f"2/{VLP}"]),
         ([], {"vehicle": 2}, [f"2/{VLP}"]),
@@ -122,8 +124,8 @@ def test_subscription_is_a_choice(client: nedbus.Bus, bus: nedbus.Bus) -> None:
             subscription.receive(0.05)
 
 
-def test_latest_is_empty_where_nothing_is(client: nedbus.Bus) -> None:
-    """Without a publisher the result is empty, without an error."""
+def test_queries_without_publishers_return_nothing(client: nedbus.Bus) -> None:
+    """Without publishers, queries return empty results and no error."""
     assert client.latest("*") == []
     assert client.vehicles() == {}
     assert client.services() == []
@@ -133,18 +135,18 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
     return len(bus.vehicles()) == count
 
 
-def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Published vehicles appear by their liveliness tokens, and closed ones disappear.
 
-    A query for all tokens costs all clients of the router, so none is sent.
+    No query for all tokens is sent: it would load all clients of the router.
     """
-    asked: list[str] = []
+    queried: list[str] = []
 
     def record_query(session: Session, key_expr: str, timeout: float) -> Replies:
-        asked.extend([key_expr] if "*" in key_expr else [])
-        return query_tokens(session, key_expr, timeout)
+        queried.extend([key_expr] if "*" in key_expr else [])
+        return original(session, key_expr, timeout)
 
-    query_tokens = alive_tokens._query_tokens
+    original = alive_tokens._query_tokens
     monkeypatch.setattr(alive_tokens, "_query_tokens", record_query)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
@@ -153,30 +155,30 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
         other.publisher(VLP, vehicle="7")
         wait_for(lambda: len(client.vehicles()["7"]) == 2, what="another address")
         assert client.vehicles()["7"] == [Address("7", "estimator_local_position", 2), Address("7", VLP)]
-    wait_for(lambda: not client.vehicles(), what="the vehicles to go")
-    assert not asked
+    wait_for(lambda: not client.vehicles(), what="the vehicles to disappear")
+    assert not queried
 
 
-def test_more_vehicles_appear_between_calls_than_are_kept(
+def test_vehicles_are_listed_again_after_an_overflow(
     endpoint: str, bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After an overflow all tokens are listed again: the list is complete and has no vehicles that left."""
+    """If too many tokens change between calls, all are listed again: the list is complete, without closed vehicles."""
     monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 20)
     gone = zenoh_session.liveliness().declare_token(f"nedbus/gone/@alive/1a/{VLP}")
-    wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
+    wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first vehicle")
     gone.undeclare()
     for number in range(12):
         zenoh_session.liveliness().declare_token(f"nedbus/gone-{number}/@alive/1a/{VLP}").undeclare()
     tokens = [zenoh_session.liveliness().declare_token(f"nedbus/{number}/@alive/1a/{VLP}") for number in range(12)]
     with nedbus.connect(endpoint) as other:
-        wait_for(partial(has_vehicles, other, len(tokens)), what="all to be there")
-    wait_for(partial(has_vehicles, bus, len(tokens)), what="all of them")
+        wait_for(partial(has_vehicles, other, len(tokens)), what="all new vehicles on another bus")
+    wait_for(partial(has_vehicles, bus, len(tokens)), what="all new vehicles")
 
 
 def test_vehicles_beyond_the_limit_are_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Two of three are an incomplete list, which is logged once; it completes once there is room."""
+    """A list truncated at the limit is incomplete, which is logged once; it is complete once all vehicles fit."""
     monkeypatch.setattr(alive_tokens, "MAX_REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
@@ -185,12 +187,14 @@ def test_vehicles_beyond_the_limit_are_logged(
         assert len(other.vehicles()) == 2
         assert not other.vehicles().complete
         next(each for each in publishers if str(each.address.vehicle) in other.vehicles()).close()
-        wait_for(lambda: len(vehicles := other.vehicles()) == 2 and vehicles.complete, what="the third one")
+        wait_for(lambda: len(vehicles := other.vehicles()) == 2 and vehicles.complete, what="the third vehicle")
     assert caplog.text.count("liveliness tokens") == 1
 
 
-def test_list_of_a_slow_router_is_incomplete(endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture) -> None:
-    """The vehicles that have arrived are returned, marked and logged once; a later call completes the list."""
+def test_vehicles_of_a_slow_router_are_incomplete(
+    endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    """On timeout the vehicles received so far are returned as incomplete, logged once; a later call completes them."""
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with closing(Link(endpoint)) as link, nedbus.connect(link.endpoint) as other:
         link.flows.clear()
@@ -198,14 +202,14 @@ def test_list_of_a_slow_router_is_incomplete(endpoint: str, bus: nedbus.Bus, cap
             vehicles = other.vehicles(timeout=0.05)
             assert (vehicles, vehicles.complete) == ({}, False)
             assert not other.publishers(timeout=0.0).complete
-        assert caplog.text.count("the router has not listed all vehicles within 0.05 s") == 1
+        assert caplog.text.count("the router listed only 0 streams within 0.05 s") == 1
         link.flows.set()
         wait_for(lambda: other.vehicles().complete, what="the end of the list")
         assert len(other.vehicles()) == len(publishers)
 
 
 def test_vehicles_without_a_router_are_incomplete() -> None:
-    """A bus whose router is gone knows no vehicles, and not whether there are any."""
+    """Without a router, the list of vehicles is incomplete."""
     where = free_endpoint()
     router = open_router(listen=(where,))
     with nedbus.connect(where) as bus:
@@ -215,45 +219,45 @@ def test_vehicles_without_a_router_are_incomplete() -> None:
         assert not bus.vehicles().complete
 
 
-def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
-    """More replies than a Zenoh channel holds (256) do not block, neither within their own bus nor in another."""
+def test_bus_receives_replies_of_its_own_300_publishers(endpoint: str) -> None:
+    """More replies than a Zenoh channel holds (256) block neither the bus that sends them nor another one."""
     with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:
         for number in range(300):
             publish(one.publisher(VLP, vehicle=str(number)), 1)
-        for asking in (one, other):
-            wait_for(partial(has_vehicles, asking, 300), what="300 vehicles")
-            assert len(asking.latest()) == 300
+        for each in (one, other):
+            wait_for(partial(has_vehicles, each, 300), what="300 vehicles")
+            assert len(each.latest()) == 300
 
 
-def answers(zenoh_session: Session, key: str) -> int:
-    """Count the replies to a plain get."""
+def count_replies(zenoh_session: Session, key: str) -> int:
+    """Return the number of replies to a plain get."""
     return sum(reply.ok is not None for reply in zenoh_session.get(key))
 
 
-def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
-    """All publishers of a key reply to a plain get, also if two processes publish the same vehicle."""
+def test_two_processes_of_one_vehicle_both_reply(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
+    """All publishers reply to a plain get, even if two processes publish the same vehicle."""
     with nedbus.connect(endpoint) as other:
         for each, topic in ((bus, VLP), (other, "external_ins_local_position")):
             publish(each.publisher(topic, vehicle="1"), 1)
         for topic in (VLP, "external_ins_local_position"):
-            wait_for(partial(answers, zenoh_session, f"nedbus/1/{topic}"), what=topic)
+            wait_for(partial(count_replies, zenoh_session, f"nedbus/1/{topic}"), what=topic)
 
 
-def test_error_in_an_answer_is_only_its_own(
+def test_exception_in_a_reply_does_not_end_the_reply_thread(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The query thread survives an exception in one reply."""
+    """After an exception in one reply, the reply thread answers the next query."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
-    wait_for(partial(answers, zenoh_session, publisher.key), what="an answer")
+    wait_for(partial(count_replies, zenoh_session, publisher.key), what="a reply")
     with monkeypatch.context() as patched:
         patched.setattr(nedbus.Publisher, "last", property(lambda _: 1 / 0), raising=False)
-        assert answers(zenoh_session, publisher.key) == 0
-    assert answers(zenoh_session, publisher.key) == 1
+        assert count_replies(zenoh_session, publisher.key) == 0
+    assert count_replies(zenoh_session, publisher.key) == 1
 
 
-def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A stored message with a later time, from an earlier run of the vehicle, does not replace the live one."""
+def test_live_message_replaces_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """`latest` prefers the message of a live publisher, even if a storage has one with a later timestamp."""
     later = zenoh.Timestamp(dt.datetime.now(dt.UTC) + dt.timedelta(hours=1), b"\x07")
     stored = {f"nedbus/{vehicle}/{VLP}": encode(message(99)) for vehicle in "12"}
     publish(bus.publisher(VLP, vehicle="1"), 1)
@@ -262,55 +266,62 @@ def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus,
         return [(sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()]
 
     with answer_queries(zenoh_session, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
-        wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="the live one and the stored one")
+        wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="a live and a stored message")
 
 
-def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """`latest` reads a layout described by its publisher, like `subscribe`."""
+def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session: Session) -> None:
+    """`latest` looks up the layout from its publisher, as `subscribe` does."""
     types = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
     layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
-    explained = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
+    schema = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
     last = reply_with({f"nedbus/1/{VLP}": msgpack.packb([9, 5, True, 2.5])})
-    with answer_queries(zenoh_session, SCHEMA, explained), answer_queries(zenoh_session, f"nedbus/1/{VLP}", last):
+    with answer_queries(zenoh_session, SCHEMA, schema), answer_queries(zenoh_session, f"nedbus/1/{VLP}", last):
         wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
 
 
-def services_of(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
-    """Reply to each query for services with all of these contents, by name of the service."""
+def reply_with_statuses(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
+    """Reply to each query for services with all these payloads, by service id."""
     return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
 
 
-def test_hostile_answers_reach_no_script(
+def test_malformed_status_is_ignored(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A status that is not JSON, or nested endlessly, is ignored, with one log line for all of them."""
+    """Replies that are not JSON, or too deeply nested, are ignored and logged in one line."""
     junk = {"evil": b"[" * 100_000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
-    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(junk)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", reply_with_statuses(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
 
 
-def test_status_that_grows_when_it_is_read_fills_no_memory(
+def test_memory_for_parsed_status_is_bounded(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """JSON may take 30 times its length in memory: of 480 kB, everything beyond 4 MiB is ignored and logged."""
+    """Parsed JSON may need 30 times its length: replies beyond the memory limit, here 4 MiB, are ignored and logged."""
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
-    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", reply_with_statuses(many)):
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
-    assert "ignored 18 replies that are too large" in caplog.messages
+    assert "ignored 18 oversized replies" in caplog.messages
 
 
-def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """The id of a status is that of its key, unknown fields are ignored, and invalid values and rows are dropped."""
+def test_status_of_hostile_or_newer_service_is_sanitized(client: nedbus.Bus, zenoh_session: Session) -> None:
+    """The id of a status is taken from its key, unknown fields are ignored, and invalid values and rows dropped."""
     sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
-    told = {"service": "lie", "host": "here", "now": 10**400, "version": [1], "sources": sources, "shape": {"of": "it"}}
+    content = {
+        "service": "forged",
+        "host": "here",
+        "now": 10**400,
+        "version": [1],
+        "sources": sources,
+        "shape": {"of": "it"},
+    }
     with answer_queries(
-        zenoh_session, "nedbus/@service/*/status", services_of({"a": json.dumps(told).encode(), "b": b"[5]"})
+        zenoh_session, "nedbus/@service/*/status", reply_with_statuses({"a": json.dumps(content).encode(), "b": b"[5]"})
     ):
         [status] = client.services()
     assert status == nedbus.health.ServiceStatus(
@@ -318,20 +329,20 @@ def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, zenoh_session:
     )
 
 
-def test_answers_that_are_too_many_are_left_out(
+def test_bytes_of_replies_are_bounded(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The bytes kept of one query are bounded, and the number of ignored replies is logged."""
+    """The bytes of replies to one query are bounded, and the number of ignored replies is logged."""
     monkeypatch.setattr("nedbus.transport.queries.MAX_QUERY_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
-    with answer_queries(zenoh_session, "nedbus/@service/*/status", services_of(many)):
+    with answer_queries(zenoh_session, "nedbus/@service/*/status", reply_with_statuses(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
     assert "nedbus/@service/*/status: dropped 40 replies beyond the limits of a query" in caplog.messages
 
 
-def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Fields by name are validated; anything that is not a message is refused before it is sent."""
+def test_published_fields_are_validated(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """A dict of fields is published if it is valid; otherwise `publish` raises and sends nothing."""
     publisher = client.publisher(VLP, vehicle="1")
     publisher.publish({"timestamp": 4, "x": 1.0})
     wait_for(lambda: [sample.message.x for sample in bus.latest()] == [1.0], what="the message")
@@ -343,7 +354,7 @@ def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) 
 
 
 def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Fields without a timestamp get the clock of PX4's own messages, in us, and it does not count as missing."""
+    """Fields without a timestamp get the time since boot [us], like PX4's messages; it does not count as missing."""
     publisher, before = client.publisher(VLP, vehicle="1"), time.monotonic_ns() // 1000
     publisher.publish({"x": 2.0})
     wait_for(bus.latest, what="the message")
@@ -352,31 +363,31 @@ def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbu
     assert "timestamp" not in last.missing
 
 
-def test_two_publishers_of_one_address_are_refused(client: nedbus.Bus) -> None:
-    """A second publisher of an address is refused, as it would mix two flights."""
+def test_second_publisher_of_an_address_raises(client: nedbus.Bus) -> None:
+    """A second publisher of an address raises AddressInUseError, because it would mix two flights."""
     publisher = client.publisher(VLP, vehicle="1")
     with pytest.raises(nedbus.errors.AddressInUseError, match="this process already publishes 1/"):
         client.publisher(VLP, vehicle="1")
     publish(publisher, 1)
 
 
-def test_two_threads_get_one_publisher_of_an_address(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two threads that open a publisher for the same address at once, one is refused."""
+def test_concurrent_publishers_of_an_address_raise(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If two threads open a publisher for the same address at once, one of them raises."""
     both = threading.Barrier(2)
 
-    def meet(*arguments: object, **options: object) -> nedbus.Publisher:
+    def create_together(*arguments: object, **options: object) -> nedbus.Publisher:
         with suppress(threading.BrokenBarrierError):
             both.wait(0.2)
-        return nedbus.Publisher(*arguments, **options)  # type: ignore[arg-type] # whatever is given
+        return nedbus.Publisher(*arguments, **options)  # type: ignore[arg-type] # passed on unchanged
 
-    monkeypatch.setattr("nedbus.client.publishing.publisher_registry.Publisher", meet)
+    monkeypatch.setattr("nedbus.client.publishing.publisher_registry.Publisher", create_together)
     with ThreadPoolExecutor(2) as pool:
         made = [pool.submit(bus.publisher, VLP, vehicle="1") for _ in range(2)]
     assert sorted(each.exception() is None for each in made) == [False, True]
 
 
-def test_wrong_names_are_refused_before_anything_is_sent(client: nedbus.Bus) -> None:
-    """A wrong topic, vehicle or mode is an error at once, and a ValueError, not a subscription without data."""
+def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> None:
+    """An invalid topic, vehicle, instance or mode raises a ValueError at once, instead of subscribing to nothing."""
     with pytest.raises(nedbus.AddressError, match="vehicle_local_positon"):
         client.subscribe("vehicle_local_positon")
     with pytest.raises(nedbus.ArgumentError, match="mode 'newest' is not valid: expected one of latest, ev") as error:
@@ -387,12 +398,12 @@ def test_wrong_names_are_refused_before_anything_is_sent(client: nedbus.Bus) -> 
     with pytest.raises(nedbus.AddressError, match="vehicle"):
         client.latest(vehicle="a/b")
     with pytest.raises(nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .*a call for each of several"):
-        client.subscribe(vehicle=["1", "2"])  # type: ignore[call-overload] # that is the mistake
+        client.subscribe(vehicle=["1", "2"])  # type: ignore[call-overload] # the mistake under test
     with pytest.raises(nedbus.AddressError, match="instance"):
         client.publisher("estimator_local_position", vehicle="1")
 
 
-def test_prefix_separates(endpoint: str) -> None:
+def test_prefixes_separate_fleets(endpoint: str) -> None:
     """Fleets with different prefixes on one router do not see each other."""
     with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
         publish(one.publisher(VLP, vehicle="1"), 1)
@@ -402,8 +413,8 @@ def test_prefix_separates(endpoint: str) -> None:
         assert two.vehicles() == {}
 
 
-def test_receive_times_out_with_words(client: nedbus.Bus) -> None:
-    """NoDataError is a TimeoutError; its text has the key that did not arrive, and advice."""
+def test_receive_raises_no_data_error_on_timeout(client: nedbus.Bus) -> None:
+    """NoDataError is a TimeoutError; its text has the key and a remedy."""
     subscription = client.subscribe(VLP, vehicle="9")
     with pytest.raises(TimeoutError, match=rf"nedbus/9/{VLP} within 0\.05 s.*nedbus list") as info:
         subscription.receive(0.05)
@@ -411,8 +422,8 @@ def test_receive_times_out_with_words(client: nedbus.Bus) -> None:
 
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf")])
-def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
-    """No timeout value leads to an error of another library."""
+def test_zero_negative_and_infinite_timeouts_are_valid(bus: nedbus.Bus, timeout: float) -> None:
+    """Zero, negative and infinite timeouts work for queries and `receive`."""
     publish(bus.publisher(VLP, vehicle="1"), 1)
     bus.latest("*", timeout=timeout)
     bus.vehicles(timeout=timeout)
@@ -424,11 +435,11 @@ def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
             taken.append(subscription.receive(timeout))
         return taken
 
-    wait_for(receive, what="the message, which a receive without patience gets once it is there")
+    wait_for(receive, what="the message")
     assert taken[0].message.timestamp == 1
 
 
-def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
+def test_async_reader_yields_to_other_tasks(endpoint: str, bus: nedbus.Bus) -> None:
     """A reader that always finds a sample still yields to the event loop."""
     publisher = bus.publisher(VLP, vehicle="1")
 
@@ -456,7 +467,7 @@ def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
     assert asyncio.run(scenario()) > 5
 
 
-def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
+def test_async_receive_timeout_loses_no_sample(endpoint: str, bus: nedbus.Bus) -> None:
     """A receive that times out does not lose a sample."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
@@ -475,8 +486,8 @@ def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> None:
-    """Each message goes to one of two threads, without an error, in either mode."""
+def test_threads_reading_one_subscription_share_its_messages(bus: nedbus.Bus, mode: Mode) -> None:
+    """Each message goes to exactly one of several reading threads, in either mode."""
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(mode=mode)
     wait_for_subscriber(publisher)
@@ -491,7 +502,7 @@ def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> N
     publish(publisher, *range(1, 2001))
     wait_for(lambda: 2000 in taken, what="the last message")
     if mode == "every":
-        wait_for(lambda: len(taken) == 2000, what="all others")
+        wait_for(lambda: len(taken) == 2000, what="all other messages")
     subscription.close()
     for thread in threads:
         thread.join(DEADLINE)

@@ -1,4 +1,4 @@
-"""Opening and closing of a bus: absent routers, cancelling, forks and garbage collection, with either client."""
+"""Opening and closing a bus: absent routers, cancellation, forks and garbage collection, with either client."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from tests.waits import DEADLINE, wait_for
 
 from .test_bus import BOTH
 
-_STEPS: Final = 100  # more than there are in a read that waits
+_STEPS: Final = 100  # more function calls than a blocking read makes
 
 
-def test_nothing_listening_is_a_clear_error() -> None:
-    """The error is a ConnectionError with the endpoint, the time waited, and advice."""
+def test_connect_without_a_router_raises() -> None:
+    """Without a router, `connect` raises a ConnectionError with the endpoint and a remedy."""
     where = free_endpoint()
     assert issubclass(nedbus.ConnectError, ConnectionError)
     with pytest.raises(nedbus.ConnectError, match=rf"nothing answers at {where} .*nedbus serve.*NEDBUS_CONNECT"):
@@ -42,7 +42,7 @@ def test_nothing_listening_is_a_clear_error() -> None:
 
 
 @pytest.mark.parametrize("is_async", [False, True])
-def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
+def test_connect_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
     """`timeout=None` waits for a router without a limit."""
     where = free_endpoint()
 
@@ -64,12 +64,12 @@ def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> N
 
 
 @pytest.mark.parametrize("read", [lambda subscription: subscription.receive(DEADLINE), next])
-def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
+def test_ctrl_c_at_any_step_of_a_read_releases_all_locks(
     endpoint: str, bus: nedbus.Bus, read: Callable[[nedbus.Subscription[Any]], nedbus.Sample[Any]]
 ) -> None:
-    """A read interrupted at any point blocks neither the next read nor the close.
+    """A read interrupted at any step blocks neither the next read nor the close.
 
-    CPython handles signals where a Python function begins, and where a C function has returned.
+    CPython handles signals when a Python function is entered and when a C function has returned.
     """
     publisher, interrupted = bus.publisher(VLP, vehicle="1"), list[int]()
 
@@ -79,20 +79,20 @@ def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
             for step in range(1, _STEPS):
                 steps = iter(range(step))
 
-                def note(_: object, event: str, __: object, steps: Iterator[int] = steps) -> None:
+                def interrupt(_: object, event: str, __: object, steps: Iterator[int] = steps) -> None:
                     if event in ("call", "c_return") and next(steps, None) is None:
                         raise KeyboardInterrupt
 
-                soon = threading.Timer(0.003, publish, [publisher, 2 * step])  # while it waits
-                soon.start()
-                sys.setprofile(note)
+                timer = threading.Timer(0.003, publish, [publisher, 2 * step])  # during the wait
+                timer.start()
+                sys.setprofile(interrupt)
                 try:
                     read(subscription)
                 except KeyboardInterrupt:
                     interrupted.append(step)
                 finally:
                     sys.setprofile(None)
-                soon.join()
+                timer.join()
                 publish(publisher, 2 * step + 1)
                 while read(subscription).message.timestamp <= 2 * step:
                     pass
@@ -104,12 +104,12 @@ def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
     assert len(interrupted) > 25
 
 
-def test_wait_that_is_cancelled_leaves_nothing() -> None:
-    """After a cancelled connect the connecting thread ends without a trace."""
-    said: list[object] = []
+def test_cancelled_connect_leaves_no_thread() -> None:
+    """After a cancelled `connect_async` the connecting thread ends without an error."""
+    errors: list[object] = []
 
     async def scenario() -> None:
-        asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context))
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(nedbus.connect_async(free_endpoint(), timeout=None).__aenter__(), 0.1)
         while len(asyncio.all_tasks()) > 1:
@@ -117,10 +117,10 @@ def test_wait_that_is_cancelled_leaves_nothing() -> None:
         gc.collect()
 
     asyncio.run(scenario())
-    assert not said
+    assert not errors
 
 
-def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connect_uses_first_answering_endpoint_or_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of several endpoints that answers is used; NEDBUS_CONNECT is used by scripts without an endpoint."""
     with nedbus.connect([free_endpoint(), endpoint]) as bus:
         assert bus.connected
@@ -129,8 +129,8 @@ def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, mon
         assert bus.connected
 
 
-def test_timeout_includes_the_opening() -> None:
-    """A receive with a timeout does not wait longer for an absent router than for a message."""
+def test_receive_timeout_includes_opening() -> None:
+    """The timeout of `receive` includes opening the subscription, even without a router."""
     where = free_endpoint()
     router = open_router(listen=(where,))
 
@@ -144,7 +144,7 @@ def test_timeout_includes_the_opening() -> None:
     asyncio.run(scenario())
 
 
-def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
+def test_cancelled_receives_open_one_subscriber(endpoint: str, bus: nedbus.Bus) -> None:
     """Receives cancelled while the subscription opens leave one subscriber, without duplicates."""
     publisher = bus.publisher(VLP, vehicle="1")
 
@@ -166,7 +166,7 @@ def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, mode: Mode) -> None:
-    """A close ends an iteration without an error, also in another thread; receive raises; close is idempotent."""
+    """`close` ends an iteration without an error, even in another thread; `receive` raises; `close` is idempotent."""
     with nedbus.connect(endpoint) as bus:
         waiting = bus.subscribe(VLP, mode=mode)
         reader = threading.Thread(target=list, args=(waiting,), daemon=True)
@@ -186,10 +186,10 @@ def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, m
 
 @pytest.mark.parametrize("mode", BOTH)
 @pytest.mark.parametrize("forms", [iter, nedbus.Subscription.rows, nedbus.Subscription.batches])
-def test_dead_session_raises_in_iteration(
+def test_failed_session_raises_in_iteration(
     endpoint: str, mode: Mode, forms: Callable[[nedbus.Subscription[Any]], Iterator[object]]
 ) -> None:
-    """A session that ends by itself, before or during a wait, ends no iteration without an error."""
+    """If the session ends unexpectedly, before or during a wait, iteration raises ReceiveError."""
     with nedbus.connect(endpoint) as bus:
         subscription = bus.subscribe(VLP, mode=mode)
         closer = threading.Thread(target=bus._zenoh.close)
@@ -203,8 +203,8 @@ def test_dead_session_raises_in_iteration(
             subscription.receive(1.0)
 
 
-def test_dead_session_raises_in_asyncio(endpoint: str) -> None:
-    """`async for` ends without an error only after a close."""
+def test_failed_session_raises_in_asyncio(endpoint: str) -> None:
+    """If the session ends unexpectedly, `async for` raises ReceiveError."""
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as bus, bus.subscribe(VLP) as subscription:
@@ -221,47 +221,47 @@ def test_dead_session_raises_in_asyncio(endpoint: str) -> None:
 
 
 def test_failed_pump_raises_in_iteration(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An unexpected error of the receiving thread reaches the reader, with its text."""
+    """An unexpected error of the pump thread raises ReceiveError with its text in the reader."""
 
     def fail(_: Receiver) -> None:
-        raise RuntimeError("out of luck")
+        raise RuntimeError("on purpose")
 
     monkeypatch.setattr(Receiver, "_receive", fail)
     subscription = client.subscribe(VLP)
     with pytest.raises((nedbus.NoDataError, nedbus.ReceiveError)):
         subscription.receive(0.01)  # starts the thread
-    with pytest.raises(nedbus.ReceiveError, match="unexpected RuntimeError: out of luck"):
+    with pytest.raises(nedbus.ReceiveError, match="unexpected RuntimeError: on purpose"):
         list(subscription)
 
 
-def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """A closed publisher is not listed, does not reply, refuses to publish, and frees its address."""
+def test_closed_publisher_frees_its_address(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """A closed publisher is not listed, does not reply, raises on publish, and frees its address."""
     publisher = client.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     wait_for(bus.latest, what="the message")
     publisher.close()
     publisher.close()
     assert client.latest("*") == []
-    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to disappear")
     with pytest.raises(nedbus.ClosedError):
         publish(publisher, 2)
-    with client.publisher(VLP, vehicle="1") as again:
-        publish(again, 3)
+    with client.publisher(VLP, vehicle="1") as successor:
+        publish(successor, 3)
 
 
-def test_closed_publishers_of_this_bus_are_not_listed(client: nedbus.Bus) -> None:
-    """A bus that lists vehicles for the first time lists none of the 50 that it has published and closed."""
+def test_publishers_closed_before_the_first_listing_are_not_listed(client: nedbus.Bus) -> None:
+    """A bus that lists vehicles for the first time lists none of its 50 closed publishers."""
     for number in range(50):
         client.publisher(VLP, vehicle=number).close()
     assert not client.vehicles()
 
 
-def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
+def test_calls_on_a_closed_bus_raise(client: nedbus.Bus) -> None:
     """Every call on a closed bus raises ClosedError, and its subscriptions end."""
     subscription = client.subscribe(VLP)
     publisher = client.publisher(VLP, vehicle="1")
     with suppress(nedbus.NoDataError):
-        subscription.receive(0.0)  # opens it
+        subscription.receive(0.0)  # opens the subscription
     assert not any(each.closed for each in (client, subscription, publisher))
     client.close()
     client.close()
@@ -269,30 +269,30 @@ def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
     assert list(islice(subscription, 1)) == []
     with pytest.raises(nedbus.ClosedError):
         publisher.publish(message())
-    for ask in (client.latest, client.vehicles, client.services, lambda: client.connected, client.subscribe):
+    for call in (client.latest, client.vehicles, client.services, lambda: client.connected, client.subscribe):
         with pytest.raises(nedbus.ClosedError):
-            ask()
+            call()
 
 
-def test_forgotten_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
-    """A bus stays open while any of its objects exists, even only a publisher, and closes before the process exits."""
-    forgotten = nedbus.connect(endpoint)
-    gone = weakref.ref(forgotten)
-    publisher, subscription = forgotten.publisher(VLP, vehicle="1"), forgotten.subscribe(mode="every")
+def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
+    """A bus stays open while one of its publishers or subscriptions is referenced, and closes after that."""
+    unreferenced = nedbus.connect(endpoint)
+    reference = weakref.ref(unreferenced)
+    publisher, subscription = unreferenced.publisher(VLP, vehicle="1"), unreferenced.subscribe(mode="every")
     publish(publisher, 1)
     assert subscription.receive(DEADLINE).message.timestamp == 1
-    del forgotten, subscription
+    del unreferenced, subscription
     gc.collect()
     publish(publisher, 2)
     wait_for(lambda: [sample.message.timestamp for sample in bus.latest()] == [2], what="the message")
     del publisher
     gc.collect()
-    assert gone() is None
-    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    assert reference() is None
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to disappear")
 
 
-def test_collecting_garbage_never_closes() -> None:
-    """Garbage is collected in any thread with any lock held, so the closer thread does the closing, which may block."""
+def test_garbage_collection_closes_on_the_closer_thread() -> None:
+    """Garbage collection may run on a thread that holds a lock, so it leaves closing to the closer thread."""
     lock = threading.Lock()
     closed: list[threading.Thread] = []
 
@@ -303,26 +303,26 @@ def test_collecting_garbage_never_closes() -> None:
 
     queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
     subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, owner=None)
-    with lock:  # as a thread holds it that is in the midst of something
+    with lock:  # a thread may hold it during any call
         del subscription
-        gc.collect()  # a closing in this thread would wait for the lock for ever
-    wait_for(lambda: closed, what="the end of the subscription")
+        gc.collect()  # closing on this thread would be a deadlock
+    wait_for(lambda: closed, what="the subscription to be closed")
     assert closed != [threading.current_thread()]
 
 
-def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, zenoh_session: Session) -> None:
-    """A Ctrl-C ends the wait for a queryable that never replies."""
-    kept: list[zenoh.Query] = []
+def test_ctrl_c_ends_a_query_without_a_reply(start: Start, endpoint: str, zenoh_session: Session) -> None:
+    """Ctrl-C ends the wait for a queryable that never replies."""
+    queries: list[zenoh.Query] = []
     code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
-    with answer_queries(zenoh_session, "nedbus/**", kept.append):
+    with answer_queries(zenoh_session, "nedbus/**", queries.append):
         process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
-        wait_for(lambda: kept, what="the question")
+        wait_for(lambda: queries, what="the query")
         process.signal(signal.SIGINT)
         assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_ctrl_c_while_a_thread_starts(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A Ctrl-C in the start of the receiving thread, which then runs all the same, is raised, and closing waits."""
+def test_ctrl_c_during_thread_start_is_raised(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C during the start of the pump thread is raised, and `close` waits for the thread, which still runs."""
     start, late = threading.Thread.start, list[threading.Thread]()
 
     def interrupted(thread: threading.Thread) -> None:
@@ -336,12 +336,12 @@ def test_ctrl_c_while_a_thread_starts(bus: nedbus.Bus, monkeypatch: pytest.Monke
     monkeypatch.setattr(threading.Thread, "start", interrupted)
     with pytest.raises(KeyboardInterrupt), bus.subscribe() as subscription:
         subscription.receive(timeout=DEADLINE)
-    assert late[0].ident is not None, "it has run"
+    assert late[0].ident is not None, "the thread has not run"
     assert not late[0].is_alive()
 
 
-def test_forked_process_gets_an_error_at_once(start: Start, endpoint: str) -> None:
-    """Zenoh does not survive a fork: in the child everything raises ForkError, and the child can exit."""
+def test_calls_in_a_forked_process_raise(start: Start, endpoint: str) -> None:
+    """Zenoh does not survive a fork: in the child every call raises ForkError, and the child can exit."""
     code = """
 import os, sys
 import nedbus
@@ -352,9 +352,9 @@ publisher.publish({"timestamp": 1})
 if child := os.fork():
     sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 publish, receive = lambda: publisher.publish({"timestamp": 2}), lambda: next(subscription)
-for ask in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
+for call in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
     try:
-        ask()
+        call()
     except nedbus.errors.ForkError as exc:
         print(exc)
 sys.exit(7)

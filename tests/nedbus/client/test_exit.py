@@ -1,4 +1,4 @@
-"""Scripts that end badly: a process that uses nedbus is gone soon, whatever it forgot."""
+"""Scripts without cleanup: a process that uses nedbus exits promptly, whatever it left open."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.flights.messages import VLP, message
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, repeating, wait_for
 
-LIMIT = 9.0  # s from the end of the script, when it said so: Zenoh needs 10 s where it is stuck, and the promise is 2 s
+LIMIT = 9.0  # s from the last line of the script; a blocked close of Zenoh takes 10 s
 
 PREAMBLE = """
 import sys, threading, time
@@ -44,32 +44,32 @@ asyncio.run(main())
 
 END = 'print("end", flush=True)'
 SCRIPTS = {
-    "forgets": PREAMBLE + END,
+    "closes nothing": PREAMBLE + END,
     "raises": PREAMBLE + 'print("end", flush=True); raise RuntimeError("on purpose")',
     "exits": PREAMBLE + 'print("end", flush=True); sys.exit(3)',
     "never reads": PREAMBLE + "time.sleep(1.0); " + END,
     "reads in a thread": PREAMBLE + "threading.Thread(target=lambda: list(subscription), daemon=True).start(); " + END,
-    "has a pump": PREAMBLE + "subscription.receive(5.0); " + END,
-    "asks and forgets": PREAMBLE + 'bus.latest("*"); bus.vehicles(); ' + END,
-    "async forgets": ASYNC.replace("END", "pass"),
+    "has a pump thread": PREAMBLE + "subscription.receive(5.0); " + END,
+    "queries and closes nothing": PREAMBLE + 'bus.latest("*"); bus.vehicles(); ' + END,
+    "async closes nothing": ASYNC.replace("END", "pass"),
     "async raises": ASYNC.replace("END", 'raise RuntimeError("on purpose")'),
 }
 CODES = {"raises": 1, "async raises": 1, "exits": 3}
-MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]  # the former has all threads of the latter, and more
+MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]  # "every" has all threads of "latest", and more
 
 
 @pytest.fixture
 def flood(endpoint: str, bus: nedbus.Bus) -> Iterator[str]:
-    """Publish all the time, so that every queue of a script that does not read is full."""
+    """Publish continuously, to fill all queues of a script that does not read."""
     publisher, sent = bus.publisher(VLP, vehicle="1"), message(1)
-    with repeating(lambda: [publisher.publish(sent) for _ in range(400)]):  # type: ignore[func-returns-value] # many
+    with repeating(lambda: [publisher.publish(sent) for _ in range(400)]):  # type: ignore[func-returns-value] # called 400 times
         yield endpoint
 
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_script_without_close_is_gone(start: Start, flood: str, script: str, mode: str) -> None:
-    """A bus that is never closed does not keep the process, whatever its queues hold; the same for asyncio."""
+def test_script_without_close_exits(start: Start, flood: str, script: str, mode: str) -> None:
+    """A bus that is never closed, blocking or asyncio, does not delay process exit, however full its queues are."""
     process = start("-c", SCRIPTS[script].replace("MODE", repr(mode)), NEDBUS_CONNECT=flood, coverage=False)
     wait_for(lambda: "end" in process.out, what=f"the script to reach its end: {process.err}")
     ended = time.monotonic()
@@ -86,7 +86,7 @@ def test_script_without_close_is_gone(start: Start, flood: str, script: str, mod
 def test_signal_ends_a_reading_script(
     start: Start, flood: str, number: signal.Signals, vehicle: str, mode: str
 ) -> None:
-    """Ctrl-C and SIGTERM end a loop over samples, while they come and while none comes."""
+    """Ctrl-C and SIGTERM end a loop over samples, with and without arriving samples."""
     code = f"""
 import nedbus
 bus = nedbus.connect()
@@ -108,33 +108,33 @@ for sample in subscription:
     "how", ["nedbus.connect(timeout=T)", "asyncio.run(nedbus.connect_async(timeout=T).__aenter__())"]
 )
 def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, timeout: float | None) -> None:
-    """Ctrl-C ends the wait for a router that has gone."""
+    """Ctrl-C ends the wait for a router that does not answer."""
     code = f"import asyncio, nedbus; T = {timeout}; {how}"
-    with socket.create_server(("127.0.0.1", 0)) as gone:
-        gone.settimeout(DEADLINE)
-        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{gone.getsockname()[1]}", coverage=False)
-        gone.accept()[0].close()  # it has begun to wait
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(DEADLINE)
+        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{server.getsockname()[1]}", coverage=False)
+        server.accept()[0].close()  # the script is connecting
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_signal_that_asyncio_sleeps_through_ends_the_wait_for_a_router(start: Start) -> None:
-    """A signal that comes as the event loop falls asleep does not wake it, as one that another thread takes."""
+def test_signal_missed_by_asyncio_ends_the_wait_for_a_router(start: Start) -> None:
+    """A signal that does not wake the event loop, such as one delivered to another thread, ends the wait as well."""
     code = """
 import asyncio, nedbus, signal, socket, threading
-gone = socket.create_server(("127.0.0.1", 0))
+server = socket.create_server(("127.0.0.1", 0))
 def interrupt():
-    gone.accept()[0].close()
+    server.accept()[0].close()
     signal.pthread_kill(threading.get_ident(), signal.SIGINT)
 threading.Thread(target=interrupt).start()
-asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{gone.getsockname()[1]}", timeout=None).__aenter__())
+asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{server.getsockname()[1]}", timeout=None).__aenter__())
 """
     process = start("-c", code, coverage=False)
     assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_vehicle_of_a_killed_script_is_gone(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """SIGKILL closes nothing, and still the vehicle disappears from the list."""
+def test_vehicle_of_a_killed_script_disappears(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """The vehicle of a script that ends by SIGKILL, without closing anything, disappears from the list."""
     code = """
 import nedbus, time
 bus = nedbus.connect()
@@ -144,19 +144,19 @@ time.sleep(600)
     process = start("-c", code, NEDBUS_CONNECT=endpoint, coverage=False)
     wait_for(lambda: "mine" in bus.vehicles(), what="the vehicle")
     process.kill()
-    wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to go")
+    wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to disappear")
 
 
-def test_closing_waits_for_threads_that_are_inside_zenoh(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that comes back from there while the interpreter ends aborts the process: 'FATAL: exception not rethrown'."""
+def test_close_waits_for_threads_inside_zenoh(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that returns from Zenoh during interpreter exit aborts the process: 'FATAL: exception not rethrown'."""
     joined: list[str] = []
     join = threading.Thread.join
 
-    def note(thread: threading.Thread, timeout: float | None = None) -> None:
+    def record_join(thread: threading.Thread, timeout: float | None = None) -> None:
         joined.append(thread.name)
         join(thread, timeout)
 
-    monkeypatch.setattr(threading.Thread, "join", note)
+    monkeypatch.setattr(threading.Thread, "join", record_join)
     publisher = bus.publisher(VLP, vehicle="0")
     before = set(threading.enumerate())
     subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(20)]
@@ -164,14 +164,14 @@ def test_closing_waits_for_threads_that_are_inside_zenoh(bus: nedbus.Bus, monkey
     reader.start()
 
     def is_inside() -> bool:
-        """Send something; return whether the innermost function of the reader is the one that receives."""
+        """Publish a message; return True if the reading thread is blocked in Zenoh."""
         publisher.publish(message(1))
         frame = sys._current_frames().get(reader.ident or 0)
         return frame is not None and frame.f_code.co_qualname == "Receiver._receive"
 
     wait_for(is_inside, what="the reader to be inside Zenoh")
     with suppress(nedbus.NoDataError):
-        subscriptions[1].receive(0.0)  # one thread at most is a subscription's own, where somebody waits for so long
+        subscriptions[1].receive(0.0)  # a timeout starts the pump thread
     for subscription in subscriptions:
         subscription.close()
     assert not is_inside()
@@ -180,8 +180,8 @@ def test_closing_waits_for_threads_that_are_inside_zenoh(bus: nedbus.Bus, monkey
     reader.join()
 
 
-def test_threads_of_ten_subscriptions(endpoint: str) -> None:
-    """One for each that is waited for with a timeout, one for their session, and one that closes what is forgotten."""
+def test_ten_subscriptions_need_at_most_twelve_threads(endpoint: str) -> None:
+    """Each subscription that is read with a timeout has a thread; the process has an I/O thread and a closer thread."""
     before = set(threading.enumerate())
     with nedbus.connect(endpoint) as bus:
         subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(10)]
@@ -196,8 +196,8 @@ def test_threads_of_ten_subscriptions(endpoint: str) -> None:
 
 
 @pytest.mark.slow
-def test_publisher_ends_amid_a_flood_of_queries(start: Start, endpoint: str) -> None:
-    """Its schema is asked for more often than it can answer: what is being answered at its end does not abort it."""
+def test_publisher_exits_during_a_flood_of_queries(start: Start, endpoint: str) -> None:
+    """A reply in progress at process exit does not abort a publisher that is flooded with schema queries."""
     code = """
 import time, nedbus
 bus = nedbus.connect()

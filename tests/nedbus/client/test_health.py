@@ -1,4 +1,4 @@
-"""The health of a stream, from its messages alone."""
+"""The health of a stream, derived from its messages."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ SECOND = 1_000_000_000
 Fields = Mapping[str, object]
 
 
-def follow(
+def stream_at(
     *times: float, boot: float = 0.0, every: float = 0.01, latency: float | None = None, fields: Fields = VALID
 ) -> StreamHealth:
-    """Return a stream with these arrival times [s], and PX4's times from `boot` on."""
+    """Return a stream with these arrival times [s]; PX4's timestamps start at `boot` [s]."""
     stream = StreamHealth(VLP)
-    for index, came in enumerate(times):
+    for index, arrival in enumerate(times):
         seconds = boot + index * every
-        stream.add(message(round(seconds * 1e6), **fields), received=round(came * SECOND), latency=latency)
+        stream.add(message(round(seconds * 1e6), **fields), received=round(arrival * SECOND), latency=latency)
     return stream
 
 
-def follow_clock(*clock: float) -> Health:
-    """Return the health of a stream whose messages have these PX4 times [s]."""
+def health_at_px4_times(*clock: float) -> Health:
+    """Return the health of a stream whose messages have these PX4 timestamps [s]."""
     stream = StreamHealth(VLP)
     for seconds in clock:
         stream.add(message(round(seconds * 1e6)), received=0)
     return stream.snapshot(0)
 
 
-def test_rate_and_jitter_are_of_the_last_second() -> None:
-    """50 Hz with steps of 15 and 25 ms; messages before the last full second do not count."""
+def test_rate_and_jitter_cover_the_last_second() -> None:
+    """Rate and jitter are those of the last full second, here 50 Hz in steps of 15 and 25 ms."""
     times = [0.0]
     for index in range(200):
         times.append(times[-1] + (0.1 if index < 10 else 0.015 if index % 2 else 0.025))
-    health = follow(*times).snapshot(round((times[-1] + 0.5) * SECOND))
+    health = stream_at(*times).snapshot(round((times[-1] + 0.5) * SECOND))
     assert health.rate == pytest.approx(50.0, rel=0.02)
     assert health.jitter == pytest.approx(0.005, rel=0.02)
     assert health.nominal == 100.0
@@ -53,13 +53,13 @@ def test_rate_and_jitter_are_of_the_last_second() -> None:
     assert health.messages == 201
 
 
-def test_first_second_may_be_read_by_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages may be added while another thread computes the jitter of the first second."""
-    stream = follow(0.0, 0.01, 0.02)
+def test_concurrent_add_does_not_break_a_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message may be added while another thread computes the jitter."""
+    stream = stream_at(0.0, 0.01, 0.02)
     mean = vars(_Window)["mean"].fget
 
     class Late(float):
-        """A mean during whose computation another message arrives."""
+        """A mean that adds a message when it is used."""
 
         def __rsub__(self, other: float) -> float:
             stream.add(message(30_000), received=SECOND // 50)
@@ -69,9 +69,9 @@ def test_first_second_may_be_read_by_another_thread(monkeypatch: pytest.MonkeyPa
     assert stream.snapshot(SECOND // 50).jitter == pytest.approx(0.0)
 
 
-def test_silence_has_no_rate() -> None:
-    """A stream that stopped has an age but no rate; before the first message there are no values."""
-    health = follow(1.0, 1.01, 1.02).snapshot(10 * SECOND)
+def test_silent_stream_has_age_but_no_rate() -> None:
+    """A stream that stopped has an age but no rate; before the first message it has neither."""
+    health = stream_at(1.0, 1.01, 1.02).snapshot(10 * SECOND)
     assert health.rate is None
     assert health.age == pytest.approx(8.98)
     health = StreamHealth("estimator_local_position").snapshot(SECOND)
@@ -89,10 +89,10 @@ def test_silence_has_no_rate() -> None:
         ("battery_status", 2.0, "slow"),
     ],
 )
-def test_what_comes_on_change_has_no_usual_rate(topic: str, silence: float, state: str) -> None:
-    """A stream that sends on change has no usual rate: only silence below its minimum rate is a fault.
+def test_stream_on_change_is_stale_only_below_its_minimum_rate(topic: str, silence: float, state: str) -> None:
+    """A stream published on change is not slow or stale unless it falls below its minimum rate.
 
-    It has no gaps, and a message other than a position has neither flags nor resets.
+    It has no gaps. Messages other than positions have neither flags nor resets.
     """
     stream = StreamHealth(topic)
     times = [index / 50 for index in range(500)] + [10.0 + index for index in range(3)]
@@ -104,14 +104,14 @@ def test_what_comes_on_change_has_no_usual_rate(topic: str, silence: float, stat
     assert (health.flags, health.resets) == (None, {})
 
 
-def test_gaps_disorder_and_reboots_are_of_px4s_own_time() -> None:
-    """A step of more than three usual ones is a gap, whenever it arrives, and does not become the usual step."""
+def test_gaps_disorder_and_reboots_are_derived_from_px4_time() -> None:
+    """Steps of PX4's time of more than three usual steps are gaps; steps back are disorder or reboots."""
     clock = [index * 0.1 for index in range(20)]
     clock += [clock[-1] + 1.0 + index * 0.1 for index in range(5)]
     clock += [clock[-1] + 0.2, clock[-1] + 2.0]
-    assert follow_clock(*clock).gaps == 2
-    # Back by a little is disorder; back by more than a second is a vehicle that started again.
-    health = follow_clock(10.0, 10.1, 10.05, 10.2, 0.5, 0.6)
+    assert health_at_px4_times(*clock).gaps == 2
+    # Less than a second back is out of order; more is a reboot.
+    health = health_at_px4_times(10.0, 10.1, 10.05, 10.2, 0.5, 0.6)
     assert (health.out_of_order, health.reboots) == (1, 1)
 
 
@@ -123,12 +123,12 @@ def test_gaps_disorder_and_reboots_are_of_px4s_own_time() -> None:
         ([(10.0, 5)], 0, 0),
         ([(10.0, 3), (10.1, 4), (0.1, 0), (0.2, 1)], 2, 1),
     ],
-    ids=["rises", "wraps at 255", "began before", "reboots"],
+    ids=["rising", "wrapping at 255", "reset before the first message", "reboot"],
 )
 def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, reboots: int) -> None:
-    """The difference of a reset counter is counted, also across 255; resets before the first message are unknown.
+    """Increments of a reset counter are counted, including its wrap at 255, from the first message on.
 
-    A reboot clears the counters without a reset; later resets count.
+    A reboot clears the counters, which is not a reset; later resets are counted.
     """
     stream = StreamHealth(VLP)
     for seconds, counter in counters:
@@ -139,8 +139,8 @@ def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, rebo
     assert health.reboots == reboots
 
 
-def test_flags_are_shares() -> None:
-    """Flags have their share of the last second, and of all time."""
+def test_flags_are_shares_of_messages() -> None:
+    """`flags` has the share of messages with a flag set in the last second, and `flags_ever` since the start."""
     stream = StreamHealth(VLP)
     for index in range(400):
         late = index >= 200
@@ -151,16 +151,16 @@ def test_flags_are_shares() -> None:
     assert health.flags_ever == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 0.5, "dead_reckoning": 0.5}
 
 
-def test_flags_that_are_not_provided_have_no_share() -> None:
-    """Neither false nor true: a share is that of the messages whose source provides the flag."""
+def test_missing_flags_do_not_count() -> None:
+    """The share of a flag is computed from the messages whose source provides it."""
     stream = StreamHealth(VLP)
     stream.add(message(1, x=0.0, y=0.0, xy_valid=True), received=0, missing={"z_valid", "dead_reckoning"})
     stream.add({"timestamp": 2, "xy_valid": False}, received=1)
     assert stream.snapshot(1).flags == {"xy_valid": 0.5, "v_xy_valid": 0.0, "v_z_valid": 0.0}
 
 
-def test_latency_and_loss() -> None:
-    """Latency has the median and maximum of the second; losses are the total."""
+def test_latency_covers_the_last_second_and_lost_is_a_total() -> None:
+    """Latency is the median and maximum of the last second; losses are the total since the start."""
     stream = StreamHealth(VLP)
     for index, latency in enumerate((0.1, 0.2, 0.9)):
         stream.add(message(index), received=index, latency=latency, lost=index)
@@ -168,26 +168,26 @@ def test_latency_and_loss() -> None:
     assert (health.latency, health.latency_max, health.lost) == (0.2, 0.9, 3)
 
 
-def test_usual_rate_shows_a_stream_that_became_slow() -> None:
+def test_usual_rate_reveals_a_slow_stream() -> None:
     """After a minute at 100 Hz, 5 Hz is far below the usual rate; a burst of recovered messages hardly changes it."""
     times = [index * 0.01 for index in range(6000)]
     times += [60.0 + index * 0.0001 for index in range(6000)]
     times += [62.0 + index * 0.01 for index in range(200)]
     times += [64.0 + index * 0.2 for index in range(50)]
-    health = follow(*times).snapshot(round((times[-1] + 0.1) * SECOND))
+    health = stream_at(*times).snapshot(round((times[-1] + 0.1) * SECOND))
     assert health.rate == pytest.approx(5.0, rel=0.05)
     assert health.usual_rate is not None
     assert 50 < health.usual_rate < 120
 
 
-def test_slow_stream_is_stale_later() -> None:
-    """A stream is stale after 3 s without a message, but not if it has one every 5 s."""
-    assert follow(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
-    assert follow(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
+def test_slow_stream_becomes_stale_later() -> None:
+    """A stream is stale after 3 s without a message, or after two usual intervals if that is longer."""
+    assert stream_at(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
+    assert stream_at(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
 
 
-def test_topic_of_events_is_never_stale() -> None:
-    """A topic without a file has no known rate: it is stale only if it came at least once a second."""
+def test_rare_topic_without_nominal_rate_is_never_stale() -> None:
+    """A topic without a nominal rate becomes stale only if it had at least one message per second."""
     for period, expected in ((0.01, 3.0), (5.0, math.inf)):
         stream = StreamHealth("vehicle_command")
         for index in range(300):
@@ -200,7 +200,7 @@ def sample(vehicle: str, timestamp: int = 0) -> Sample:
     return Sample(message(timestamp), Address(vehicle, VLP), received=time.time_ns())
 
 
-def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rate and age use the monotonic clock: setting the wall clock back changes nothing."""
     monitor, now, address = Monitor(), 100 * SECOND, Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
@@ -219,22 +219,22 @@ def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_monitor_is_bounded() -> None:
-    """In a flood of keys the 4096 most recent streams are kept, and never displace one that is still sending."""
+    """In a flood of keys, the 4096 most recently updated streams are kept, including one that stays active."""
     monitor, real = Monitor(), sample("real")
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
-    for junk in flood:
-        monitor.add(junk)
+    for each in flood:
+        monitor.add(each)
         monitor.add(real)
-    kept = monitor.snapshot()
-    assert (len(kept), kept[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
-    assert flood[-4095].address in kept
-    assert flood[-4096].address not in kept
+    streams = monitor.snapshot()
+    assert (len(streams), streams[real.address].messages, monitor.evicted) == (4096, 5000, 5001 - 4096)
+    assert flood[-4095].address in streams
+    assert flood[-4096].address not in streams
     monitor.forget(real.address)
     assert real.address not in monitor.snapshot()
 
 
-def test_retained_sample_does_not_count() -> None:
-    """A retained sample may be of any age: the stream is measured from the next one on."""
+def test_retained_sample_is_not_measured() -> None:
+    """A retained sample may have any age: a stream is measured from its first live sample on."""
     monitor, first = Monitor(), sample("1")
     assert not monitor.add(dataclasses.replace(first, retained=True))
     assert monitor.snapshot() == {}
@@ -243,10 +243,10 @@ def test_retained_sample_does_not_count() -> None:
 
 
 def test_states_have_reasons() -> None:
-    """The worst state wins, and each one but "ok" has its reason, with a fake clock."""
+    """A stream has the worst state that applies, with a reason unless it is "ok"."""
     second = [index / 100 for index in range(300)]
-    fresh, late = (follow(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
-    stream = follow(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
+    fresh, late = (stream_at(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
+    stream = stream_at(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
     silent, longer = (stream.snapshot(seconds * SECOND) for seconds in (40, 3 * 3600))
     cases: tuple[tuple[Health, dict[str, Any], str], ...] = (
         (fresh, {}, "ok"),
@@ -260,17 +260,19 @@ def test_states_have_reasons() -> None:
         (longer, {}, "stale: nothing for 3 h"),
         (silent, {"publishers": 0, "connected": False}, "disconnected: no link"),
     )
-    for health, known, text in cases:
-        assert str(stream_state(health, **known)) == text
+    for health, options, text in cases:
+        assert str(stream_state(health, **options)) == text
     assert str(stream_state(stream.snapshot(33 * SECOND))).startswith("slow: 5.0 Hz, usually ")
     assert stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
 
 
-def test_description_has_state_flags_and_events() -> None:
-    """A description has state and flags, then gaps, disorder and reboots; "ok" if there are none."""
-    health = follow(0.0, 0.01, 0.02).snapshot(SECOND // 10)
+def test_description_has_state_flags_and_faults() -> None:
+    """The description has the state, flags, gaps, out-of-order messages and reboots; "ok" without any."""
+    health = stream_at(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
-    doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
+    doubtful = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
     assert describe_stream(doubtful, stream_state(doubtful)) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"
-    mixed = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0).snapshot(SECOND // 10)
-    assert "reboots" not in describe_stream(mixed, stream_state(mixed, publishers=2)), "each message of the other one"
+    mixed = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0).snapshot(SECOND // 10)
+    assert "reboots" not in describe_stream(mixed, stream_state(mixed, publishers=2)), (
+        "two publishers look like reboots"
+    )

@@ -1,4 +1,4 @@
-"""The I/O thread of the process: due times, common ticks, and what is left after a session or a vehicle has gone."""
+"""The I/O thread of the process: due times, common ticks, and cleanup after a session or a publisher is closed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.waits import DEADLINE, wait_for
 
 
 class Calls:
-    """A job that counts its calls and keeps their times."""
+    """A job that records the times of its calls."""
 
     def __init__(self, pause: float) -> None:
         self.pause, self.times = pause, list[float]()
@@ -34,12 +34,12 @@ def test_pauses_end_at_common_ticks() -> None:
     wait_for(lambda: all(len(call.times) > 5 for call in calls), what="a few rounds")
     for job in jobs:
         job.end()
-    rounds = sorted({moment for call in calls for moment in call.times[1:]})
+    rounds = sorted({each for call in calls for each in call.times[1:]})
     assert len(rounds) <= (rounds[-1] - rounds[0]) / TICK + 2
 
 
 def test_job_is_called_when_woken() -> None:
-    """A job that waits for an hour is called at once after `wake`, and after a moment that `wake` names."""
+    """A job that waits for an hour is called at once after `wake()`, or at the time passed to `wake`."""
     calls = Calls(3600.0)
     job = Job(calls)
     wait_for(lambda: len(calls.times) == 1, what="the first call")
@@ -52,20 +52,20 @@ def test_job_is_called_when_woken() -> None:
     job.end()
 
 
-def test_ended_job_is_not_running() -> None:
-    """`end` waits for a call in progress; a job may end itself, and delays no other by that."""
-    inside, go_on = threading.Event(), threading.Event()
+def test_end_waits_for_a_running_job() -> None:
+    """`end` waits until a running call has returned, and a job may end itself."""
+    inside, proceed = threading.Event(), threading.Event()
 
     def block(_: float) -> float:
         inside.set()
-        assert go_on.wait(DEADLINE)
+        assert proceed.wait(DEADLINE)
         return 0.0
 
     job = Job(block)
     assert inside.wait(DEADLINE)
     ending = threading.Thread(target=job.end)
     ending.start()
-    go_on.set()
+    proceed.set()
     ending.join(DEADLINE)
     assert not ending.is_alive()
     ends: list[Callable[[], None]] = []
@@ -80,8 +80,28 @@ def test_ended_job_is_not_running() -> None:
     wait_for(lambda: itself not in io_thread._jobs, what="the job to end itself")
 
 
-def test_failing_call_ends_no_others() -> None:
-    """A call that raises is followed by the next one."""
+def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
+    """A job that raises is logged once and called again, and delays no other job."""
+    calls: list[float] = []
+
+    def fail_at_first(now: float) -> float:
+        calls.append(now)
+        return 0.0 if len(calls) > 2 else 1 / 0
+
+    def succeed(now: float) -> float:
+        others.append(now)
+        return 0.01
+
+    others: list[float] = []
+    jobs = [Job(fail_at_first), Job(succeed)]
+    wait_for(lambda: len(calls) > 5 and len(others) > 5, what="calls of both jobs")
+    for job in jobs:
+        job.end()
+    assert sum("unexpected error" in text for text in caplog.messages) == 1
+
+
+def test_failed_call_does_not_stop_the_thread() -> None:
+    """After a call that raises, a CallThread runs the next one."""
     thread, done = CallThread("nedbus-test"), threading.Event()
     thread.start()
     thread.put(lambda: 1 // 0)
@@ -89,8 +109,8 @@ def test_failing_call_ends_no_others() -> None:
     assert done.wait(DEADLINE)
 
 
-def test_sessions_share_their_threads(endpoint: str) -> None:
-    """Twenty buses that publish, and are queried, have the Python threads of one."""
+def test_sessions_share_threads(endpoint: str) -> None:
+    """Twenty buses that publish and reply to queries need no more Python threads than one."""
     before = set(threading.enumerate())
     with ExitStack() as opened:
         buses = [opened.enter_context(nedbus.connect(endpoint)) for _ in range(20)]
@@ -103,8 +123,8 @@ def test_sessions_share_their_threads(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("closed", ["publishers", "bus"])
-def test_nothing_is_polled_after_a_close(endpoint: str, closed: str) -> None:
-    """Vehicles that have left, and closed sessions, leave no job behind; the schema stays for messages under way."""
+def test_closed_publishers_and_sessions_leave_no_jobs(endpoint: str, closed: str) -> None:
+    """Closed publishers and sessions leave no jobs; a session keeps that of its schemas, for messages in transit."""
     before = len(io_thread._jobs)
     with nedbus.connect(endpoint) as bus:
         for number in range(30):

@@ -76,7 +76,7 @@ class FakeRegistry:
         )
         return self.publishers[address]
 
-    def is_read(self, _: object) -> bool:
+    def has_subscriber(self, _: object) -> bool:
         return self.clock.seconds >= self.readers_at
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:

@@ -591,7 +591,7 @@ def test_traffic_on_mavlink_link_gives_findings() -> None:
     find(findings, "mavlink", "warning", "system 7: SDLOG_BACKEND is 1")
     find(findings, "mavlink", "warning", "system 8: sends its ULog stream to system 255 component 190")
     findings = check_link(*packets_of(7, position, component=0), *packets_of(8, heartbeat, component=100))
-    find(findings, "mavlink", "wrong", "system 7 component 0: ignored: id 0 addresses all")
+    find(findings, "mavlink", "wrong", "system 7 component 0: ignored: id 0 is for broadcast only")
     find(findings, "mavlink", "wrong", "system 8 component 100: ignored: not an autopilot")
     assert not any(each.state == "ok" for each in findings if each.check == "mavlink")
     findings = check_link(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)

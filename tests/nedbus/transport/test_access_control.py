@@ -25,8 +25,8 @@ from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
 from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.numbered import take
-from tests.nedbus.client.receiving.test_max_rate_sessions import Clock, clock, publish, wait_for_demand
+from tests.nedbus.client.downsampling import Clock, clock, publish, wait_for_downsampling_reader
+from tests.nedbus.client.numbered import receive_timestamps
 from tests.nedbus.sources.px4.test_source import Px4
 from tests.peers.certificates import CONFIG, client_tls, pki, secure_endpoint, tls_options, write_config
 from tests.peers.command_line import run_command
@@ -84,10 +84,10 @@ def test_reader_receives_everything_of_a_vehicle(join: Join) -> None:
     wait_for(lambda: reader.latest(VLP), what="the last value")
     wait_for(lambda: "1" in reader.vehicles(), what="the vehicle")
     with reader.subscribe("*", mode="every") as subscription:
-        assert take(subscription, 1) == [1]
+        assert receive_timestamps(subscription, 1) == [1]
         for timestamp in range(2, 1000):
             publisher.publish(message(timestamp))
-        assert take(subscription, 998) == list(range(2, 1000))
+        assert receive_timestamps(subscription, 998) == list(range(2, 1000))
     assert publisher.flush()
 
 
@@ -96,14 +96,14 @@ def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
     publisher = join("vehicle-1").publisher(VLP, vehicle="1", lossless=True)
     publisher.publish(message(1))
     with join("reader").subscribe("*", mode="every") as subscription:
-        assert take(subscription, 1) == [1]
+        assert receive_timestamps(subscription, 1) == [1]
         count = 3 * WINDOW
         many = to_array([message(number) for number in range(2, count + 1)])
         sending = threading.Thread(target=publisher.publish_many, args=[many])
         sending.start()
         wait_for(lambda: publisher.published > WINDOW, what="the first window")
         assert publisher.published < count
-        assert take(subscription, count - 1)[-1] == count
+        assert receive_timestamps(subscription, count - 1)[-1] == count
         sending.join(DEADLINE)
         assert publisher.flush()
         publisher.close()  # else it waits for the reader to reconnect
@@ -140,13 +140,13 @@ def test_other_certificates_cannot_publish_a_vehicle(join: Join, intruder: str) 
     genuine.publish(message(1))
     reader = join("reader")
     with reader.subscribe("*", mode="every") as subscription:
-        assert take(subscription, 1) == [1]
+        assert receive_timestamps(subscription, 1) == [1]
         other = join(intruder)
         other.publisher(VLP, vehicle="1").publish(message(666))
         other.publisher(VLP, vehicle="3").publish(message(667))
         for timestamp in (2, 3):
             genuine.publish(message(timestamp))
-            assert take(subscription, 1) == [timestamp]
+            assert receive_timestamps(subscription, 1) == [timestamp]
         assert [sample.message.timestamp for sample in reader.latest("*")] == [3]
         assert list(reader.vehicles()) == ["1"]
 
@@ -341,11 +341,11 @@ def test_downsampled_stream_passes_the_secure_router(
     publisher.publish(message(1))
     stranger, reader = open_as("vehicle-2"), join("reader")
     with reader.subscribe(mode="every", max_rate=5) as subscription:
-        assert take(subscription, 1) == [1]
-        wait_for_demand(publisher)
+        assert receive_timestamps(subscription, 1) == [1]
+        wait_for_downsampling_reader(publisher)
         stranger.put(Address("1", VLP).rate_key(5), encode(message(666)))
         publish(publisher, clock, 2, 1000)
-        assert take(subscription, 50) == list(range(2, 1002, 20))
+        assert receive_timestamps(subscription, 50) == list(range(2, 1002, 20))
         assert subscription.counts.lost == 0
         assert caplog.messages == []
 

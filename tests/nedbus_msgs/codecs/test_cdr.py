@@ -60,14 +60,14 @@ def test_ros_2_payload_round_trip(layout: str, vector: Mapping[str, Any]) -> Non
 
 
 @given(messages())
-def test_payload_equals_that_of_rosbags(message: VehicleLocalPosition) -> None:
+def test_payload_matches_rosbags(message: VehicleLocalPosition) -> None:
     """Any message in any layout encodes to the same bytes as with rosbags, and decodes to the same fields."""
     for layout in LAYOUTS:
         fields = downgrade(message, layout)
         kind = rosbags_type(layout)
         payload = encode_cdr(fields, layout=layout)
-        theirs = STORE.types[kind](**{name: as_array(value) for name, value in fields.items()})
-        assert bytes(STORE.serialize_cdr(theirs, kind)) == payload
+        expected = STORE.types[kind](**{name: as_array(value) for name, value in fields.items()})
+        assert bytes(STORE.serialize_cdr(expected, kind)) == payload
         assert repr(decode_cdr(payload, layout=layout)) == repr(fields)
 
 
@@ -76,7 +76,7 @@ def as_array(value: object) -> Any:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_payload_size_is_limited_to_px4s_trailer(layout: str) -> None:
+def test_payload_size_is_limited_to_px4_trailer(layout: str) -> None:
     """PX4's struct size plus 28 bytes is accepted; one byte more, or one less than CDR needs, is rejected."""
     payload = encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout)
     longest = {"1.13": 196, "1.14": 196, "1.15": 212, "V0": 220, "1.16": 220}[layout]
@@ -88,7 +88,7 @@ def test_payload_size_is_limited_to_px4s_trailer(layout: str) -> None:
 
 @pytest.mark.parametrize("head", ["00000000", "00030000", "00070000", "01000000"])
 def test_other_encapsulation_is_rejected(head: str) -> None:
-    """Big-endian, parameter lists and XCDR2 are rejected with that reason."""
+    """Big-endian CDR, parameter lists and XCDR2 are rejected as not little-endian CDR."""
     payload = encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), "1.16"), layout="1.16")
     with pytest.raises(DecodeError, match="not little-endian CDR"):
         decode_cdr(bytes.fromhex(head) + payload[4:], layout="1.16")
@@ -96,7 +96,7 @@ def test_other_encapsulation_is_rejected(head: str) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_bool_other_than_0_or_1_is_rejected(layout: str) -> None:
-    """Any other byte indicates a payload of another layout."""
+    """Another byte value means that the payload has another layout."""
     payload = bytearray(encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout))
     payload[4 + 16] = 2
     with pytest.raises(DecodeError, match="xy_valid: 2"):

@@ -35,11 +35,11 @@ from tests.flights.local_position import (
     row_of,
     valid_mask,
 )
-from tests.nedbus_msgs.strategies import BROKEN, bits, messages, pack_full_width
+from tests.nedbus_msgs.strategies import POSSIBLE_VIOLATIONS, bits, messages, pack_full_width
 
 GOOD = VehicleLocalPosition(timestamp=5, vxy_max=math.inf, eph=math.inf)
 # Valid and invalid values, for fields of any type.
-ODD = st.one_of(
+ANY_VALUE = st.one_of(
     st.integers(-(2**70), 2**70),
     st.floats(allow_subnormal=True),
     st.floats(width=32),
@@ -50,7 +50,7 @@ ODD = st.one_of(
     st.tuples(st.floats(), st.floats()),
     st.lists(st.floats(), max_size=3),
 )
-CHANGES = st.dictionaries(st.sampled_from(list(FIELD_TYPES)), ODD, max_size=3)
+CHANGES = st.dictionaries(st.sampled_from(list(FIELD_TYPES)), ANY_VALUE, max_size=3)
 
 
 def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
@@ -78,13 +78,13 @@ def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
 def test_fields_and_rows_are_validated_like_the_model(
     message: VehicleLocalPosition, changes: dict[str, object]
 ) -> None:
-    """Keywords, fields and rows give the same bytes, or the same rejection with the same reasons."""
+    """Keywords, fields and rows are encoded to the same bytes, or rejected for the same reasons."""
     fields = {**message.model_dump(), **changes}
     expected = payload_by_model(fields)
     if expected is not None:
-        made = VehicleLocalPosition(**fields)
-        assert encode(made) == encode_fields(fields) == encode_row(list(fields.values())) == expected
-        assert bits(made) == bits(VehicleLocalPosition.model_validate(fields))
+        created = VehicleLocalPosition(**fields)
+        assert encode(created) == encode_fields(fields) == encode_row(list(fields.values())) == expected
+        assert bits(created) == bits(VehicleLocalPosition.model_validate(fields))
         return
     expected_reasons = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
     assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected_reasons
@@ -92,7 +92,7 @@ def test_fields_and_rows_are_validated_like_the_model(
 
 
 def test_misspelled_field_with_right_field_count_is_rejected() -> None:
-    """With the right number of fields, the fast path still leaves the error to the model."""
+    """If a field is misspelled, the fast path leaves the error to the model, even if the field count is right."""
     fields = {("hagl" if name == "hagl_min" else name): value for name, value in GOOD.model_dump().items()}
     expected = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
     assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected
@@ -107,7 +107,7 @@ def test_misspelled_field_with_right_field_count_is_rejected() -> None:
         ({"delta_xy": (0.0, None)}, "delta_xy.1: Input should be a valid number (is None)"),
         ({"z_dervi": 1.0}, "unknown field 'z_dervi': did you mean z_deriv or "),
         ({"Heading": 1.0}, "unknown field 'Heading': did you mean heading or "),
-        ({"temperature": 20.0}, "unknown field 'temperature': 'nedbus schema' lists the fields (is 20.0)"),
+        ({"temperature": 20.0}, "unknown field 'temperature': 'nedbus schema VehicleLocalPosition' lists the fields"),
         ({"timestamp": None}, "timestamp: Field required"),
     ],
 )
@@ -122,7 +122,7 @@ def test_invalid_message_error_names_field_rule_and_value(changes: dict[str, obj
     assert str(pickle.loads(pickle.dumps(info.value))) == str(info.value)
 
 
-@given(st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=3)), min_size=1, max_size=5))
+@given(st.lists(st.tuples(messages(), st.lists(POSSIBLE_VIOLATIONS, max_size=3)), min_size=1, max_size=5))
 def test_payloads_are_validated_like_the_model(
     cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]],
 ) -> None:
@@ -203,11 +203,6 @@ def test_subclass_validators_run() -> None:
 def test_validation_of_dicts_and_json_bypasses_the_constructor() -> None:
     """Pydantic treats the constructor as its own, so JSON may hold strings for NaN and infinities."""
     assert not VehicleLocalPosition.__pydantic_custom_init__
-
-
-PYTHON_TYPES = {
-    "uint64": int, "uint8": int, "bool": bool, "float32": float, "float64": float, "float32[2]": tuple[float, float],
-}  # fmt: skip
 
 
 def test_row_has_the_fields_of_the_model() -> None:

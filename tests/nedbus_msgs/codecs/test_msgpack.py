@@ -22,7 +22,7 @@ from tests.flights.local_position import (
     encode,
     encode_row,
 )
-from tests.nedbus_msgs.strategies import DATA, FLIGHTS, MANY, REAL, bits, messages
+from tests.nedbus_msgs.strategies import DATA, FLIGHTS, MANY_EXAMPLES, REAL, bits, messages
 
 GOLDEN = json.loads((DATA / "golden.json").read_text())
 
@@ -100,7 +100,7 @@ def test_newer_layout_is_decoded_by_field_names() -> None:
         (REAL[0][1:], "243 bytes are not a single msgpack value"),
     ],
 )
-def test_invalid_payload_raises_with_reason(payload: bytes, reason: str) -> None:
+def test_invalid_payload_error_has_the_reason(payload: bytes, reason: str) -> None:
     """The error states what is wrong with the payload."""
     with pytest.raises(DecodeError, match=reason):
         decode(payload)
@@ -140,7 +140,7 @@ def test_flipped_bit_has_the_same_effect_in_model_row_and_array() -> None:
 @given(st.binary(max_size=600))
 @example(b"\xdc\x00\x36")
 @example(b"\xc7\x0c\xff" + bytes(12))
-@MANY
+@MANY_EXAMPLES
 def test_random_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
     """Random bytes never raise any other error."""
     try:
@@ -158,11 +158,9 @@ msgpack_values = st.recursive(
 
 
 @given(st.sampled_from(FLIGHTS), st.integers(0, 53), msgpack_values)
-@MANY
-def test_payload_with_one_random_value_keeps_it_or_is_rejected(
-    good: VehicleLocalPosition, index: int, value: object
-) -> None:
-    """The value is decoded unchanged, up to rounding to float32, or DecodeError is raised."""
+@MANY_EXAMPLES
+def test_random_value_is_decoded_unchanged_or_rejected(good: VehicleLocalPosition, index: int, value: object) -> None:
+    """In an otherwise valid payload, a value is decoded up to rounding to float32, or DecodeError is raised."""
     array: list[object] = [1, *good.model_dump().values()]
     array[index] = value
     try:

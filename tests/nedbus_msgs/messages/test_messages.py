@@ -236,7 +236,7 @@ def any_fields(draw: st.DrawFn) -> tuple[Definition[Any], dict[str, object]]:
     """Return fields of any message, of the right types, which may break its rules."""
     definition = MESSAGES[draw(st.sampled_from(NAMES))]
     fields = {name: draw(values_of(kind)) for name, kind in definition.types.items()}
-    if draw(st.booleans()):  # otherwise almost all break a rule
+    if draw(st.booleans()):  # otherwise almost all messages break a rule
         times = [name for name in ("timestamp_sample", "timestamp") if name in fields]
         fields |= {name: number for number, name in enumerate(times)}
         for rule in definition.rules:
@@ -249,7 +249,7 @@ def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[st
     """Model, fields, rows and arrays accept the same messages, write the same bytes, and read the same values."""
     definition, fields = case
     codec, arrays = codec_of(definition), arrays_of(definition)
-    array = np.array([arrays.to_element(tuple(fields.values()))] * 21, arrays.dtype)  # enough to be checked by columns
+    array = np.array([arrays.to_element(tuple(fields.values()))] * 21, arrays.dtype)  # enough for checks by column
     try:
         message = definition.model.model_validate(fields)
     except ValidationError:
@@ -324,7 +324,7 @@ class WheelEncoders(Message):
     wheel_speed: Float32x2 = field("Speed of the right and left wheel [rad/s]")
     wheel_angle: Float32x2 = field("Angle of the right and left wheel [rad]")
 '''
-USE_IT = """
+USE_WHEEL_ENCODERS = """
 import sys
 import nedbus
 from nedbus.sources import parse_source
@@ -369,14 +369,14 @@ def test_new_message_needs_only_its_file(tmp_path: Path, start: Start, endpoint:
     shutil.copytree(SCHEMAS / "nedbus_msgs", tmp_path / "nedbus_msgs")
     (tmp_path / "nedbus_msgs" / "messages" / "wheel_encoders.py").write_text(WHEEL_ENCODERS)
     log = write_wheels(tmp_path / "rover.ulg", 20)
-    program = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{USE_IT}"
+    program = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{USE_WHEEL_ENCODERS}"
     process = start("-c", program, str(log), endpoint, coverage=False, fresh=True)
     assert process.wait() == 0, process.err
     assert process.out == "used 20 WheelEncoders\n"
 
 
-def test_type_checkers_know_each_message() -> None:
-    """`messages/__init__.py` imports each class; without that line type checkers would reject it."""
+def test_messages_package_imports_each_class_for_type_checkers() -> None:
+    """`messages/__init__.py` has an import for each class; without it type checkers reject the class."""
     lines = Path(str(nedbus_msgs.messages.__file__)).read_text()
-    shown = set(re.findall(r"^    from \.(\w+) import (\w+) as \2$", lines, re.MULTILINE))
-    assert shown == {(module_of(definition), name) for name, definition in MESSAGES.items()}
+    imported = set(re.findall(r"^    from \.(\w+) import (\w+) as \2$", lines, re.MULTILINE))
+    assert imported == {(module_of(definition), name) for name, definition in MESSAGES.items()}

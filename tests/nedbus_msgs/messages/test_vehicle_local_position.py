@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from nedbus_msgs import InvalidMessageError, VehicleLocalPosition
 from nedbus_msgs.arrays import to_array
 from tests.flights.local_position import FIELD_TYPES, describe, encode, encode_fields, json_schema
-from tests.nedbus_msgs.strategies import BREAKING, KEEPING, WITHIN, bits, fields, messages
+from tests.nedbus_msgs.strategies import EXTREMES, VIOLATIONS, WITHIN, bits, fields, messages
 
 FLOATS = [name for name, kind in FIELD_TYPES.items() if kind == "float32"]
 
@@ -75,15 +75,15 @@ def test_int_is_accepted_for_float() -> None:
     assert (message.x, type(message.x)) == (3.0, float)
 
 
-@pytest.mark.parametrize("changes", BREAKING)
-def test_broken_rule_names_the_field(changes: dict[str, object]) -> None:
+@pytest.mark.parametrize("changes", VIOLATIONS)
+def test_error_for_broken_rule_names_the_field(changes: dict[str, object]) -> None:
     """A value just beyond a rule (flags, signs, bounds, order of timestamps) is rejected."""
     assert list(changes)[-1] in rejection(**changes)
 
 
 def test_extreme_valid_values_pass() -> None:
-    """Bounds, -0.0, NaN and infinity unless a rule forbids them, and NaN while a flag is not set are valid."""
-    for changes in KEEPING:
+    """A value on its bound, -0.0, NaN and infinity are valid unless a rule forbids them; so is NaN without its flag."""
+    for changes in EXTREMES:
         VehicleLocalPosition.model_validate({"timestamp": 1, **changes})
 
 
@@ -125,13 +125,13 @@ def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
 
 
 @given(messages(), st.sampled_from(sorted(FIELD_TYPES)))
-def test_copy_of_a_valid_message_is_the_same(message: VehicleLocalPosition, name: str) -> None:
+def test_copy_with_unchanged_value_equals_the_message(message: VehicleLocalPosition, name: str) -> None:
     """Validation does not change a valid value."""
     assert bits(message.model_copy(update={name: getattr(message, name)})) == bits(message)
 
 
-def test_json_schema_describes_the_json() -> None:
-    """Every field has a description and no default, and floats may be one of the three strings."""
+def test_json_schema_matches_the_model() -> None:
+    """In the schema every field has a description and no default; floats may be "NaN", "Infinity" or "-Infinity"."""
     schema = json_schema()
     properties = schema["properties"]
     assert isinstance(properties, dict)
@@ -189,7 +189,7 @@ def test_array_element_is_accepted() -> None:
 
 @given(fields=fields(), names=st.sets(st.sampled_from(sorted(FIELD_TYPES))))
 def test_omitted_fields_are_the_same_on_the_fast_path(fields: dict[str, object], names: set[str]) -> None:
-    """A message with some fields is created and encoded exactly as with the model's validator."""
+    """The fast path creates and encodes a message with omitted fields exactly as the model's validator does."""
     given_fields: dict[str, Any] = {"timestamp": fields["timestamp"], **{name: fields[name] for name in sorted(names)}}
     try:
         slow = VehicleLocalPosition.model_validate(given_fields)

@@ -10,7 +10,7 @@ from nedbus_msgs.arrays import arrays_of
 from nedbus_msgs.codecs.cdr import cdr_layout
 
 
-def use(name: str) -> Definition[Message]:
+def use_all_codecs(name: str) -> Definition[Message]:
     """Return a definition after using all of its codecs."""
     definition = define(name, [("timestamp", field_type("uint64")), ("q", field_type("float32[4]"))])
     codec, message = codec_of(definition), definition.model(timestamp=1)
@@ -24,11 +24,11 @@ def use(name: str) -> Definition[Message]:
 
 
 def test_unused_definition_is_freed_with_its_codecs() -> None:
-    """No cache keeps a definition alive, and its codecs are cached while it is in use."""
-    kept = use("Kept")
-    departed = [weakref.ref(use(f"Departed{number}")) for number in range(50)]
+    """No cache keeps a definition alive; the codecs of a definition in use are cached."""
+    used = use_all_codecs("Used")
+    unused = [weakref.ref(use_all_codecs(f"Unused{number}")) for number in range(50)]
     gc.collect()
-    assert not any(each() for each in departed)
-    assert codec_of(kept) is codec_of(kept)
-    assert arrays_of(kept) is arrays_of(kept)
-    assert cdr_layout(kept.current) is cdr_layout(kept.current)
+    assert not any(each() for each in unused)
+    assert codec_of(used) is codec_of(used)
+    assert arrays_of(used) is arrays_of(used)
+    assert cdr_layout(used.current) is cdr_layout(used.current)

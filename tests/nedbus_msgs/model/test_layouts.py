@@ -1,4 +1,4 @@
-"""The layout table, compared with PX4's message pages, and conversion between layouts."""
+"""The layout table, compared with PX4's message reference, and conversion between layouts."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SHARED = Path(__file__).parents[4] / "shared" / "seeds"
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_layout_equals_px4s_page(name: str) -> None:
+def test_layout_matches_px4_page(name: str) -> None:
     """The table has the names, order and types of each page's message definition."""
     layout = LAYOUTS[name]
     assert [[field, str(kind)] for field, kind in layout.types.items()] == SEEDS[name]["fields"]
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_fixture_equals_px4s_page(name: str) -> None:
+def test_fixture_matches_px4_page(name: str) -> None:
     """tests/data/seeds.json has the fields of the original pages."""
     path = SHARED / SEEDS[name]["seed"]
     if not path.exists():
@@ -38,7 +38,7 @@ def test_fixture_equals_px4s_page(name: str) -> None:
     assert [[field, kind] for kind, field in rows] == SEEDS[name]["fields"]
 
 
-def test_table_has_px4s_layouts() -> None:
+def test_table_has_the_px4_layouts() -> None:
     """There are five layouts with PX4's field counts, two of them used on the wire, and the table is JSON."""
     table = json.loads(json.dumps(layout_table()))
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [

@@ -49,7 +49,7 @@ def test_topic_round_trip(address: Address, namespace: str, slash: str) -> None:
         (Address("1", "vehicle_local_position"), "/fleet/a/", "fleet/a/fmu/out/vehicle_local_position"),
     ],
 )
-def test_topic_name_equals_px4s(address: Address, namespace: str, name: str) -> None:
+def test_topic_name_matches_px4(address: Address, namespace: str, name: str) -> None:
     """The name is PX4's, below the namespace, with the instance as suffix."""
     assert ros2_topic_of(address, namespace) == name
 
@@ -94,7 +94,7 @@ HASHES = {
 
 
 @pytest.mark.parametrize(("layout", "ros2_type"), HASHES)
-def test_type_hash_equals_ros_2s(layout: str, ros2_type: str) -> None:
+def test_type_hash_matches_ros_2(layout: str, ros2_type: str) -> None:
     """Each type has the hash that ROS 2 computes, and the layout is found by that hash."""
     assert ros2_type in ros2_types()
     assert type_hash(layout, name=ros2_type) == f"RIHS01_{HASHES[layout, ros2_type]}"
@@ -111,6 +111,6 @@ def test_layout_is_found_by_hash() -> None:
     assert layout_of_type_hash("RIHS01_" + 64 * "0") is None
 
 
-def test_dds_type_equals_that_of_rmw_zenoh() -> None:
+def test_dds_type_matches_rmw_zenoh() -> None:
     """A ROS 2 type appears in keys as rmw_zenoh writes it."""
     assert dds_type(ROS2_TYPE) == "px4_msgs::msg::dds_::VehicleLocalPosition_"

@@ -1,1 +1,1 @@
-"""The sending side of a session: publishers with flow control, heartbeats and downsampling, replies to queries."""
+"""The sending side of a session: publishers with flow control, heartbeats and downsampling, and query replies."""

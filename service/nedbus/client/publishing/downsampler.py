@@ -1,7 +1,7 @@
-"""Downsampled copies of a stream, one for each of RATES, published while they have subscribers.
+"""Downsampled copies of a stream, one per rate in RATES, published while they have subscribers.
 
 `<key>/@rate/5` carries up to 5 messages per second of `<key>`, with its own sequence numbers and history cache.
-A vehicle without such subscribers costs one declaration; each stream declares more once that one is matched.
+Each vehicle declares one matching listener for all rates; its streams declare theirs once that one is matched.
 """
 
 import threading
@@ -28,17 +28,17 @@ class MatchingListener:
     def __init__(self, session: Session, key_expr: str) -> None:
         with translate_zenoh_errors():
             self._probe = session.declare_publisher(key_expr)
-            # It reports the current status first.
+            # The listener reports the current status first.
             self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
         self._matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
-        self._take = self._listener.handler.try_recv
+        self._try_recv = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
         """Return True if there are subscribers, by the latest report of Zenoh."""
         with self._lock:
             try:
-                if (status := self._take()) is not None:
+                if (status := self._try_recv()) is not None:
                     self._matched = status.matching
             except zenoh.ZError:  # closed
                 self._matched = False
@@ -52,26 +52,26 @@ class MatchingListener:
 
 
 class Downsampler:
-    """Publisher of the downsampled copies of one address, for one thread.
+    """Publisher of the downsampled copies of one address; not thread-safe.
 
-    `vehicle`: the listener of all downsampled streams of its vehicle.
+    `listener`: matched by subscribers of any downsampled stream of the vehicle.
     """
 
-    def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
-        self.vehicle, self._heartbeats = vehicle, heartbeats
+    def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, listener: MatchingListener) -> None:
+        self.vehicle_listener, self._heartbeats = listener, heartbeats
         self._key = partial(address.rate_key, prefix=prefix)
         self._topic = get_topic(address.topic)
-        self._any_rate: MatchingListener | None = None
+        self._address_listener: MatchingListener | None = None
         self._streams: list[_Stream] = []
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
         """Publish a message at all matched rates for which it is due; never waits for a reader."""
-        if self._any_rate is None:
-            if not self.vehicle.is_matched():
+        if self._address_listener is None:
+            if not self.vehicle_listener.is_matched():
                 return
-            self._any_rate = MatchingListener(self._heartbeats.session, self._key(ANY))
+            self._address_listener = MatchingListener(self._heartbeats.session, self._key(ANY))
         now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
-        is_matched = self._any_rate.is_matched()
+        is_matched = self._address_listener.is_matched()
         if is_matched and not self._streams:
             self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._topic) for rate in RATES]
         for stream in self._streams:
@@ -82,12 +82,12 @@ class Downsampler:
         """Undeclare all streams and listeners."""
         for stream in self._streams:
             stream.close()
-        if self._any_rate is not None:
-            self._any_rate.close()
+        if self._address_listener is not None:
+            self._address_listener.close()
 
 
 class _Stream:
-    """The stream of one rate; its writer exists while it is matched, and for another minute."""
+    """The stream of one rate; its writer exists while it is matched and for one minute after."""
 
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, topic: Topic) -> None:
         self.writer: Writer | None = None

@@ -22,13 +22,13 @@ _log = logging.getLogger(__name__)
 
 WINDOW: Final = 2000  # unacknowledged messages of a session; this fits into the queues of a link and of a reader
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
-_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages, after which not even one per trickle period is sent
-_MIN_WINDOW: Final = 100  # messages per publisher, whatever their number
+_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; beyond, not even one per trickle period is sent
+_MIN_WINDOW: Final = 100  # messages per publisher, however many there are
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
-_RETRY_PAUSE: Final = 0.5  # s before a request is repeated, as a full queue may have dropped it; then it doubles
-_QUERY_TIMEOUT: Final = 10.0  # s before a request is repeated at most, and timeout of each of its queries
-_STALE_POLL: Final = 1.0  # s without a poll after which the replies do not show which readers exist
+_RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have dropped, is repeated; doubles each time
+_QUERY_TIMEOUT: Final = 10.0  # s, timeout of each query, and the longest pause before a request is repeated
+_STALE_POLL: Final = 1.0  # s without a poll after which replies are too old to tell which readers exist
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
 _POLL_EVERY: Final = 16  # messages between polls
 _DROP: Final = CongestionControl.DROP  # blocking on a full queue could make Zenoh close the link
@@ -36,13 +36,13 @@ _UNKNOWN: Final = ""  # a reader that has never replied
 
 
 class SharedWindow:
-    """The window of a session: its lossless publishers share it equally, and may use what the others do not."""
+    """The window of a session, shared equally by lossless publishers; each may also use what others leave unused."""
 
     def __init__(self) -> None:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key; replaced as a whole
 
-    def part(self, key: str, unread: int, *, now: float) -> int:
-        """Return the window of a publisher with `unread` messages; it expires without a call for a second."""
+    def share(self, key: str, unread: int, *, now: float) -> int:
+        """Return the share of a publisher with `unread` messages; it expires after a second without a call."""
         recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
         self._unread = unread_by_key = recent | {key: (unread, now)}
         others = sum(number for number, _ in unread_by_key.values()) - unread
@@ -55,19 +55,17 @@ class ReaderProxies:
     def __init__(self) -> None:
         self._matched: set[str] = set()
         self.away: dict[str, float] = {}  # deadline of each reader that the publisher waits for
-        self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown one froze
+        self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown reader froze
 
     def update(self, replies: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Update from all replies to a request; `replies`: by reader, True if it is closed. `now` in seconds.
 
-        `froze`: the request ended long after its last reply, by the end of the lease of a reader without a reply.
+        `froze`: the request ended long after its last reply, when the lease of a silent reader expired.
         """
         if replies.keys() - self._matched - self.away.keys():
             self.away.pop(_UNKNOWN, None)
-        gone, until = (
-            self._matched - replies.keys(),
-            now + (TIMINGS.frozen_wait if froze else TIMINGS.return_wait),
-        )
+        gone = self._matched - replies.keys()
+        until = now + (TIMINGS.frozen_wait if froze else TIMINGS.return_wait)
         if gone & self._suspects:  # it replied, but froze before Zenoh finalized its reply
             until = self.away.pop(_UNKNOWN, until)
         self._suspects = set()
@@ -90,7 +88,7 @@ class _Request:
     def __init__(self, number: int, routers: list[str], *, read: bool, now: float) -> None:
         self.number, self.read, self.routers = number, read, routers
         self.sent = self.last_reply = now
-        self.queries: set[Replies] = set()  # without those that timed out
+        self.queries: set[Replies] = set()  # those that have not timed out
         self.replies: dict[str, bool] = {}  # by reader, True if it is closed
 
     def poll(self, now: float) -> bool:
@@ -110,7 +108,7 @@ class _Request:
 class FlowControl:
     """The credit of one writer, renewed by acknowledgement requests on `<key>/@ack`, one at a time.
 
-    `needs_router`: readers are reached through a router; without one, missing replies do not mean that they left.
+    `needs_router`: readers are reached through a router; without one, missing replies do not mean that readers left.
     """
 
     def __init__(self, writer: Writer, window: SharedWindow, *, needs_router: bool) -> None:
@@ -127,7 +125,7 @@ class FlowControl:
     def wait_for_credit(self, published: int) -> None:
         """Wait while readers have more than a window of unread messages; raise ClosedError once closed.
 
-        Call it after each message. It returns after a trickle period, until _MAX_UNACKNOWLEDGED messages are unread.
+        Call it after each message. Up to _MAX_UNACKNOWLEDGED unread messages it returns after a trickle period.
         """
         has_credit = published < self._due and published - self._acknowledged[True] < self._window
         if has_credit and published % _POLL_EVERY:
@@ -139,11 +137,11 @@ class FlowControl:
         self._logged = True
         self._wait(published, _MAX_UNACKNOWLEDGED, read=True, timeout=math.inf)
 
-    def wait(self, published: int, *, timeout: float) -> bool:
+    def wait_for_reception(self, published: int, *, timeout: float) -> bool:
         """Wait until readers have received all messages; return False after `timeout` s. Raises ClosedError."""
         with self._lock:
             if self._request is not None and self._request.read:
-                self._request, self._next_request = None, 0.0  # a request for reception is acknowledged sooner
+                self._request, self._next_request = None, 0.0  # reception is acknowledged sooner
             self._acknowledged[False] = 0  # there may be new readers
         return not published or self._wait(published, 1, read=False, timeout=timeout)
 
@@ -166,7 +164,7 @@ class FlowControl:
     def _send_request(self, published: int, *, read: bool, now: float) -> None:
         """Request an acknowledgement of the first `published` messages, or repeat the open request."""
         if self._request is None:
-            self._window = self._shared.part(self._writer.key, published - self._acknowledged[True], now=now)
+            self._window = self._shared.share(self._writer.key, published - self._acknowledged[True], now=now)
             self._due = published + self._window // _REQUESTS_PER_WINDOW
             self._request = _Request(published, self._routers(), read=read, now=now)
         request, writer = self._request, self._writer

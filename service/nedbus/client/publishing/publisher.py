@@ -27,11 +27,11 @@ FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
 class Publisher(AbstractContextManager["Publisher"]):
-    """Publishes the messages of one address; get one from `bus.publisher(...)`.
+    """Publisher of the messages of one address; get one from `bus.publisher(...)`.
 
     A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
-    `publish` never waits for slow readers, unless the publisher is lossless: it then waits while a reader of mode
-    "every" has more than 2,000 unread messages, and sends 10 messages per second meanwhile.
+    `publish` never waits for slow readers, unless the publisher is lossless: it then slows down to 10 messages per
+    second while a reader of mode "every" has more than 2,000 unread messages.
     Not thread-safe. A context manager.
     """
 
@@ -41,7 +41,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         definition: Definition[Any],
         *,
         registry: PublisherRegistry,
-        matched: MatchingListener,
+        listener: MatchingListener,
         lossless: bool,
         source: str | None,
         owner: object,
@@ -67,7 +67,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
-        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=matched)
+        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
 
     @property
     def published(self) -> int:
@@ -89,7 +89,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         """Publish a message, or validate a dict of fields and publish them as a message.
 
         A Message was validated when it was created, and is not validated again.
-        A dict without `timestamp` gets the time since this host booted, as PX4's own messages have that of theirs.
+        A dict without `timestamp` gets the time since boot of this host, like PX4's time since boot.
         Readers see the fields that were not provided in `sample.missing`.
 
         Raises TypeError for another type of message, InvalidMessageError for invalid fields, EncodeError for a message
@@ -108,14 +108,14 @@ class Publisher(AbstractContextManager["Publisher"]):
     def publish_row(self, values: Sequence[object] | Message) -> None:
         """Validate and publish the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples.
 
-        Equivalent to `publish` with these fields, but faster, as no message object is created. Raises the same errors.
+        Equivalent to `publish` with these fields, but faster: no message object is created. Raises the same errors.
         """
         self._put(self._codec.encode_row(cast("Sequence[object]", values)), self._all)
 
     def publish_many(self, messages: MessageArray) -> None:
         """Validate a structured array of shape (n,) and dtype DTYPE, then publish its messages in order.
 
-        Nothing is published if any message is invalid. If the bus is closed meanwhile, `published` has the number sent.
+        Publishes nothing if a message is invalid. If the bus closes during the call, `published` has the number sent.
 
         Raises TypeError for another dtype, InvalidMessageError for the first invalid message, with its `index`,
         ClosedError once the publisher or its bus is closed.
@@ -134,18 +134,18 @@ class Publisher(AbstractContextManager["Publisher"]):
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers of mode "every" have received all messages; return False on timeout.
 
-        Without it, messages in transit to a slow reader when the process ends are lost, and not counted as lost.
+        If the process ends without a flush, messages in transit to a slow reader are lost and not counted as lost.
         A disconnected reader detects the messages it missed, and recovers those still in the history cache.
 
         Raises ClosedError once the bus is closed.
         """
-        return self._flow_control.wait(self.published, timeout=timeout)
+        return self._flow_control.wait_for_reception(self.published, timeout=timeout)
 
     def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
         """Withdraw the address and free it for another publisher. Idempotent.
 
         A lossless publisher is flushed first, for at most `timeout` seconds, unless a `with` block ends with an
-        exception. Ctrl-C ends the wait, and closes.
+        exception. Ctrl-C ends the wait and closes the publisher.
         """
         if self._writer.closed:
             return

@@ -29,7 +29,7 @@ from .writer import Heartbeats
 _log = logging.getLogger(__name__)
 
 _TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to reply with its tokens; usually milliseconds
-_MAX_UNUSED: Final = 64  # definitions without a publisher, for readers that still have messages of one
+_MAX_UNUSED: Final = 64  # definitions kept after their publisher closed, for readers with unread messages
 _FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
 
 
@@ -43,12 +43,12 @@ class PublisherRegistry:
         self.prefix, self.is_client = prefix, is_client
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries = session, queries
-        self.publishers: dict[Address, Publisher] = {}  # the open ones
+        self.publishers: dict[Address, Publisher] = {}  # open publishers
         self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
         self._schema_key = partial(schema_key, session=str(session.zid()), prefix=prefix)
-        self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
+        self._rate_listeners: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
-        self._shared: set[str] = set()
+        self._shared: set[str] = set()  # vehicles that another process also publishes
         self._lock = threading.Lock()
 
     def publisher(
@@ -74,17 +74,17 @@ class PublisherRegistry:
             if address in self.publishers:
                 raise AddressInUseError(address)
             vehicle, prefix = address.vehicle, self.prefix
-            if vehicle not in self._matched:
+            if vehicle not in self._rate_listeners:
                 selection = Selection(vehicle=vehicle)
                 tokens, rates = selection.alive_key_expr(prefix=prefix), selection.rate_key_expr(ANY, prefix=prefix)
                 self._directories[vehicle] = VehicleDirectory(tokens, prefix=prefix)
-                self._matched[vehicle] = MatchingListener(self._session, rates)
-            matched = self._matched[vehicle]
+                self._rate_listeners[vehicle] = MatchingListener(self._session, rates)
+            listener = self._rate_listeners[vehicle]
             publisher = self.publishers[address] = Publisher(
-                address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
+                address, definition, registry=self, listener=listener, lossless=lossless, source=source, owner=owner
             )
             self._queries.answer(f"{self.prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
-            # A key of its own: routers take quadratic time for one that all sessions declare.
+            # One key per session: routers need quadratic time for a key that all sessions declare.
             self._queries.answer(self._schema_key(ANY), partial(_reply_schemas, self._schema_key, self._definitions))
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
             if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
@@ -99,12 +99,12 @@ class PublisherRegistry:
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
     def shared_vehicles(self) -> set[str]:
-        """Return the vehicles that another process publishes as well; log new ones."""
+        """Return the vehicles that another process also publishes; log new ones."""
         with self._lock:
             directories = list(self._directories.items())
         counts = {name: each.publishers(self._session, timeout=0).values() for name, each in directories}
         shared = {name for name, numbers in counts.items() if max(numbers, default=0) > 1}
-        with self._lock:  # several threads ask
+        with self._lock:  # several threads call this
             known, self._shared = self._shared, shared
         for name in shared - known:
             text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
@@ -112,13 +112,13 @@ class PublisherRegistry:
         return shared
 
     def confirm(self, address: Address) -> None:
-        """Wait until the router has processed all declarations of an address, by a query without an answer.
+        """Wait until the router has processed all declarations of an address, with a query that matches nothing.
 
-        After a query for a token of its own, Zenoh 1.10 at times lists that token for ever.
+        After a query for the session's own token, Zenoh 1.10 sometimes lists that token forever.
         """
         alive_keys(self._session, f"{self.prefix}/{address.vehicle}/@alive", timeout=_TOKENS_TIMEOUT)
 
-    def is_read(self, addresses: Iterable[Address]) -> bool:
+    def has_subscriber(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""
         with ExitStack() as opened:
             keys = (address.key(prefix=self.prefix) for address in addresses)
@@ -133,7 +133,7 @@ class PublisherRegistry:
         timeout: float = FLUSH_TIMEOUT,
         stop: threading.Event | None = None,
     ) -> None:
-        """Wait until readers have received all messages of these publishers, `timeout` seconds, or until `stop`."""
+        """Wait until readers have received all messages of these publishers; end after `timeout` s or on `stop`."""
         end = time.monotonic() + timeout
         for publisher in publishers:
             address, logged = publisher.address, False
@@ -152,12 +152,12 @@ class PublisherRegistry:
             self.publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self.publishers):
                 self._queries.end(f"{self.prefix}/{address.vehicle}/**")
-                self._matched.pop(address.vehicle).close()
+                self._rate_listeners.pop(address.vehicle).close()
                 del self._directories[address.vehicle]
 
 
 def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:
-    """Reply with the last messages of a vehicle; the registry would else stay alive, and its bus."""
+    """Reply with the last messages of a vehicle; a strong reference would keep the registry and its bus alive."""
     for publisher in tuple(found.publishers.values()) if (found := registry()) is not None else ():
         matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
         if matches and publisher.last is not None:
@@ -168,8 +168,8 @@ def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.
 def _reply_schemas(
     key_of: Callable[[str], str], definitions: Mapping[tuple[str, str], Definition[Any]], query: zenoh.Query
 ) -> None:
-    """Reply with the schemas of the queried messages, or with the one that has the hash in the query."""
-    wanted = query.parameters.get("hash")
+    """Reply with the schemas of the queried messages, or only with the one whose hash the query names."""
+    requested = query.parameters.get("hash")
     for (name, short), definition in tuple(definitions.items()):
-        if wanted in (None, short) and query.key_expr.intersects(key_of(name)):
+        if requested in (None, short) and query.key_expr.intersects(key_of(name)):
             query.reply(key_of(name), json.dumps({**definition.schema(), "hash": short}), encoding=JSON)

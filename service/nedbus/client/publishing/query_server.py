@@ -1,4 +1,4 @@
-"""Replies to Zenoh queries: the I/O thread polls for them, and a thread of their own computes the replies."""
+"""Replies to Zenoh queries: the I/O thread polls for them, and a separate thread computes the replies."""
 
 import logging
 import threading
@@ -16,12 +16,12 @@ from nedbus.transport import Session, translate_zenoh_errors
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 1000  # queued queries per key expression; beyond that the oldest are dropped
-_TURN: Final = 0.02  # s of replies on one key expression, then others get their turn
-_POLL: Final = 0.01  # s between polls; a tick without a query for _BUSY seconds
+_TURN: Final = 0.02  # s of replies on one key expression before others get their turn
+_POLL: Final = 0.01  # s between polls; TICK after _BUSY seconds without a query
 _BUSY: Final = 1.0
 JSON: Final = "application/json"
 
-_replies = CallThread("nedbus-replies")  # a report of many vehicles takes longer than the I/O thread may be held up
+_replies = CallThread("nedbus-replies")  # a report on many vehicles would block the I/O thread for too long
 
 # Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close.
 Reply = Callable[[zenoh.Query], object]
@@ -35,7 +35,7 @@ class QueryServer:
         self._queryables: dict[str, _Queryable] = {}
 
     def answer(self, key_expr: str, reply: Reply) -> None:
-        """Call `reply` for each query on a key expression from now on, unless it is answered already.
+        """Call `reply` for each query on a key expression from now on; do nothing if it is already answered.
 
         Raises ClosedError if the session is closed.
         """
@@ -43,7 +43,7 @@ class QueryServer:
             self._queryables[key_expr] = _Queryable(self._session, key_expr, reply)
 
     def answer_json(self, key: str, parts: Callable[[Callable[[str], str | None]], Iterable[bytes]]) -> None:
-        """Reply to queries on a key with one or several JSON texts; `parts` gets a getter of the query's parameters."""
+        """Reply to queries on a key with the JSON texts of `parts(get)`; `get` returns a parameter of the query."""
 
         def reply(query: zenoh.Query) -> None:
             for part in parts(query.parameters.get):
@@ -52,12 +52,12 @@ class QueryServer:
         self.answer(key, reply)
 
     def end(self, key_expr: str) -> None:
-        """Reply no more to queries on a key expression. Idempotent."""
+        """Stop replying to queries on a key expression. Idempotent."""
         if (queryable := self._queryables.pop(key_expr, None)) is not None:
             queryable.close()
 
     def close(self) -> None:
-        """Reply to no more queries."""
+        """Stop replying to queries."""
         while self._queryables:
             self._queryables.popitem()[1].close()
 
@@ -66,8 +66,8 @@ class _Queryable:
     def __init__(self, session: Session, key_expr: str, reply: Reply) -> None:
         with translate_zenoh_errors():
             self._queryable = session.declare_queryable(key_expr, zenoh.handlers.RingChannel(_MAX_PENDING))
-        self._take, self._reply = self._queryable.handler.try_recv, reply
-        self._query: zenoh.Query | None = None  # to be replied to
+        self._try_recv, self._reply = self._queryable.handler.try_recv, reply
+        self._query: zenoh.Query | None = None  # the next one to reply to
         self._busy_until = 0.0
         self._replying = threading.Lock()
         self._closed = False
@@ -83,7 +83,7 @@ class _Queryable:
     def _poll(self, now: float) -> float:
         if self._query is None:
             with suppress(zenoh.ZError):  # the session is closed
-                self._query = self._take()
+                self._query = self._try_recv()
             if self._query is not None:
                 self._busy_until = now + _BUSY
                 _replies.put(self._take_turn)
@@ -101,4 +101,4 @@ class _Queryable:
                     _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
                 except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
                     _log.exception("%s: failed to reply to a query", key_expr, extra=about("internal_error"))
-                self._query = self._take() if time.monotonic() < end else None
+                self._query = self._try_recv() if time.monotonic() < end else None

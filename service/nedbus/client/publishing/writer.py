@@ -1,4 +1,4 @@
-"""Writers: advanced publishers of Zenoh with history cache, sequence numbers and heartbeats."""
+"""Writers: Zenoh's advanced publishers with history cache, sequence numbers and heartbeats."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payl
 from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
-_TURN: Final = 256  # heartbeats per call, so that other jobs are not delayed
-HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s from a last message until readers detect that they missed it, at most
+_TURN: Final = 256  # heartbeats per call; more would delay other jobs
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s, at most, until readers detect that they missed a last message
 
 
 class Writer:
@@ -29,9 +29,9 @@ class Writer:
         self.session, self.key, self.published = heartbeats.session, key, 0
         self.priority = Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA
         self.last_put = 0.0  # monotonic time of the last message [s]
-        self.is_silent = True  # since then a heartbeat has been sent, or there is no message yet
+        self.is_silent = True  # before the first message, and once a heartbeat has followed the last one
         self.silent_since, self.sent_heartbeats = 0.0, 0  # time of the last message [s], and heartbeats since then
-        self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a look at `last_put` [s]
+        self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a check of `last_put` [s]
         self._heartbeats = heartbeats
         with translate_zenoh_errors():
             # Interconnected routers cache the route of a message only if something is declared on its exact key.
@@ -66,14 +66,14 @@ class Writer:
     def close(self) -> None:
         """Withdraw the key and the history cache. Idempotent."""
         self._heartbeats.writers.discard(self)
-        # This drops the only reference: undeclare() would wait for Zenoh while holding the interpreter's lock.
+        # This drops the only reference: undeclare() would wait for Zenoh while holding the GIL.
         self._publisher = None
         with suppress(zenoh.ZError):  # the session is already closed
             self._token.undeclare()
 
 
 class Heartbeats:
-    """Sends the heartbeats of `writers`, all of a session; without readers they cost no traffic."""
+    """Sends the heartbeats of all writers of a session; without readers they cause no traffic."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -81,7 +81,7 @@ class Heartbeats:
         self._job: Job | None = None
 
     def resume(self, writer: Writer) -> None:
-        """End the silence of a writer, which has put a message."""
+        """Schedule the heartbeat of a writer that has put a message after a silence."""
         writer.is_silent, writer.heartbeat_due = False, writer.last_put + _PAUSES[0]
         if self._job is None:
             self._job = Job(self._run)
@@ -96,7 +96,7 @@ class Heartbeats:
     def _run(self, now: float) -> float:
         due = now + self.send_due(now)
         if self._job is not None and due < math.inf:  # without a job yet, `resume` wakes it
-            self._job.wake(due)  # not before, unlike the returned pause
+            self._job.wake(due)  # at the next tick; a returned pause would end at the tick before
         return math.inf
 
     def send_due(self, now: float) -> float:
@@ -105,7 +105,7 @@ class Heartbeats:
         for writer in tuple(self.writers):
             if writer.heartbeat_due > now or not left:
                 continue
-            writer.is_silent = True  # before the look at its last message, so that the next one calls `resume`
+            writer.is_silent = True  # before `last_put` is read: a message after that calls `resume`
             if writer.silent_since != writer.last_put:
                 writer.silent_since, writer.sent_heartbeats = writer.last_put, 0
                 writer.heartbeat_due = writer.silent_since + _PAUSES[0]

@@ -1,4 +1,4 @@
-"""Receiving: from Zenoh's ring to the application, with every message accounted for."""
+"""The receiving side: from Zenoh's ring to the application, with every message counted."""
 
 from .decoder import Decoder
 from .layout_lookup import LayoutLookup, find_schemas

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
-_MAX_WARNED: Final = 100  # keys with a logged warning about invalid messages
+_MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
 _MAX_ENCODING: Final = 512  # characters kept of an encoding; those of nedbus have 250 at most
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
@@ -38,20 +38,20 @@ _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 class KeyState:
     """State of a key: address, codec, writer proxies and losses not yet reported."""
 
-    key: str  # of the full-rate stream
-    wire_key: str  # on which messages arrive, perhaps downsampled
+    key: str  # key of the full-rate stream
+    wire_key: str  # key on which messages arrive, perhaps downsampled
     address: Address
-    codec: Codec[Any] | None = None  # None for messages without a file, whose definition each encoding identifies
+    codec: Codec[Any] | None = None  # None for messages not installed here: each encoding identifies a definition
     size: int = -1  # bytes of its payload with all fields
-    encoding: tuple[object, str] = None, ""  # the last one, as Zenoh's object and as text; two threads access it
+    encoding: tuple[object, str] = None, ""  # the last one, Zenoh's object and its text; accessed by two threads
     provenance: tuple[str, Provenance] = "", Provenance()  # the last one, with its encoding
     writers: dict[str, WriterProxy] = field(default_factory=dict)  # by name
     writer: WriterProxy | None = None  # of the last message
-    heard: float = 0.0  # monotonic time of the last message or heartbeat [s]
+    last_active: float = 0.0  # monotonic time of the last message or heartbeat [s]
     gap: int = 0  # messages lost before the next delivery
     unreported: int = 0  # messages lost before one that was dropped or invalid; the next sample read reports them
     gate: RateGate | None = None  # with a maximum rate, once a downsampled message has arrived
-    last_sent: float = -math.inf  # with a maximum rate, time of sending of the last message, queued before [ns]
+    last_sent: float = -math.inf  # with a maximum rate, time of sending of the retained message [ns]
 
 
 class DetachedSample(NamedTuple):
@@ -64,10 +64,10 @@ class DetachedSample(NamedTuple):
 
 
 Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int, int]
-"""An admitted message: its stream, its payload, empty if it was rejected, its metadata, messages lost before it, and
-the time at which it left Zenoh's ring [ns].
+"""An admitted message: key state, payload (empty if rejected), metadata, number of messages lost before it, and the
+time at which it left Zenoh's ring [ns].
 
-A plain tuple: an object with names costs 0.1 us more per message, where a batch takes 0.3 us.
+A plain tuple: a class with named fields costs 0.1 us more per message, where a batch takes 0.3 us.
 """
 
 
@@ -78,7 +78,7 @@ class Decoder:
         self.invalid = 0
         self._layouts = layouts
         self.prefix = prefix
-        self._warned: set[int] = set()  # hashes, as keys may be long
+        self._warned: set[int] = set()  # hashes, because keys may be long
         self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject
 
     def open(self, key: str) -> KeyState:
@@ -91,7 +91,7 @@ class Decoder:
         return stream
 
     def read(self, answers: Sequence[RawSample]) -> Iterator[tuple[RawSample, Sample[Any]]]:
-        """Decode the valid samples of a query, each with its Zenoh sample; blocks for lookups of definitions."""
+        """Yield the valid samples of a query, each with its Zenoh sample; wait for lookups of definitions."""
         received = clock.utc_ns()
         opened = [(raw, str(raw.key_expr), raw.payload.to_bytes()) for raw in answers]
         for raw, key, payload in opened:
@@ -110,7 +110,7 @@ class Decoder:
                     yield raw, sample
 
     def codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
-        """Return the codec of a sample; None if no publisher describes its message.
+        """Return the codec of a sample; None if no publisher has its definition.
 
         `wait`: wait for a lookup in progress; never do so on a receiving thread.
         Raises DecodeError if the encoding identifies no message.
@@ -120,7 +120,7 @@ class Decoder:
         encoding, info = encoding_of(stream, raw), raw.source_info
         identity = identity_of(encoding)
         if identity is None:
-            raise DecodeError(f"the encoding {encoding!r:.100} has no name and hash of a message")
+            raise DecodeError(f"the encoding {encoding!r:.100} has no message name and hash")
         return self._layouts.codec(*identity, publisher=info and info.source_id.zid, wait=wait)
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
@@ -131,7 +131,7 @@ class Decoder:
         codec = stream.codec or self.codec(stream, raw)
         encoding = encoding_of(stream, raw)
         if codec is None:
-            self.reject(stream.key, DecodeError(f"no publisher describes {encoding[:_MAX_TEXT]!r}"), stream)
+            self.reject(stream.key, DecodeError(f"no publisher has the definition of {encoding[:_MAX_TEXT]!r}"), stream)
             return None
         decode = codec.decode_row if rows else codec.decode
         try:
@@ -158,10 +158,10 @@ class Decoder:
         """Count an invalid sample and log the reason once per key, for the first 100 keys only."""
         with self._counting:
             self.invalid += 1
-            if len(self._warned) >= _MAX_WARNED or hash(key) in self._warned:
+            if len(self._warned) >= _MAX_LOGGED_KEYS or hash(key) in self._warned:
                 return
             self._warned.add(hash(key))
-            last = "; further keys are only counted" if len(self._warned) == _MAX_WARNED else ""
+            last = "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
         reason = str(error)[:_MAX_TEXT]
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
@@ -189,7 +189,7 @@ def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:
 def mark_retained(arrival: Arrival) -> Arrival:
     """Return the first arrival of a publisher, marked as retained if Zenoh's history query returned it.
 
-    Only replies to queries have that congestion control: publishers of nedbus drop.
+    Only replies to queries use congestion control BLOCK; nedbus publishers use DROP.
     """
     raw = arrival[2]
     is_reply = not isinstance(raw, DetachedSample) and raw.congestion_control == zenoh.CongestionControl.BLOCK
@@ -204,5 +204,5 @@ def encoding_of(stream: KeyState, raw: RawSample | DetachedSample) -> str:
     known, text = stream.encoding
     if encoding != known:
         text = str(encoding)[:_MAX_ENCODING]
-        stream.encoding = zenoh.Encoding(text), text  # a copy, as the original keeps its receive buffer in memory
+        stream.encoding = zenoh.Encoding(text), text  # a copy: the original keeps its receive buffer in memory
     return text

@@ -1,4 +1,4 @@
-"""Layout lookup: ask publishers for message definitions and layouts that are not installed here."""
+"""Layout lookup: query publishers for message definitions and layouts that are not installed here."""
 
 import logging
 import threading
@@ -23,21 +23,21 @@ from nedbus_msgs import MESSAGES, Codec, Definition, codec_of, define, field_typ
 _log = logging.getLogger(__name__)
 
 _MAX_LAYOUTS: Final = 16  # newer layouts per message
-_MAX_FIELDS: Final = 65_536  # of all messages defined by publishers; PX4's have 15 on average
-_IN_USE: Final = 60.0  # s since the last message for which a definition is kept, although there is no room for another
-_BASE: Final = 48  # fields that take as much memory as a message without any
-_MAX_UNKNOWN: Final = 64  # messages and layouts per query, and those that wait for the next one
-_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond, the first one may be asked for again
-_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s until the same is asked for again, by failed queries
-_PACE: Final = 0.2  # s between a query without a result and the next one
+_MAX_FIELDS: Final = 65_536  # of all definitions from publishers; PX4's messages have 15 on average
+_IN_USE: Final = 60.0  # s after its last message during which a definition is not evicted
+_BASE: Final = 48  # memory of an empty definition, in units of one field
+_MAX_UNKNOWN: Final = 64  # messages and layouts per query; as many more may wait for the next one
+_MAX_FAILED: Final = 1024  # messages and layouts with a failed query; beyond that the oldest backoff is discarded
+_PAUSES: Final = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)  # s, backoff after failed queries for a message or layout
+_QUERY_PAUSE: Final = 0.2  # s between a query without a result and the next one
 _MAX_REPLY_FIELDS: Final = 256  # per layout
 _MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_RECOVERY: Final = 0.1  # of the time since then becomes patience again, so that no peer can keep readers waiting
+_BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait for longer
 
-# A message, and the number of a newer layout or, for a message without a file, the hash of its definition.
-Wanted = tuple[str, int | str]
-Schemas = Mapping[Wanted, Mapping[str, str]]  # descriptions by publishers: field name to type
+# Message name, and number of a newer layout or, for a message not installed here, hash of its definition.
+SchemaId = tuple[str, int | str]
+Schemas = Mapping[SchemaId, Mapping[str, str]]  # definitions from publishers: field types by name
 
 
 class LayoutLookup:
@@ -48,40 +48,40 @@ class LayoutLookup:
     """
 
     def __init__(
-        self, find: Callable[[Collection[Wanted]], Schemas], *, now: Callable[[], float] = time.monotonic
+        self, find: Callable[[Collection[SchemaId]], Schemas], *, now: Callable[[], float] = time.monotonic
     ) -> None:
         self._find = find
         self._now = now
         self._newer: dict[str, dict[int, Sequence[str]]] = {}
-        self._codecs: dict[Wanted, Codec[Any]] = {}
-        self._used: dict[Wanted, float] = {}  # monotonic time of the last use of each codec [s]
+        self._codecs: dict[SchemaId, Codec[Any]] = {}
+        self._used: dict[SchemaId, float] = {}  # monotonic time of the last use of each codec [s]
         self._full = False
         self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
-        self._open: dict[Wanted, object] = {}  # with the publisher; those of the current query first
-        self._failed: dict[Wanted, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
-        self._patience, self._waited = TIMINGS.definition_timeout, float("-inf")  # of readers; their last wait in vain
+        self._open: dict[SchemaId, object] = {}  # with the publisher; the queried ones first
+        self._failed: dict[SchemaId, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
+        self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last futile wait
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
         """Return the newer layouts of a message found so far, in the form that `decode` expects."""
         return self._newer.get(definition.name, {})
 
     def codec(self, name: str, identity: str, *, publisher: object = None, wait: bool = False) -> Codec[Any] | None:
-        """Return the codec of a message without a file; None while its definition is unknown, and start a lookup.
+        """Return the codec of a message not installed here; None if unknown, which starts a lookup.
 
-        `publisher`: after a failed lookup, that of another publisher starts at once.
+        `publisher`: after a failed lookup, one for another publisher starts at once, without backoff.
         `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
         """
-        wanted = name, identity
-        codec = self._codecs.get(wanted)
+        schema_id = name, identity
+        codec = self._codecs.get(schema_id)
         if codec is None:
-            self._request(wanted, publisher)
+            self._request(schema_id, publisher)
             if wait:
-                self.wait(wanted)
-                codec = self._codecs.get(wanted)
+                self.wait(schema_id)
+                codec = self._codecs.get(schema_id)
         if codec is not None:
-            self._used[wanted] = self._now()
+            self._used[schema_id] = self._now()
         return codec
 
     def check(self, codec: Codec[Any], payload: bytes) -> None:
@@ -94,17 +94,17 @@ class LayoutLookup:
                 self._request((name, exc.layout))
             raise
 
-    def wait(self, wanted: Wanted | None = None) -> None:
+    def wait(self, schema_id: SchemaId | None = None) -> None:
         """Wait for one lookup or for all, up to 3 s; never call it on a receiving thread."""
         with self._changed:
             start = time.monotonic()
             longest = TIMINGS.definition_timeout
-            patience = min(longest, self._patience + _RECOVERY * (start - self._waited))
-            is_pending = self._open.__len__ if wanted is None else partial(self._open.__contains__, wanted)
-            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if wanted is None else patience)
-            if wanted is not None and wanted not in self._codecs:
-                self._waited = time.monotonic()
-                self._patience = max(0.0, patience - (self._waited - start))
+            budget = min(longest, self._wait_budget + _BUDGET_RATE * (start - self._budget_time))
+            is_pending = self._open.__len__ if schema_id is None else partial(self._open.__contains__, schema_id)
+            self._changed.wait_for(lambda: self._closed or not is_pending(), longest if schema_id is None else budget)
+            if schema_id is not None and schema_id not in self._codecs:
+                self._budget_time = time.monotonic()
+                self._wait_budget = max(0.0, budget - (self._budget_time - start))
 
     def close(self) -> None:
         """Start no more lookups and wait for the one in progress."""
@@ -115,14 +115,14 @@ class LayoutLookup:
         if thread is not None:
             join_thread(thread, TIMINGS.definition_timeout)
 
-    def _request(self, wanted: Wanted, publisher: object = None) -> None:
+    def _request(self, schema_id: SchemaId, publisher: object = None) -> None:
         with self._changed:
-            _, due, failed = self._failed.get(wanted, (0, float("-inf"), None))
+            _, due, failed = self._failed.get(schema_id, (0, float("-inf"), None))
             is_due = self._now() >= due or publisher != failed
-            is_known = wanted in self._codecs or wanted[1] in self._newer.get(wanted[0], ())
+            is_known = schema_id in self._codecs or schema_id[1] in self._newer.get(schema_id[0], ())
             if self._closed or is_known or not is_due or len(self._open) >= 2 * _MAX_UNKNOWN:
                 return
-            self._open[wanted] = publisher
+            self._open[schema_id] = publisher
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="nedbus-layouts", daemon=True)
                 self._thread.start()
@@ -133,61 +133,61 @@ class LayoutLookup:
                 if self._closed or not self._open:
                     self._thread = None
                     return
-                asked = dict(islice(self._open.items(), _MAX_UNKNOWN))
-            added: list[Wanted] = []
+                queried = dict(islice(self._open.items(), _MAX_UNKNOWN))
+            added: list[SchemaId] = []
             try:
                 with suppress(NedbusError):  # the session is closed
-                    found = self._find(asked)
-                    added = [wanted for wanted in asked if wanted in found and self._add(wanted, found[wanted])]
+                    found = self._find(queried)
+                    added = [each for each in queried if each in found and self._add(each, found[each])]
             finally:
-                self._end(asked, added)
+                self._finish_query(queried, added)
 
-    def _end(self, asked: Mapping[Wanted, object], added: Collection[Wanted]) -> None:
+    def _finish_query(self, queried: Mapping[SchemaId, object], added: Collection[SchemaId]) -> None:
         with self._changed:
-            for wanted, asked_for in asked.items():
-                publisher = self._open.pop(wanted)
-                failures = self._failed.pop(wanted, (0,))[0]
-                if wanted not in added and publisher != asked_for:
-                    self._open[wanted] = publisher  # perhaps later than the query
-                elif wanted not in added:
+            for schema_id, queried_publisher in queried.items():
+                publisher = self._open.pop(schema_id)
+                failures = self._failed.pop(schema_id, (0,))[0]
+                if schema_id not in added and publisher != queried_publisher:
+                    self._open[schema_id] = publisher  # this publisher may have appeared after the query
+                elif schema_id not in added:
                     pause = _PAUSES[min(failures, len(_PAUSES) - 1)]
-                    self._failed[wanted] = failures + 1, self._now() + pause, publisher
+                    self._failed[schema_id] = failures + 1, self._now() + pause, publisher
             while len(self._failed) > _MAX_FAILED:
                 del self._failed[next(iter(self._failed))]
             self._changed.notify_all()
             if not added:
-                self._changed.wait_for(lambda: self._closed, _PACE)
+                self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
 
-    def _add(self, wanted: Wanted, fields: Mapping[str, str]) -> bool:
-        name, which = wanted
+    def _add(self, schema_id: SchemaId, fields: Mapping[str, str]) -> bool:
+        name, which = schema_id
         return self._add_layout(name, which, fields) if isinstance(which, int) else self._define(name, which, fields)
 
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
-        if not self._make_room(len(fields) + _BASE):
+        if not self._evict(len(fields) + _BASE):
             if not self._full:
-                _log.warning("%s: too many messages without a file: not read", name, extra=about("invalid"))
+                _log.warning("%s: not decoded: too many messages are not installed here", name, extra=about("invalid"))
             self._full = True
             return False
         try:
             definition = define(name, ((field, field_type(kind)) for field, kind in fields.items()))
         except ValueError as exc:
-            _log.warning("%s: invalid description by a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
+            _log.warning("%s: invalid definition from a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
         self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
-        text = "%s is not installed here: using the publisher's description"
+        text = "%s is not installed here: using the publisher's definition"
         _log.info(text, name, extra=about("runtime_definition", reason=f"hash {identity}"))
         return True
 
-    def _make_room(self, size: int) -> bool:
-        """Forget definitions out of use, least recently used first; return False if that makes too little room."""
+    def _evict(self, size: int) -> bool:
+        """Evict unused definitions, least recently used first; return False if that frees too little."""
         known = sorted(self._codecs, key=self._used.__getitem__)
-        room = _MAX_FIELDS - sum(len(self._codecs[wanted].definition.types) + _BASE for wanted in known)
-        for wanted in known:
-            if room >= size or self._now() - self._used[wanted] < _IN_USE:
+        free = _MAX_FIELDS - sum(len(self._codecs[schema_id].definition.types) + _BASE for schema_id in known)
+        for schema_id in known:
+            if free >= size or self._now() - self._used[schema_id] < _IN_USE:
                 break
-            room += len(self._codecs.pop(wanted).definition.types) + _BASE
-            del self._used[wanted]
-        return room >= size
+            free += len(self._codecs.pop(schema_id).definition.types) + _BASE
+            del self._used[schema_id]
+        return free >= size
 
     def _add_layout(self, name: str, number: int, fields: Mapping[str, str]) -> bool:
         definition, newer = MESSAGES[name], self._newer.get(name, {})
@@ -195,8 +195,8 @@ class LayoutLookup:
             return False
         self._newer[name] = {**newer, number: tuple(fields)}
         ignored = ", ".join(field for field in fields if field not in definition.types)[:_MAX_TEXT] or "nothing"
-        extra = about("newer_layout")
-        _log.warning("layout %d of %s is newer than this reader; not read: %s", number, name, ignored, extra=extra)
+        text = "layout %d of %s is newer than this reader; ignored fields: %s"
+        _log.warning(text, number, name, ignored, extra=about("newer_layout"))
         return True
 
 
@@ -215,14 +215,14 @@ class _Layout:
 _LAYOUT: Final = TypeAdapter(_Layout)
 
 
-def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -> Schemas:
+def find_schemas(ids: Collection[SchemaId], *, session: Session, prefix: str) -> Schemas:
     """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
 
-    Returns once all are found: a publisher that is stopped, or behind a bad link, does not delay it.
+    Returns once all are found, without waiting for stopped publishers or bad links.
     """
-    found: dict[Wanted, dict[str, str]] = {}
+    found: dict[SchemaId, dict[str, str]] = {}
     keys = {
-        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in wanted
+        schema_key(name, prefix=prefix) + (f"?hash={which}" if isinstance(which, str) else "") for name, which in ids
     }
     queries = [send_query(session, key, timeout=TIMINGS.definition_timeout) for key in keys]
     replies = islice(wait_for_replies(queries), MAX_REPLIES)
@@ -233,11 +233,11 @@ def find_schemas(wanted: Collection[Wanted], *, session: Session, prefix: str) -
             with suppress(ValueError):
                 parsed = _LAYOUT.validate_python(layout)
                 fields = {field.name: field.type for field in parsed.fields}
-                # The hash of what the peer describes, not what it claims.
+                # Compute the hash from the fields: the peer's own `hash` is untrusted.
                 types = {} if name in MESSAGES else {field: field_type(kind) for field, kind in fields.items()}
                 which = short_hash(name, types) if types else parsed.wire
-                if len(fields) == len(parsed.fields) and (name, which) in wanted:
+                if len(fields) == len(parsed.fields) and (name, which) in ids:
                     found.setdefault((name, which), fields)
-        if len(found) == len(wanted):
+        if len(found) == len(ids):
             break
     return found

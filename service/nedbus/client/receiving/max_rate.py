@@ -1,6 +1,6 @@
-"""Subscription with a maximum rate: last messages first, then the streams that publishers downsample.
+"""Subscription with a maximum rate: last messages first, then the streams downsampled by publishers.
 
-If a publisher does not downsample, a warning is logged; the full rate is never used, as the link may not carry it.
+If a publisher does not downsample, a warning is logged; the full rate is never used, because the link may not carry it.
 """
 
 import logging
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 _TIMEOUT: Final = 2.0  # s for the queries of last messages and liveliness tokens
 _LAST_POLL: Final = 0.02  # s between polls for last messages
-_OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
+_MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake a downsampled one
 
 
 class MaxRateQueue(PendingQueue):
@@ -71,8 +71,8 @@ class MaxRateQueue(PendingQueue):
     def _passes(self, arrival: Arrival) -> bool:
         stream = arrival[0]
         stream.gate = stream.gate or RateGate(self._max_rate)
-        passes = not 0 <= stream.last_sent - _sent(arrival) <= _OVERTAKEN
-        if self.rate > self._max_rate:  # lower than publishers offer
+        passes = not 0 <= stream.last_sent - _sent(arrival) <= _MAX_OVERTAKE
+        if self.rate > self._max_rate:  # below the lowest rate of publishers
             passes = passes and stream.gate.passes(time.monotonic_ns())
         if not passes:
             stream.unreported += arrival[3]
@@ -84,7 +84,7 @@ class MaxRateReceiver(Receiver):
 
     def __init__(self, session: Session, queue: MaxRateQueue) -> None:
         self._prefix, self._rate_queue, selection = queue.decoder.prefix, queue, queue.selection
-        self._awaiting: dict[Address, float] = {}  # appearance of tokens without a downsampled message yet [s]
+        self._awaiting: dict[Address, float] = {}  # time at which the token of a stream without a message appeared [s]
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=self._prefix))
         self._last = send_query(session, selection.key_expr(prefix=self._prefix), timeout=_TIMEOUT)
         super().__init__(session, queue, history=False)
@@ -95,7 +95,7 @@ class MaxRateReceiver(Receiver):
         pause = super()._poll(now)
         with suppress(NedbusError, zenoh.ZError):  # the session is closed
             found = [reply.ok for reply in self._last.take() if reply.ok is not None]
-            # Only live publishers: vehicles with nothing but a stored message are gone.
+            # Only from live publishers: a vehicle that has only a stored message is gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
                 self._rate_queue.put_last(live)
             self._check_publishers(now)
@@ -108,14 +108,14 @@ class MaxRateReceiver(Receiver):
                 topic = get_topic(address.topic)
                 if not alive:
                     self._awaiting.pop(address, None)
-                elif topic.rate and not topic.on_change:  # others may pause for long
+                elif topic.rate and not topic.on_change:  # other topics may pause for long
                     self._awaiting.setdefault(address, now)
         due = [address for address, since in self._awaiting.items() if now - since >= TIMINGS.downsampled_timeout]
         for address in due:
             del self._awaiting[address]
         if missing := [address for address in due if not self._rate_queue.has_downsampled(address)]:
             key = missing[0].key(prefix=self._prefix)
-            text = "%d streams are not received, as they are not downsampled (by publisher or access rules), such as %s"
+            text = "%d streams are not downsampled (by publisher or access rules) and not received, such as %s"
             _log.warning(text, len(missing), key, extra=about("unsupported"))
 
 

@@ -34,25 +34,25 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CAPACITY: Final = 65_536
-"""Samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped."""
+"""Samples queued in mode `every`, about 45 MB; beyond that the oldest are dropped."""
 
 MAX_KEYS: Final = 10_000
-"""Keys that a reader follows, a bound on memory; beyond, those silent longest are forgotten, and counted."""
+"""Keys tracked by a reader, to bound its memory; beyond that the least recently active are evicted and counted."""
 
 MAX_SILENCE: Final = 600.0
-"""Seconds without a message or heartbeat after which the state of a key is freed where there are many keys."""
+"""Seconds without a message or heartbeat after which a key is evicted, if there are more than KEPT_KEYS."""
 
 KEPT_KEYS: Final = 1_000
-"""Keys that are remembered however long they are silent, so that the losses of a long outage are counted."""
+"""Keys kept however long they are silent, to count the losses of a long outage."""
 
 MAX_HELD: Final = 131_072
-"""Messages held back behind gaps, about 90 MB; beyond, gaps are given up."""
+"""Messages held back behind gaps, about 90 MB; beyond that gaps are given up."""
 
 MAX_ACK_REQUESTS: Final = 1000
 """Pending acknowledgement requests; a well-behaved publisher has one per key."""
 
 _MAX_BATCH: Final = 4096  # messages per batch
-_MAX_FRESH: Final = 1024  # samples queued along with Zenoh's receive buffer; later ones are detached from it
+_MAX_FRESH: Final = 1024  # samples queued with Zenoh's receive buffer; later ones are detached from it
 _MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
@@ -68,7 +68,7 @@ class AckRequest:
     publisher: str
     number: int
     read: bool
-    reply: Callable[[], object]  # answers it, and is called once
+    reply: Callable[[], object]  # sends the acknowledgement; called once
     read_target: int | None = None  # samples to be read before answering; None until the message has arrived
 
 
@@ -95,10 +95,10 @@ class PendingQueue:
         self._warned: set[str] = set()
         self.decoder = decoder
         self._clock = clock
-        self._lock = threading.RLock()  # reentrant, as log handlers may read the counts
+        self._lock = threading.RLock()  # reentrant, because log handlers may read the counts
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._streams: dict[str, KeyState] = {}
-        self._by_silence: list[tuple[float, str]] = []  # heap: every key, with the time of some message of it
+        self._by_activity: list[tuple[float, str]] = []  # heap: each key, with a time at which it was active
         self._settling_until = float("-inf")
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
@@ -107,10 +107,11 @@ class PendingQueue:
 
     @property
     def counts(self) -> Counts:
-        """Received, lost, dropped, invalid and discarded messages so far, and forgotten keys."""
+        """Received, lost, dropped, invalid and discarded messages so far, and evicted keys."""
         with self._lock:
-            own, invalid = self.counters, self.decoder.invalid
-            return Counts(self._received, own.lost, own.dropped, invalid, own.discarded, own.forgotten)
+            counters, invalid = self.counters, self.decoder.invalid
+            lost, dropped, forgotten = counters.lost, counters.dropped, counters.forgotten
+            return Counts(self._received, lost, dropped, invalid, counters.discarded, forgotten)
 
     @property
     def waiting(self) -> int:
@@ -128,7 +129,7 @@ class PendingQueue:
             has_gap = self.counters.opened > opened
         if has_gap and self.on_gap is not None:
             self.on_gap()
-        if self._tokens.empty():  # as `wake` does
+        if self._tokens.empty():  # like `wake`, inlined
             self._tokens.put(None)
         if self.on_wake is not None:
             self.on_wake()
@@ -137,7 +138,7 @@ class PendingQueue:
         if self._ack_requests:
             self.acknowledge(drained=True)
 
-    def on_link(self) -> None:
+    def on_link_change(self) -> None:
         """Handle a link that broke or came back."""
         with self._lock:
             self._settling_until = self._clock() + _SETTLING
@@ -148,7 +149,7 @@ class PendingQueue:
         """Handle a heartbeat: the publisher, known or not, has sent `number`, which should have arrived by now."""
         with self._lock, suppress(AddressError):
             stream = self._stream(key)
-            stream.heard = self._clock()
+            stream.last_active = self._clock()
             writer = stream.writers.get(publisher)
             if writer is None and len(self.counters.requesting) < MAX_KEYS:
                 writer = self._add_writer(stream, publisher, 0 if self._settling else number, history_end=number + 1)
@@ -280,14 +281,14 @@ class PendingQueue:
 
     @property
     def _settling(self) -> bool:
-        """True shortly after a link change, while unknown publishers may have sent messages."""
+        """True shortly after a link change, when unknown publishers may have sent messages."""
         return self._clock() < self._settling_until
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
         if request.read_target is None:
             stream = self._streams.get(request.key)
             writer = stream and stream.writers.get(request.publisher)
-            if writer.has(request.number) if writer else drained and not self._settling:
+            if writer.is_settled(request.number) if writer else drained and not self._settling:
                 request.read_target = self._arrived if request.read else 0
         return self.ended or (request.read_target is not None and self._arrived - self.waiting >= request.read_target)
 
@@ -298,22 +299,22 @@ class PendingQueue:
         stream = self._streams.get(key)
         if stream is None:
             stream = self.decoder.open(key)
-            now = stream.heard = self._clock()
-            self._make_room(now)
+            now = stream.last_active = self._clock()
+            self._evict(now)
             self._streams[key] = stream
-            heappush(self._by_silence, (now, key))
+            heappush(self._by_activity, (now, key))
         return stream
 
-    def _make_room(self, now: float) -> None:
-        """Forget keys, of many, that are silent for long and, at the limit, the one silent longest; gaps go last."""
-        order = self._by_silence
+    def _evict(self, now: float) -> None:
+        """Evict silent keys above KEPT_KEYS and, at MAX_KEYS, the least recently active, keys with a gap last."""
+        order = self._by_activity
         while len(order) >= MAX_KEYS or (len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE):
             since, key = order[0]
             stream = self._streams[key]
             if any(writer.request for writer in stream.writers.values()):
-                stream.heard = now
-            if since < stream.heard:
-                heapreplace(order, (stream.heard, key))
+                stream.last_active = now
+            if since < stream.last_active:
+                heapreplace(order, (stream.last_active, key))
                 continue
             heappop(order)
             del self._streams[key]
@@ -323,14 +324,14 @@ class PendingQueue:
             stream.writer = None
             if since >= now - MAX_SILENCE:
                 self.counters.forgotten += 1
-                text = "those silent longest are forgotten, and their next gap is not counted"
+                text = "the least recently active are evicted, and their next gap is not counted"
                 self._warn_once(f"more than {MAX_KEYS:,} keys: {text}")
 
     def _admit(self, batch: Sequence[RawSample]) -> list[Arrival]:
         """Return the arrivals of a batch, with 0 losses each; rejected ones keep their number but lose the payload.
 
-        A payload of the expected size is decoded when it is read. Any other size is checked here, so that it can
-        neither displace a valid sample nor use much memory.
+        A payload of the expected size is decoded when it is read. Any other size is checked here: an invalid
+        sample must neither displace a valid one nor use much memory.
         """
         admitted: list[Arrival] = []
         known, received = self._streams.get, clock.utc_ns()
@@ -363,7 +364,7 @@ class PendingQueue:
         delivered = self.counters.delivered
         for admitted in arrivals:
             stream, payload, raw, _, _ = arrival = admitted
-            stream.heard = now
+            stream.last_active = now
             info, writer = raw.source_info, stream.writer
             if info is not None:
                 source = info.source_id
@@ -392,7 +393,7 @@ class PendingQueue:
         self._queue()
 
     def _are_in_order(self, arrivals: list[Arrival]) -> bool:
-        """Return whether a batch continues the last publisher of one key without a gap; if so, expect the next one."""
+        """Return whether a batch continues one key's last publisher without a gap; if so, advance its `expected`."""
         stream, info = arrivals[0][0], arrivals[-1][2].source_info
         writer = stream.writer
         if writer is None or info is None or writer.request is not None or stream.gap:
@@ -406,7 +407,7 @@ class PendingQueue:
         if [info and info.source_sn for info in infos] != list(range(writer.expected, stop)):
             return False
         writer.expected = stop
-        stream.heard = self._clock()
+        stream.last_active = self._clock()
         return True
 
     def _add_writer(self, stream: KeyState, name: str, expected: int, *, history_end: int) -> WriterProxy | None:

@@ -37,7 +37,7 @@ _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slow
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
 _BUSY_PAUSE: Final = 0.001  # s
 _MAX_DIGITS: Final = 10  # of a sequence number
-_JOIN_TIMEOUT: Final = 3.0  # s, enough for a busy machine
+_JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
 _T = TypeVar("_T")
 
 
@@ -200,7 +200,7 @@ class Receiver:
             return
         try:
             while self._take_link() is not None:
-                self._queue.on_link()
+                self._queue.on_link_change()
             while (query := self._take_query()) is not None:
                 self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
                 key, get = str(query.key_expr), query.parameters.get

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 _MAX_OPEN: Final = 64  # requests in flight
 _MAX_OPEN_HISTORY: Final = 16  # of these, requests to publishers that have delivered no message yet
 _MAX_OPEN_OF_KEY: Final = 4  # of these, requests on one key, whose publishers may never answer
-_MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, answers would push out others, and requests pause
+_MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, requests pause: answers would displace messages
 _TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests
 _ANSWER_POLL: Final = 0.005  # s between polls for answers
@@ -48,7 +48,9 @@ class Retransmission:
         Return a key with newly readable messages, or "", and the seconds until the next poll.
         `drained`: the queue holds everything that had arrived before this call.
         """
-        if drained and now >= self._next_heartbeat_poll:  # else the messages they announce may still be in the ring
+        if (
+            drained and now >= self._next_heartbeat_poll
+        ):  # else messages announced by heartbeats may still be in the ring
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._queue.on_heartbeat(key, publisher, number)
@@ -60,7 +62,7 @@ class Retransmission:
             for writer in list(self._queue.counters.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
-                if writer in self._open or not self._has_room(writer):
+                if writer in self._open or not self._may_open(writer):
                     continue
                 if (numbers := self._queue.next_request(writer, now)) is not None:
                     key, name = writer.stream.wire_key, writer.name
@@ -89,7 +91,7 @@ class Retransmission:
             recovered = self._queue.on_retransmission(writer, {}, ended=True, now=float("inf"))
         return key if recovered else ""
 
-    def _has_room(self, writer: WriterProxy) -> bool:
+    def _may_open(self, writer: WriterProxy) -> bool:
         share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]
         if writer.history_end:
             return len(share) < _MAX_OPEN_HISTORY

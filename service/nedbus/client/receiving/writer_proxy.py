@@ -25,7 +25,7 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the las
 
 @dataclass(slots=True, eq=False)
 class LossCounters:
-    """Counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
+    """Loss counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
 
     lost: int = 0
     dropped: int = 0  # by a full ring or queue
@@ -43,12 +43,12 @@ class Request:
 
     stop: int  # one past the highest number known to be sent
     due: float = 0.0
-    deadline: float | None = None  # the gap is lost then; each delivery resets it
+    deadline: float | None = None  # when the gap counts as lost; each delivery resets it
     attempts: int = 0
     requested: range | None = None  # numbers of the open query
     first_available: int | None = None  # lowest number answered; the publisher caches everything from there on
     last_answered: bool = False  # the highest requested number was answered
-    probe: int | None = None  # number to request again; an answer proves that `candidate` is the lowest in the cache
+    probe: int | None = None  # number requested again; an answer proves that `candidate` is the lowest in the cache
     candidate: int | None = None
 
 
@@ -114,7 +114,7 @@ class WriterProxy:
         return request.requested
 
     def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> None:
-        """Accept answers to the open request and deliver what is in order; `ended`: these were the last."""
+        """Accept answers to the open request and deliver what is in order; `ended`: no more answers follow."""
         request = self.request
         if request is None:
             return
@@ -125,18 +125,18 @@ class WriterProxy:
             lowest = request.first_available
             request.first_available = min(found) if lowest is None else min(lowest, *found)
             request.last_answered |= request.requested is not None and request.requested[-1] in found
-        if self.history_end <= self.expected:  # else wait for the end, which tells the lowest number available
+        if self.history_end <= self.expected:  # else wait for the end, which reveals the lowest number available
             self._release()
         if ended and request.requested is not None:
             last, request.requested = request.requested[-1], None
-            over = request.deadline is not None and now >= request.deadline
+            expired = request.deadline is not None and now >= request.deadline
             if request.last_answered:
                 self.unresponsive = False
-                self._confirm_lowest(request, over=over)
+                self._confirm_lowest(request, expired=expired)
             elif request.probe is not None:
                 request.probe = request.stop - 1  # the probe may have left the cache
             self._release()
-            if over:
+            if expired:
                 self.unresponsive = request.first_available is None
                 self.give_up(last)
             request.last_answered = False
@@ -148,16 +148,16 @@ class WriterProxy:
             self._count_gap(min(self.held, default=self.request.stop))
             self._release()
 
-    def has(self, number: int) -> bool:
+    def is_settled(self, number: int) -> bool:
         """Return True if this message has arrived or counts as lost."""
         return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 
-    def _confirm_lowest(self, request: Request, *, over: bool) -> None:
-        """Give up numbers below the lowest one answered, after a probe: lower ones may have been answered but lost."""
+    def _confirm_lowest(self, request: Request, *, expired: bool) -> None:
+        """Give up numbers below the lowest answered one, once a probe has shown that no lower answer was lost."""
         lowest = request.first_available
         if lowest is None or lowest <= self.expected:
             return
-        if lowest != request.candidate and not over:
+        if lowest != request.candidate and not expired:
             request.probe = request.candidate = lowest
         else:
             request.probe = None

@@ -1,1 +1,1 @@
-"""Messages with and without a file, through a real router."""
+"""Messages with definitions from nedbus and from their publishers, through a real router."""

@@ -1,4 +1,4 @@
-"""Readers of a lossless publisher, and Zenoh between them, with a clock that advances only by waiting."""
+"""A fake session of a lossless publisher and its readers, with a fake clock that advances only in waits."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from tests.nedbus.client.receiving.raw_samples import Payload
 
 KEY: Final = "nedbus/1/vehicle_local_position"
 _TICK: Final = 0.01  # s
-END: Final = 600.0  # s after which a wait is stuck
+END: Final = 600.0  # s of simulated time after which a wait counts as stuck
 
 
-class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
+class Stuck(Exception):  # noqa: N818 - not an error, but an expected outcome
     """Raised when a wait does not end within ten minutes."""
 
 
@@ -39,8 +39,8 @@ class Reader:
     read: float = 0.0
     alive: bool = True
     closed: bool = False
-    stopped: float | None = None  # since when
-    stops_in_answer: bool = False  # between its next answer, and the word that this was all
+    stopped: float | None = None  # time of the suspension
+    stops_in_answer: bool = False  # after its next reply, before that query is finalized
 
     def is_linked(self, now: float) -> bool:
         return self.alive and (self.stopped is None or now - self.stopped < TIMINGS.lease)
@@ -69,16 +69,16 @@ class Query:
 
 
 @dataclass(eq=False)
-class World:
-    """The session of the publisher, and its clock; everything runs in the waiting thread."""
+class FakeSession:
+    """The fake session of a publisher, its readers and its clock; all run in the waiting thread."""
 
     readers: list[Reader] = field(default_factory=list)
     now: float = 0.0
     published: int = 0
     sent: list[float] = field(default_factory=list)  # when each message was sent
-    asked: list[dict[str, str]] = field(default_factory=list)  # the parameters of each query
+    requests: list[dict[str, str]] = field(default_factory=list)  # the parameters of each query
     pending: list[Query] = field(default_factory=list)
-    plans: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
+    scheduled: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
     routers: list[str] = field(default_factory=lambda: ["r1"])
     closed: bool = False
     dropping: bool = False  # a full queue drops all requests
@@ -86,48 +86,48 @@ class World:
     def flow_control(
         self, monkeypatch: pytest.MonkeyPatch, timings: Timings, *, needs_router: bool = True
     ) -> FlowControl:
-        """Return a flow control in this world."""
+        """Return a FlowControl on this session and clock."""
         timings.credit_polls = 0.0005, _TICK
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
         return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)
 
     def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
-        """Publish `count` messages, `rate` per second if there is credit."""
+        """Publish `count` messages, at `rate` [Hz] while there is credit."""
         for _ in range(count):
             self.advance(1 / rate)
             self.published += 1
             self.sent.append(self.now)
             control.wait_for_credit(self.published)
 
-    def plan(self, seconds: float, action: Callable[[], object]) -> None:
-        """Schedule an action in a number of seconds."""
-        self.plans.append((self.now + seconds, action))
-        self.plans.sort(key=itemgetter(0))
+    def schedule(self, seconds: float, action: Callable[[], object]) -> None:
+        """Schedule an action after `seconds`."""
+        self.scheduled.append((self.now + seconds, action))
+        self.scheduled.sort(key=itemgetter(0))
 
     def cut(self, reader: Reader, at: float, *, until: float) -> None:
         """Break the link of a reader."""
-        self.plan(at, lambda: setattr(reader, "alive", False))
-        self.plan(until, lambda: setattr(reader, "alive", True))
+        self.schedule(at, lambda: setattr(reader, "alive", False))
+        self.schedule(until, lambda: setattr(reader, "alive", True))
 
     def restart_router(self, reader: Reader, at: float, *, until: float) -> None:
         """Break the link of the publisher for a second, and that of a reader for longer."""
         self.cut(reader, at, until=until)
-        self.plan(at, self.routers.clear)
-        self.plan(at + 1.0, lambda: self.routers.append("r2"))
+        self.schedule(at, self.routers.clear)
+        self.schedule(at + 1.0, lambda: self.routers.append("r2"))
 
     def stop(self, reader: Reader, at: float, *, until: float) -> None:
         """Suspend the process of a reader (SIGSTOP)."""
-        self.plan(at, lambda: setattr(reader, "stopped", self.now))
-        self.plan(until, lambda: setattr(reader, "stopped", None))
+        self.schedule(at, lambda: setattr(reader, "stopped", self.now))
+        self.schedule(until, lambda: setattr(reader, "stopped", None))
 
     def advance(self, seconds: float) -> None:
         """Advance the clock."""
         self.now += seconds
         if self.now > END:
             raise Stuck
-        while self.plans and self.plans[0][0] <= self.now:
-            self.plans.pop(0)[1]()
+        while self.scheduled and self.scheduled[0][0] <= self.now:
+            self.scheduled.pop(0)[1]()
         for reader in self.readers:
             if reader.is_running():
                 reader.read = min(self.published, reader.read + reader.rate * seconds)
@@ -143,7 +143,7 @@ class World:
         times = [since, *(each for each in self.sent if each >= since)]
         return max(later - earlier for earlier, later in pairwise(times))
 
-    # What a flow control needs of a session.
+    # The methods of a session that FlowControl uses.
 
     @property
     def info(self) -> SimpleNamespace:
@@ -157,7 +157,7 @@ class World:
         key, _, parameters = selector.partition("?")
         assert key == f"{KEY}/@ack"
         parsed = dict(each.split("=") for each in parameters.split(";"))
-        self.asked.append(parsed)
+        self.requests.append(parsed)
         linked = [reader for reader in self.readers if self.is_linked(reader) and not reader.closed]
         query = Query(int(parsed["number"]), parsed["read"] == "1", self.now + timeout, linked)
         query.lost = self.dropping and bool(self.routers)
@@ -174,11 +174,11 @@ class World:
                 self._reply(query, reader, CLOSED)
             elif reader.is_running() and (not query.read or reader.read > query.number):
                 self._reply(query, reader, b"")
-        late = bool(query.waiting) or query.lost
-        if late and self.now < query.end:
+        is_open = bool(query.waiting) or query.lost
+        if is_open and self.now < query.end:
             return
         self.pending.remove(query)
-        if late:
+        if is_open:
             query.replies.append(SimpleNamespace(ok=None))
         query.ended = True
 

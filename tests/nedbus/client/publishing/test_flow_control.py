@@ -14,137 +14,135 @@ from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
 
-from .fake_readers import END, Reader, Stuck, World
+from .fake_readers import END, FakeSession, Reader, Stuck
 
-Interrupt = Callable[..., None]  # a method of World
-LIMIT = 6192  # messages that are sent at all without an acknowledgement
-
-
-@pytest.fixture
-def world() -> World:
-    return World()
+Interrupt = Callable[..., None]  # a method of FakeSession
+LIMIT = 6192  # messages sent without any acknowledgement
 
 
 @pytest.fixture
-def control(world: World, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> FlowControl:
-    return world.flow_control(monkeypatch, timings)
+def session() -> FakeSession:
+    return FakeSession()
 
 
-def test_limits_fit_into_each_other() -> None:
+@pytest.fixture
+def control(session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> FlowControl:
+    return session.flow_control(monkeypatch, timings)
+
+
+def test_unacknowledged_messages_fit_into_cache_and_queues() -> None:
     """Unacknowledged messages fit into the history cache for recovery, and into the queue of each reader."""
     assert WINDOW < LIMIT < CACHE < RING_CAPACITY < CAPACITY
     assert LIMIT + WINDOW == CACHE
 
 
 @pytest.mark.parametrize("routers", [["r1"], []])
-def test_without_readers_it_never_waits(
-    world: World, monkeypatch: pytest.MonkeyPatch, timings: Timings, routers: list[str]
+def test_publisher_without_readers_never_waits(
+    session: FakeSession, monkeypatch: pytest.MonkeyPatch, timings: Timings, routers: list[str]
 ) -> None:
-    """Without readers there is no wait; a router does not need another router for that."""
-    world.routers = routers
-    world.publish(world.flow_control(monkeypatch, timings, needs_router=bool(routers)), 10_000)
-    assert world.now == pytest.approx(1.0)
+    """A publisher without readers never waits, whether its session is a client or a router."""
+    session.routers = routers
+    session.publish(session.flow_control(monkeypatch, timings, needs_router=bool(routers)), 10_000)
+    assert session.now == pytest.approx(1.0)
 
 
-def test_reader_that_keeps_up_is_not_waited_for(world: World, control: FlowControl) -> None:
-    """A request is sent every 250 messages, with the number of the last message, one at a time."""
-    world.readers.append(Reader("fast"))
-    world.publish(control, 10_000)
-    assert world.now == pytest.approx(1.0)
-    numbers = [int(each["number"]) for each in world.asked]
+def test_fast_reader_causes_no_wait(session: FakeSession, control: FlowControl) -> None:
+    """An acknowledgement of the last message is requested every 250 messages, one at a time."""
+    session.readers.append(Reader("fast"))
+    session.publish(control, 10_000)
+    assert session.now == pytest.approx(1.0)
+    numbers = [int(each["number"]) for each in session.requests]
     assert numbers == list(range(249, 10_000, 250))
-    assert {(each["publisher"], each["read"]) for each in world.asked} == {("p:1", "1")}
+    assert {(each["publisher"], each["read"]) for each in session.requests} == {("p:1", "1")}
 
 
-def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, control: FlowControl) -> None:
-    """It sends 2,000 messages at once, then 10 per second until the history cache is full, then nothing.
+def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control: FlowControl) -> None:
+    """A stuck reader is sent 2,000 messages at once, then 10 per second until the history cache is full, then none.
 
     A connected reader is never given up: requests are repeated after 0.5, 1, 2, 4 and 8 s, then every 10 s.
     """
-    world.readers.append(Reader("stuck", rate=0.0))
+    session.readers.append(Reader("stuck", rate=0.0))
     with pytest.raises(Stuck):
-        world.publish(control, 10_000)
-    assert world.published == LIMIT
-    assert world.sent[WINDOW - 1] == pytest.approx(0.2)
-    steps = [later - earlier for earlier, later in pairwise(world.sent[WINDOW:])]
+        session.publish(control, 10_000)
+    assert session.published == LIMIT
+    assert session.sent[WINDOW - 1] == pytest.approx(0.2)
+    steps = [later - earlier for earlier, later in pairwise(session.sent[WINDOW:])]
     assert steps == pytest.approx([0.1] * len(steps), abs=0.011)
-    assert len(world.asked) == pytest.approx(5 + END / 10, rel=0.05)
+    assert len(session.requests) == pytest.approx(5 + END / 10, rel=0.05)
 
 
-def test_window_is_shared_while_it_is_used() -> None:
-    """Publishers share the window and use what others do not; one without messages for a second does not count."""
+def test_window_is_shared_by_active_publishers() -> None:
+    """Publishers share the window and what others leave unused; one without messages for a second does not count."""
     shared = SharedWindow()
-    assert shared.part("a", 0, now=0.0) == WINDOW
-    assert shared.part("a", 1900, now=0.1) == WINDOW
-    assert shared.part("b", 0, now=0.2) == WINDOW // 2
-    assert shared.part("b", 500, now=0.3) == WINDOW // 2
-    assert shared.part("a", 100, now=0.4) == WINDOW - 500
+    assert shared.share("a", 0, now=0.0) == WINDOW
+    assert shared.share("a", 1900, now=0.1) == WINDOW
+    assert shared.share("b", 0, now=0.2) == WINDOW // 2
+    assert shared.share("b", 500, now=0.3) == WINDOW // 2
+    assert shared.share("a", 100, now=0.4) == WINDOW - 500
     for number in range(8):
-        shared.part(f"other {number}", 1000, now=0.5)
-    assert shared.part("a", 100, now=0.6) == WINDOW // 10
-    assert shared.part("a", 100, now=1.8) == WINDOW
+        shared.share(f"other {number}", 1000, now=0.5)
+    assert shared.share("a", 100, now=0.6) == WINDOW // 10
+    assert shared.share("a", 100, now=1.8) == WINDOW
 
 
 @pytest.mark.parametrize(("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)])
 def test_request_dropped_by_a_full_queue_is_repeated(
-    world: World, control: FlowControl, at: float, rate: float, pause: float
+    session: FakeSession, control: FlowControl, at: float, rate: float, pause: float
 ) -> None:
-    """A dropped request is repeated after half a second."""
-    world.readers.append(Reader("fast"))
-    world.plan(at, lambda: setattr(world, "dropping", True))
-    world.plan(at + 0.2, lambda: setattr(world, "dropping", False))
-    world.publish(control, round(3 * rate), rate=rate)
-    assert world.now < 3.0 + pause
-    assert world.longest_pause() < pause
+    """An acknowledgement request that a full queue dropped is repeated after half a second."""
+    session.readers.append(Reader("fast"))
+    session.schedule(at, lambda: setattr(session, "dropping", True))
+    session.schedule(at + 0.2, lambda: setattr(session, "dropping", False))
+    session.publish(control, round(3 * rate), rate=rate)
+    assert session.now < 3.0 + pause
+    assert session.longest_pause() < pause
 
 
-def test_reader_that_goes_on_gets_everything(world: World, control: FlowControl) -> None:
-    """A reader that resumes after eight minutes gets everything, and the publisher is no longer delayed."""
+def test_reader_that_resumes_gets_all_messages(session: FakeSession, control: FlowControl) -> None:
+    """A reader that resumes after eight minutes gets all messages, and no longer delays the publisher."""
     reader = Reader("stuck", rate=0.0)
-    world.readers.append(reader)
-    world.plan(480.0, lambda: setattr(reader, "rate", 100_000.0))
-    world.publish(control, 20_000)
-    assert world.now < 480.0 + 2.0
-    assert world.longest_pause(since=480.2) < 0.02
+    session.readers.append(reader)
+    session.schedule(480.0, lambda: setattr(reader, "rate", 100_000.0))
+    session.publish(control, 20_000)
+    assert session.now < 480.0 + 2.0
+    assert session.longest_pause(since=480.2) < 0.02
 
 
 @pytest.mark.parametrize("rate", [100.0, 500.0, 5_000.0])
-def test_slow_reader_sets_the_pace_and_is_never_without_messages(
-    world: World, control: FlowControl, rate: float
-) -> None:
-    """The publisher is ahead by a window and a trickle at most, and the reader always has messages to read."""
+def test_slow_reader_sets_the_pace_and_never_starves(session: FakeSession, control: FlowControl, rate: float) -> None:
+    """The publisher leads by a window and a trickle at most, and a slow reader always has messages to read."""
     reader = Reader("slow", rate=rate)
-    world.readers += [reader, Reader("fast")]
-    world.publish(control, 10_000)
-    ahead = [at - reader.rate * time for at, time in enumerate(world.sent)]
+    session.readers += [reader, Reader("fast")]
+    session.publish(control, 10_000)
+    ahead = [at - reader.rate * time for at, time in enumerate(session.sent)]
     assert max(ahead) < WINDOW * 1.5
-    assert world.now == pytest.approx((10_000 - WINDOW) / rate, rel=0.2)
-    assert world.longest_pause() < 0.2
+    assert session.now == pytest.approx((10_000 - WINDOW) / rate, rel=0.2)
+    assert session.longest_pause() < 0.2
 
 
-def test_healthy_reader_is_never_without_a_message_for_long(world: World, control: FlowControl) -> None:
-    """Beside a reader of one message per second it gets ten per second, while the history cache has room."""
-    world.readers += [Reader("slow", rate=1.0), Reader("fast")]
-    world.publish(control, WINDOW + 1000)
-    assert world.now > 90.0
-    assert world.longest_pause() < 0.2
+def test_slow_reader_leaves_others_ten_messages_per_second(session: FakeSession, control: FlowControl) -> None:
+    """With a reader of one message per second, other readers get ten per second while the history cache has room."""
+    session.readers += [Reader("slow", rate=1.0), Reader("fast")]
+    session.publish(control, WINDOW + 1000)
+    assert session.now > 90.0
+    assert session.longest_pause() < 0.2
 
 
-def test_reader_that_is_closed_is_not_waited_for(world: World, control: FlowControl) -> None:
+def test_closed_reader_causes_no_wait(session: FakeSession, control: FlowControl) -> None:
     """A closing reader acknowledges the open request, and the publisher continues."""
     reader = Reader("stuck", rate=0.0)
-    world.readers += [reader, Reader("fast")]
-    world.plan(1.0, lambda: setattr(reader, "closed", True))
-    world.publish(control, 10_000)
-    assert world.now < 2.1
+    session.readers += [reader, Reader("fast")]
+    session.schedule(1.0, lambda: setattr(reader, "closed", True))
+    session.publish(control, 10_000)
+    assert session.now < 2.1
 
 
-def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> float:
-    """Publish; return the number of messages a reader lacked `at` seconds later. It reads nearly all in the end."""
+def measure_lead(session: FakeSession, control: FlowControl, reader: Reader, at: float) -> float:
+    """Publish 20,000 messages, which a reader finally reads; return the lead over it after `at` seconds."""
     lead: list[float] = []
-    world.plan(at, lambda: lead.append(world.published - reader.read))
-    count = world.published + 20_000
-    world.publish(control, 20_000)
+    session.schedule(at, lambda: lead.append(session.published - reader.read))
+    count = session.published + 20_000
+    session.publish(control, 20_000)
     assert reader.read > count - WINDOW
     return lead[0]
 
@@ -152,149 +150,156 @@ def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> 
 @pytest.mark.parametrize("rate", [math.inf, 5_000.0])
 @pytest.mark.parametrize(
     ("interrupt", "begin", "end"),
-    [(World.cut, 0.1, 2.1), (World.restart_router, 0.1003, 4.5), (World.stop, 0.5, 60.5), (World.stop, 0.0, 90.0)],
+    [
+        (FakeSession.cut, 0.1, 2.1),
+        (FakeSession.restart_router, 0.1003, 4.5),
+        (FakeSession.stop, 0.5, 60.5),
+        (FakeSession.stop, 0.0, 90.0),
+    ],
 )
-def test_reader_that_comes_back_in_time_has_missed_nothing(  # noqa: PLR0917 - a table
-    world: World, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
+def test_reader_that_returns_in_time_misses_nothing(  # noqa: PLR0917 - a table
+    session: FakeSession, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
 ) -> None:
     """A reader whose link was reset, whose router restarted, or that was suspended gets all messages.
 
-    Others get ten messages per second meanwhile, and all messages soon after.
+    Until then other readers get ten messages per second.
     """
     reader = Reader("back", rate=rate)
-    world.readers += [reader, Reader("fast")]
-    interrupt(world, reader, begin, until=end)
-    assert WINDOW / 2 < lead_over(world, control, reader, end - 0.01) < LIMIT
-    assert world.longest_pause() < 0.2
-    assert world.now < end + 20_000 / min(rate, 10_000.0)
+    session.readers += [reader, Reader("fast")]
+    interrupt(session, reader, begin, until=end)
+    assert WINDOW / 2 < measure_lead(session, control, reader, end - 0.01) < LIMIT
+    assert session.longest_pause() < 0.2
+    assert session.now < end + 20_000 / min(rate, 10_000.0)
 
 
 @pytest.mark.parametrize(
     ("interrupt", "at", "seconds"),
     [
-        (World.cut, 0.1003, 5.0),
-        (World.restart_router, 0.1003, 1.0 + 5.0),
-        (World.stop, 0.1003, TIMINGS.lease + 90.0),
-        (World.stop, 0.0, TIMINGS.lease + 90.0),
+        (FakeSession.cut, 0.1003, 5.0),
+        (FakeSession.restart_router, 0.1003, 1.0 + 5.0),
+        (FakeSession.stop, 0.1003, TIMINGS.lease + 90.0),
+        (FakeSession.stop, 0.0, TIMINGS.lease + 90.0),
     ],
 )
-def test_reader_that_does_not_come_back_is_given_up(
-    world: World, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
+def test_lost_reader_is_given_up(
+    session: FakeSession, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
 ) -> None:
-    """It is given up after 5 s with a router, or 90 s after its lease expired; others get ten per second until then."""
+    """A lost reader is given up after 5 s with a router, or 90 s after its lease; until then others get 10 Hz."""
     reader = Reader("gone", rate=5_000.0)
-    world.readers += [reader, Reader("fast")]
-    interrupt(world, reader, at, until=math.inf)
-    world.publish(control, 20_000)
-    assert seconds - 0.3 < world.now - 18_000 / 10_000.0 < seconds + 1.0
-    assert world.longest_pause() < 0.2
+    session.readers += [reader, Reader("fast")]
+    interrupt(session, reader, at, until=math.inf)
+    session.publish(control, 20_000)
+    assert seconds - 0.3 < session.now - 18_000 / 10_000.0 < seconds + 1.0
+    assert session.longest_pause() < 0.2
 
 
 @pytest.mark.parametrize("away", [0.5, 4.0, 7.0, 60.0])
 @pytest.mark.parametrize("answered", [True, False])
-def test_no_time_runs_while_there_is_no_router(world: World, control: FlowControl, away: float, answered: bool) -> None:
-    """A reader that returns 3 s after the router has missed nothing, whether it ever replied or not."""
+def test_wait_for_readers_is_extended_without_a_router(
+    session: FakeSession, control: FlowControl, away: float, answered: bool
+) -> None:
+    """A reader that returns 3 s after the router misses nothing, whether it ever replied or not."""
     reader = Reader("back")
-    world.readers.append(reader)
-    world.publish(control, 1000 if answered else 249)
+    session.readers.append(reader)
+    session.publish(control, 1000 if answered else 249)
     reader.alive = False
-    world.routers.clear()
-    world.plan(away, lambda: world.routers.append("r2"))
-    world.plan(away + 3.0, lambda: setattr(reader, "alive", True))
-    assert lead_over(world, control, reader, away + 2.99) < LIMIT
-    assert world.now < away + 3.0 + 20_000 / 10_000.0 + 0.2
+    session.routers.clear()
+    session.schedule(away, lambda: session.routers.append("r2"))
+    session.schedule(away + 3.0, lambda: setattr(reader, "alive", True))
+    assert measure_lead(session, control, reader, away + 2.99) < LIMIT
+    assert session.now < away + 3.0 + 20_000 / 10_000.0 + 0.2
 
 
 @pytest.mark.parametrize(("rate", "published"), [(0.0, 10_000.0), (100.0, 10_000.0), (math.inf, 200.0)])
 @pytest.mark.parametrize("second", range(20, 30, 2))
-def test_reader_that_is_stopped_at_any_time_is_waited_for(
-    world: World, control: FlowControl, rate: float, published: float, second: int
+def test_publisher_waits_for_a_suspended_reader(
+    session: FakeSession, control: FlowControl, rate: float, published: float, second: int
 ) -> None:
-    """The publisher waits, however the lease overlaps with requests, late replies, or none."""
+    """The publisher waits for a suspended reader, however its lease overlaps with requests and late replies."""
     reader = Reader("stopped", rate=rate)
-    world.readers += [reader, Reader("fast")]
-    world.stop(reader, second, until=math.inf)
-    while world.now < second + 60.0:
-        world.publish(control, 1, rate=published)
-    assert world.published - reader.read < LIMIT
+    session.readers += [reader, Reader("fast")]
+    session.stop(reader, second, until=math.inf)
+    while session.now < second + 60.0:
+        session.publish(control, 1, rate=published)
+    assert session.published - reader.read < LIMIT
 
 
 @pytest.mark.parametrize("others", [[], ["fast"]])
 @pytest.mark.parametrize("back", [0.1, 60.0])
-def test_reader_that_is_stopped_as_it_answers_is_known(
-    world: World, control: FlowControl, others: list[str], back: float
+def test_reader_suspended_while_replying_is_recognized(
+    session: FakeSession, control: FlowControl, others: list[str], back: float
 ) -> None:
-    """The publisher waits for no unknown reader after it returns: it had replied to the request that it delayed."""
+    """Once a reader that was suspended while replying returns, the publisher waits for no unknown reader."""
     reader = Reader("back", stops_in_answer=True)
-    world.readers += [reader, *map(Reader, others)]
-    world.plan(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
-    assert WINDOW / 2 < lead_over(world, control, reader, TIMINGS.lease + back - 0.01) < LIMIT
-    assert world.now < TIMINGS.lease + back + 20_000 / 10_000.0
+    session.readers += [reader, *map(Reader, others)]
+    session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
+    assert WINDOW / 2 < measure_lead(session, control, reader, TIMINGS.lease + back - 0.01) < LIMIT
+    assert session.now < TIMINGS.lease + back + 20_000 / 10_000.0
 
 
-def test_reader_that_ended_beside_a_stuck_one_is_given_up_after_5_seconds(world: World, control: FlowControl) -> None:
-    """It had replied to the open request, so the unknown suspended reader is another one."""
+def test_reader_that_closes_during_a_long_request_is_given_up(session: FakeSession, control: FlowControl) -> None:
+    """A reader that closes while a stuck one delays the request is given up 5 s after the stuck one resumes."""
     stuck, ended = Reader("stuck", rate=0.0), Reader("ended")
-    world.readers += [stuck, ended]
-    world.plan(10.0, lambda: setattr(ended, "closed", True))
-    world.plan(20.0, lambda: setattr(stuck, "rate", math.inf))
-    world.publish(control, 10_000)
-    assert world.now < 20.0 + 5.0 + 1.5
+    session.readers += [stuck, ended]
+    session.schedule(10.0, lambda: setattr(ended, "closed", True))
+    session.schedule(20.0, lambda: setattr(stuck, "rate", math.inf))
+    session.publish(control, 10_000)
+    assert session.now < 20.0 + 5.0 + 1.5
 
 
-def test_closed_session_ends_the_wait(world: World, control: FlowControl) -> None:
-    """A service that is stopped does not wait for a stuck reader."""
-    world.readers.append(Reader("stuck", rate=0.0))
-    world.plan(30.0, lambda: setattr(world, "closed", True))
+def test_closed_session_ends_the_wait(session: FakeSession, control: FlowControl) -> None:
+    """Closing the session ends the wait for a stuck reader."""
+    session.readers.append(Reader("stuck", rate=0.0))
+    session.schedule(30.0, lambda: setattr(session, "closed", True))
     with pytest.raises(ClosedError):
-        world.publish(control, 10_000)
-    assert world.now < 50.0
+        session.publish(control, 10_000)
+    assert session.now < 50.0
 
 
-def test_flush_waits_until_readers_have_what_was_published(world: World, control: FlowControl) -> None:
+def test_flush_waits_for_reception_only(session: FakeSession, control: FlowControl) -> None:
     """A flush waits until readers have received all messages, not until they have read them."""
-    world.readers.append(Reader("slow", rate=0.0))
-    assert control.wait(100, timeout=5.0)
-    assert world.asked == [{"publisher": "p:1", "number": "99", "read": "0"}]
-    assert world.now < 1.0
+    session.readers.append(Reader("slow", rate=0.0))
+    assert control.wait_for_reception(100, timeout=5.0)
+    assert session.requests == [{"publisher": "p:1", "number": "99", "read": "0"}]
+    assert session.now < 1.0
 
 
-def test_flush_gives_up_in_time(world: World, control: FlowControl) -> None:
-    """It returns False if a connected reader does not reply, and True once it does."""
+def test_flush_returns_false_on_timeout(session: FakeSession, control: FlowControl) -> None:
+    """A flush returns False if a connected reader does not reply, and True once it does."""
     reader = Reader("stopped", stopped=0.0)
-    world.readers.append(reader)
-    assert not control.wait(100, timeout=2.0)
-    assert world.now == pytest.approx(2.0, abs=0.02)
+    session.readers.append(reader)
+    assert not control.wait_for_reception(100, timeout=2.0)
+    assert session.now == pytest.approx(2.0, abs=0.02)
     reader.stopped = None
-    assert control.wait(100, timeout=15.0)
+    assert control.wait_for_reception(100, timeout=15.0)
 
 
-def test_each_flush_sends_a_new_request(world: World, control: FlowControl) -> None:
-    """Each flush sends a new request, as there may be new readers; without messages it returns at once."""
-    assert control.wait(0, timeout=5.0)
-    assert world.asked == []
-    world.publish(control, 250)
-    world.advance(1.0)
-    assert control.wait(250, timeout=5.0)
-    assert len(world.asked) == 2
-    world.readers.append(Reader("new", stopped=world.now))
-    assert not control.wait(250, timeout=2.0)
+def test_each_flush_sends_a_new_request(session: FakeSession, control: FlowControl) -> None:
+    """Each flush sends a new request, because there may be new readers; without messages it returns at once."""
+    assert control.wait_for_reception(0, timeout=5.0)
+    assert session.requests == []
+    session.publish(control, 250)
+    session.advance(1.0)
+    assert control.wait_for_reception(250, timeout=5.0)
+    assert len(session.requests) == 2
+    session.readers.append(Reader("new", stopped=session.now))
+    assert not control.wait_for_reception(250, timeout=2.0)
 
 
-def test_flush_waits_for_a_reader_that_may_come_back(world: World, control: FlowControl) -> None:
-    """A flush waits as long as publishing would, but not for a reader that replied that it is closed."""
+def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowControl) -> None:
+    """A flush waits for a lost reader as long as publishing would, but not for a closed one."""
     ended, away = Reader("ended", stopped=0.0), Reader("away")
-    world.readers += [ended, away]
-    world.plan(0.1, lambda: setattr(ended, "closed", True))
-    world.plan(0.1, lambda: setattr(ended, "stopped", None))
-    assert control.wait(200, timeout=5.0)
-    assert world.now < 0.2
-    world.restart_router(away, 0.0, until=math.inf)
-    assert control.wait(300, timeout=60.0)
-    assert world.now == pytest.approx(6.0, abs=0.5)
+    session.readers += [ended, away]
+    session.schedule(0.1, lambda: setattr(ended, "closed", True))
+    session.schedule(0.1, lambda: setattr(ended, "stopped", None))
+    assert control.wait_for_reception(200, timeout=5.0)
+    assert session.now < 0.2
+    session.restart_router(away, 0.0, until=math.inf)
+    assert control.wait_for_reception(300, timeout=60.0)
+    assert session.now == pytest.approx(6.0, abs=0.5)
 
 
-def test_number_of_the_last_message_wraps(world: World, control: FlowControl) -> None:
+def test_acknowledged_number_wraps(session: FakeSession, control: FlowControl) -> None:
     """Message numbers wrap after 2^32, both at the reader and at the publisher."""
-    assert control.wait(2**32 + 1, timeout=1.0)
-    assert world.asked[-1]["number"] == "0"
+    assert control.wait_for_reception(2**32 + 1, timeout=1.0)
+    assert session.requests[-1]["number"] == "0"

@@ -11,13 +11,13 @@ from nedbus.client.receiving.receiver import drain
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
 from tests.flights.local_position import decode
 from tests.flights.messages import VLP
-from tests.nedbus.client.downsampling import Link, wait_for_demand
+from tests.nedbus.client.downsampling import Link, wait_for_downsampling_reader
 from tests.nedbus.client.numbered import publish, wait_for_subscriber
 from tests.waits import wait_for
 
 
 def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> None:
-    """Zenoh's advanced subscriber recovers the last message after a heartbeat, although no other message follows."""
+    """Zenoh's advanced subscriber recovers the last message after a heartbeat, without a further message."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(100)
     recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
     samples: list[zenoh.Sample] = []
@@ -40,19 +40,19 @@ def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> N
 
 
 def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """Each downsampled stream has its own numbers, and heartbeats with the last one."""
-    heard: Heartbeats = {}
+    """A downsampled stream has its own sequence numbers, and heartbeats with the last one."""
+    heartbeats: Heartbeats = {}
     take, undeclare = follow_heartbeats(zenoh_session, f"nedbus/*/{VLP}/@rate/*")
     with bus.publisher(VLP, vehicle="1") as publisher, bus.subscribe(VLP, mode="every", max_rate=1):
-        wait_for_demand(publisher)
+        wait_for_downsampling_reader(publisher)
 
-        def publish_until_heard() -> bool:
+        def publish_until_heartbeat() -> bool:
             publish(publisher, publisher.published)
-            heard.update(take())
-            return bool(heard)
+            heartbeats.update(take())
+            return bool(heartbeats)
 
-        wait_for(publish_until_heard, what="a heartbeat")
-    [((key, _), number)] = heard.items()
+        wait_for(publish_until_heartbeat, what="a heartbeat")
+    [((key, _), number)] = heartbeats.items()
     assert key == f"{publisher.key}/@rate/1"
     assert number < 10 < publisher.published
     undeclare()

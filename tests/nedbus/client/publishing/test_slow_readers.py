@@ -1,4 +1,4 @@
-"""Readers that do not read, are suspended, die or are slow: they delay no other reader, and all losses are counted."""
+"""Slow, stuck, suspended and killed readers: they delay no other reader, and all losses are counted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.timings import Timings
 from nedbus.transport import open_router
 from tests.flights.messages import VLP
-from tests.nedbus.client.numbered import is_read, numbered, publish, take, wait_for_subscriber
+from tests.nedbus.client.numbered import has_subscriber, numbered, publish, receive_timestamps, wait_for_subscriber
 from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
@@ -34,23 +34,23 @@ with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mo
     print("ready", flush=True)
     for number, sample in enumerate(subscription, 1):
         if sample.message.timestamp != number or sample.lost:
-            sys.exit(f"{sample.message.timestamp} in place of {number}, {sample.lost} lost")
+            sys.exit(f"message {sample.message.timestamp} instead of {number}, {sample.lost} lost")
         if number == 10:
             print("ten", flush=True)
         if mode == "slow":
             time.sleep(0.05)
-        if mode == "amid" and number == 300:
+        if mode == "during" and number == 300:
             os.kill(os.getpid(), signal.SIGSTOP)
         if number == int(last):
             break
     counts = subscription.counts
-    print("whole" if counts == nedbus.Counts(received=number) else counts, flush=True)
-    signal.pause()  # a publisher waits 5 s for one that has ended
+    print("complete" if counts == nedbus.Counts(received=number) else counts, flush=True)
+    signal.pause()  # if it ended here, the publisher would wait 5 s for it
 """
 
 
 def subscribe(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Open a reader; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
+    """Subscribe to positions. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
@@ -62,7 +62,7 @@ stuck_reader = pytest.fixture(name="stuck")(subscribe)
 def publish_all(
     bus: nedbus.Bus, *, count: int = COUNT, before: Callable[[], object] = lambda: None
 ) -> tuple[nedbus.Publisher, threading.Thread]:
-    """Publish messages losslessly, once there is a reader, after a first action."""
+    """Wait for a reader, call `before`, and publish messages losslessly in a thread."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
     before()
@@ -71,17 +71,17 @@ def publish_all(
     return publisher, thread
 
 
-def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
+def test_stuck_reader_slows_down_a_replay_without_losses(
     stuck: nedbus.Subscription[Any], reader: nedbus.Subscription[Any], bus: nedbus.Bus
 ) -> None:
-    """While a reader reads nothing, a window is sent at once and then a trickle for others; both get everything."""
+    """While one reader is stuck, others get a window at once and then a trickle; finally all have all messages."""
     publisher, sending = publish_all(bus)
-    got = take(reader, WINDOW + 5)
+    got = receive_timestamps(reader, WINDOW + 5)
     assert publisher.published < COUNT
     late: list[int] = []
-    reading = threading.Thread(target=lambda: late.extend(take(stuck, COUNT)), daemon=True)
+    reading = threading.Thread(target=lambda: late.extend(receive_timestamps(stuck, COUNT)), daemon=True)
     reading.start()
-    got += take(reader, COUNT - len(got))
+    got += receive_timestamps(reader, COUNT - len(got))
     reading.join(DEADLINE)
     assert late == got == list(range(1, COUNT + 1))
     sending.join(DEADLINE)
@@ -90,12 +90,12 @@ def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
 
 
 @pytest.mark.parametrize(
-    ("when", "lease"), [("before", 1), ("amid", 1), pytest.param("amid", 5, marks=pytest.mark.slow)]
+    ("when", "lease"), [("before", 1), ("during", 1), pytest.param("during", 5, marks=pytest.mark.slow)]
 )
-def test_stopped_reader_gets_everything(
+def test_suspended_reader_gets_all_messages(
     start: Start, endpoint: str, bus: nedbus.Bus, timings: Timings, *, when: str, lease: int
 ) -> None:
-    """A reader suspended (SIGSTOP) until its lease of 5 s, here 1 s, has expired returns without losses."""
+    """A reader suspended (SIGSTOP) until its lease has expired, after 5 s or here 1 s, loses nothing."""
     assert timings.lease == 5
     begin = time.monotonic()
     timings.lease = lease
@@ -107,22 +107,22 @@ def test_stopped_reader_gets_everything(
             stopped.popen.send_signal(signal.SIGSTOP)
 
     publisher, sending = publish_all(bus, before=stop)
-    process = psutil.Process(stopped.popen.pid)  # a lease of 1 s may end before the stop, on a busy machine
-    wait_for(lambda: process.status() == psutil.STATUS_STOPPED, what="the stop")
-    wait_for(lambda: not is_read(publisher), what="the end of the lease")
+    process = psutil.Process(stopped.popen.pid)  # on a busy machine, a lease of 1 s may expire before the stop
+    wait_for(lambda: process.status() == psutil.STATUS_STOPPED, what="the reader to stop")
+    wait_for(lambda: not has_subscriber(publisher), what="the end of the lease")
     assert sending.is_alive()
     stopped.popen.send_signal(signal.SIGCONT)
     sending.join(2 * DEADLINE)
     assert not sending.is_alive()
-    wait_for(lambda: "whole" in stopped.out or stopped.popen.poll() is not None, what="the last message")
-    assert "whole" in stopped.out, stopped.err
+    wait_for(lambda: "complete" in stopped.out or stopped.popen.poll() is not None, what="the last message")
+    assert "complete" in stopped.out, stopped.err
     assert time.monotonic() - begin > lease - 1
     publisher.close()
 
 
 @pytest.mark.parametrize("lossless", [False, True])
-def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: nedbus.Bus, lossless: bool) -> None:
-    """A reader that was offline when publishers started gets their whole history cache in order, once it is back."""
+def test_publishers_started_during_an_outage_are_recovered(endpoint: str, bus: nedbus.Bus, lossless: bool) -> None:
+    """A reader that was offline when publishers started gets their whole history cache in order once it reconnects."""
     near = free_endpoint()
     router = open_router(listen=(near,), connect=(endpoint,))
     vehicles = [str(number) for number in range(10)]
@@ -157,7 +157,7 @@ def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: ned
                     got[sample.vehicle].append(sample.message.timestamp)
             return all(len(each) > 100 for each in got.values())
 
-        wait_for(take_all, what="messages of all")
+        wait_for(take_all, what="messages of all vehicles")
         for each in got.values():
             assert each == list(range(1, len(each) + 1))
         assert subscription.counts.lost == 0
@@ -166,7 +166,7 @@ def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: ned
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_reader_that_dies_is_given_up(
+def test_killed_reader_is_given_up(
     start: Start,
     endpoint: str,
     reader: nedbus.Subscription[Any],
@@ -175,25 +175,25 @@ def test_reader_that_dies_is_given_up(
     *,
     number: signal.Signals,
 ) -> None:
-    """A replay continues without a reader that is killed or ends, and other readers miss nothing."""
+    """A replay continues without a reader that is killed or interrupted, and other readers miss nothing."""
     timings.return_wait = 0.5
     dying = start("-c", READER, endpoint, str(COUNT), "slow", coverage=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")
     _, sending = publish_all(bus)
     wait_for(lambda: "ten" in dying.out, what="the first messages")
     dying.signal(number)
-    assert take(reader, COUNT) == list(range(1, COUNT + 1))
+    assert receive_timestamps(reader, COUNT) == list(range(1, COUNT + 1))
     sending.join(DEADLINE)
     assert not sending.is_alive()
 
 
-def test_flush_waits_for_arrival_and_not_for_scripts(
+def test_flush_does_not_wait_for_scripts_to_read(
     stuck: nedbus.Subscription[Any], reader: nedbus.Subscription[Any], bus: nedbus.Bus
 ) -> None:
     """A flush waits for messages to arrive at readers, not for scripts to read them."""
     publisher, sending = publish_all(bus, count=WINDOW // 2)
-    assert take(reader, WINDOW // 2)[-1] == WINDOW // 2
+    assert receive_timestamps(reader, WINDOW // 2)[-1] == WINDOW // 2
     reader.close()
     sending.join(DEADLINE)
     assert publisher.flush(DEADLINE)
-    assert take(stuck, WINDOW // 2)[-1] == WINDOW // 2
+    assert receive_timestamps(stuck, WINDOW // 2)[-1] == WINDOW // 2

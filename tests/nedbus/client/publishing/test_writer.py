@@ -1,4 +1,4 @@
-"""The schedule of heartbeats, from the times of the last messages, with a fake clock."""
+"""The schedule of heartbeats after the last message, with a fake clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nedbus.transport import Session
 
 @dataclass(eq=False)
 class FakeWriter:
-    """The attributes of a writer that heartbeats use."""
+    """The attributes of a writer that Heartbeats uses."""
 
     published: int = 0
     key: str = "key"
@@ -32,7 +32,7 @@ class FakeWriter:
 
 
 class Stream:
-    """A session with one writer and a clock; `sent` has the time and payload of each heartbeat."""
+    """A fake session with one writer and a fake clock; `sent` has the time and payload of each heartbeat."""
 
     def __init__(self) -> None:
         self.now, self.calls, self.due = 100.0, 0, math.inf
@@ -44,7 +44,7 @@ class Stream:
         self.on_sent: Callable[[], object] = lambda: None
 
     def put(self, key: str, payload: bytes, *, congestion_control: zenoh.CongestionControl, priority: object) -> None:
-        """Send a heartbeat, as the session."""
+        """Record a heartbeat; called like `Session.put`."""
         assert (key, congestion_control) == ("key/@adv/pub/ab/7/_", zenoh.CongestionControl.DROP)
         self.sent.append((self.now, payload))
         self.on_sent()
@@ -72,24 +72,24 @@ class Stream:
 
 @pytest.fixture
 def stream(monkeypatch: pytest.MonkeyPatch) -> Stream:
-    """Return a stream with no message yet."""
+    """Return a stream without messages."""
     stream = Stream()
     monkeypatch.setattr(writer, "Job", stream.make_job)
     return stream
 
 
 @pytest.mark.parametrize("rate", [5, 7, 50, 400])
-def test_stream_that_goes_on_sends_none(stream: Stream, rate: int) -> None:
-    """A stream of 5 Hz or more needs no heartbeats, as its next message reveals losses; nor does an unused stream."""
+def test_busy_stream_sends_no_heartbeats(stream: Stream, rate: int) -> None:
+    """A stream of 5 Hz or more needs no heartbeats: its next message reveals losses; nor does an unused stream."""
     assert stream.wait(10.0) == []
     for _ in range(20 * rate):
         stream.publish()
         assert stream.wait(1 / rate) == []
-    assert stream.calls < 20 / 0.15, "its messages cost no call each"
+    assert stream.calls < 20 / 0.15, "the job is called too often"
 
 
-def test_silent_stream_sends_ever_more_rarely(stream: Stream) -> None:
-    """Heartbeats follow after 0.4 s, then after 0.5, 1 and 2 s, then each 4 s: 900 per hour, each with one call."""
+def test_heartbeats_of_a_silent_stream_back_off(stream: Stream) -> None:
+    """Heartbeats follow after 0.4 s, then after 0.5, 1 and 2 s, then every 4 s: 900 per hour, each with one call."""
     for _ in range(2):  # a message restarts the schedule
         stream.publish()
         first, *others = stream.wait(60.0)
@@ -103,18 +103,18 @@ def test_silent_stream_sends_ever_more_rarely(stream: Stream) -> None:
     for _ in range(50):
         stream.publish()
         stream.wait(0.1)
-    assert stream.wait(HEARTBEAT), "a stream that went on until now is known to be silent sooner"
+    assert stream.wait(HEARTBEAT), "no heartbeat in time after a busy period"
 
 
 def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> None:
-    """A message put while the heartbeat of the one before is sent has its own first heartbeat in time."""
+    """A message put while a heartbeat is being sent gets its own first heartbeat in time."""
     stream.publish()
 
-    def publish_meanwhile() -> None:
+    def publish_during_heartbeat() -> None:
         stream.on_sent = lambda: None
         stream.publish()
 
-    stream.on_sent = publish_meanwhile
+    stream.on_sent = publish_during_heartbeat
     first, second, *_ = stream.wait(5.0)
     assert first == pytest.approx(0.4)
     assert second - first <= HEARTBEAT
@@ -124,7 +124,7 @@ def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> Non
 
 
 def test_heartbeat_has_the_number_of_the_last_message(stream: Stream) -> None:
-    """Zenoh's numbers start at 0, and wrap after 2^32."""
+    """A heartbeat has the sequence number of the last message, which starts at 0 and wraps after 2^32."""
     for published, payload in ((1, b"\0\0\0\0"), (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"), (2**32, b"\xff" * 4)):
         stream.publish(published)
         stream.wait(1.0)
@@ -136,8 +136,8 @@ def test_heartbeat_has_the_number_of_the_last_message(stream: Stream) -> None:
     assert stream.wait(10.0) == []
 
 
-def test_many_heartbeats_are_sent_in_turns(stream: Stream) -> None:
-    """Publishers that fall silent at the same time do not delay the other jobs of the process."""
+def test_many_heartbeats_are_sent_in_batches(stream: Stream) -> None:
+    """Heartbeats of many publishers that fall silent at once do not delay other jobs of the process."""
     writers = [FakeWriter(published=1, last_put=0.1) for _ in range(1000)]
     for each in writers:
         stream.heartbeats.writers.add(cast("Writer", each))

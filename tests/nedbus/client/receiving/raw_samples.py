@@ -1,4 +1,4 @@
-"""Hand-made samples with the attributes of Zenoh's samples, which cannot be created in Python."""
+"""Fake samples with the attributes of Zenoh's samples, which cannot be created in Python."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ SOURCE = encoding_of("sim")
 
 
 class Payload(bytes):
-    """A stand-in for zenoh.ZBytes."""
+    """A fake zenoh.ZBytes."""
 
     def to_bytes(self) -> bytes:
         return bytes(self)
 
 
 VALID = Payload(encode(message(1)))
-INVALID = Payload(bytes(len(VALID)))  # of the right size, so that only its reader notices
+INVALID = Payload(bytes(len(VALID)))  # of the right size: detected only when it is decoded
 
 
 class Raw(SimpleNamespace):
-    """The attributes of a Zenoh sample that are read; unlike its base, it supports weak references."""
+    """A fake sample; unlike its base, it supports weak references."""
 
 
 def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
-    """Return a message's sequence number and its publisher, the first one in the session of this name."""
+    """Return source info with a sequence number and the first publisher of the session `publisher`."""
     entity = SimpleNamespace(zid=publisher, eid=1)
     return cast("zenoh.SourceInfo", SimpleNamespace(source_sn=number, source_id=entity))
 
 
 def name_of(publisher: str) -> str:
-    """Return the name by which a reader knows a publisher."""
+    """Return the name that a reader derives for a publisher."""
     return f"{publisher}:1"
 
 
@@ -78,16 +78,16 @@ def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> Pe
 
 
 def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
-    """Put samples into a queue, and give up all gaps, as no publisher replies."""
+    """Put samples into a queue, and give up all gaps, because no publisher replies."""
     pending_queue.put(samples, overflowed=overflowed)
     pending_queue.give_up()
 
 
 def drain(pending_queue: PendingQueue) -> list[nedbus.Sample]:
-    """Take all queued samples."""
+    """Remove and return all queued samples."""
     return list(iter(partial(pending_queue.pop, rows=False), None))
 
 
 def timestamps(pending_queue: PendingQueue) -> list[int]:
-    """Take all queued samples and return their timestamps."""
+    """Remove all queued samples and return their timestamps."""
     return [sample.message.timestamp for sample in drain(pending_queue)]

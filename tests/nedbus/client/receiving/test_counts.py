@@ -1,4 +1,4 @@
-"""Counts of a reader through a real router, under floods, junk, unknown layouts and rejected messages."""
+"""Counts of a reader through a real router, with floods, invalid messages, unknown layouts and rejections."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.numbered import numbered, publish, take, wait_for_subscriber
+from tests.nedbus.client.numbered import numbered, publish, receive_timestamps, wait_for_subscriber
 from tests.nedbus.client.test_bus import BOTH, SCHEMA
 from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 
 KEY = f"nedbus/1/{VLP}"
-ADDRESS = Address("7", "estimator_local_position", 1)  # of what is rejected
+ADDRESS = Address("7", "estimator_local_position", 1)  # of rejected messages
 
 
 @pytest.fixture
 def publisher(bus: nedbus.Bus) -> nedbus.Publisher:
-    """Return a publisher of a first message; readers that have received it are known to be subscribed."""
+    """Return a publisher that has published one message, which each new reader receives."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     return publisher
@@ -45,8 +45,8 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_every_sample_arrives_in_order(client: nedbus.Bus, publisher: nedbus.Publisher) -> None:
-    """Mode "every" gives each sample once, in order, and its counts prove it."""
+def test_mode_every_receives_all_samples_in_order(client: nedbus.Bus, publisher: nedbus.Publisher) -> None:
+    """Mode "every" receives each sample once and in order, and counts no loss."""
     subscription = client.subscribe(VLP, mode="every")
     first = subscription.receive(DEADLINE)
     publish(publisher, *range(2, 1002))
@@ -55,21 +55,23 @@ def test_every_sample_arrives_in_order(client: nedbus.Bus, publisher: nedbus.Pub
     assert subscription.counts == Counts(received=1001)
 
 
-def test_latest_keeps_what_is_quiet(client: nedbus.Bus, publisher: nedbus.Publisher, bus: nedbus.Bus) -> None:
+def test_mode_latest_keeps_samples_of_quiet_vehicles(
+    client: nedbus.Bus, publisher: nedbus.Publisher, bus: nedbus.Bus
+) -> None:
     """A busy vehicle does not displace a quiet one while the reader pauses, and all messages are counted exactly."""
     subscription = client.subscribe(VLP)
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     publish(bus.publisher(VLP, vehicle="quiet"), 1)
     publish(publisher, *range(2, 3001))
 
     def is_counted() -> bool:
-        """Return True if all but the newest message are counted; else send another one, which reveals its losses."""
+        """Return True if all but the newest message are counted; else publish another one, which reveals losses."""
         counts = subscription.counts
         if counts.dropped + counts.lost < publisher.published - 2:
             publish(publisher, 3000)
         return counts.dropped + counts.lost == publisher.published - 2
 
-    wait_for(is_counted, what="all but the newest")
+    wait_for(is_counted, what="the counts of all but the newest message")
     newest = {sample.vehicle: sample.message.timestamp for sample in islice(subscription, 2)}
     assert newest == {"1": 3000, "quiet": 1}
     counts = subscription.counts
@@ -78,29 +80,31 @@ def test_latest_keeps_what_is_quiet(client: nedbus.Bus, publisher: nedbus.Publis
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_unread_subscription_delays_no_other(
+def test_unread_subscription_delays_no_other_reader(
     client: nedbus.Bus, endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, mode: Mode
 ) -> None:
-    """A full subscription delays no other of any bus, no query, and not its own close."""
+    """A full subscription delays neither other subscriptions of any bus, nor queries, nor its own close."""
     monkeypatch.setattr("nedbus.client.receiving.receiver.RING_CAPACITY", 256)
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 1000)
     stuck = client.subscribe(VLP, mode=mode)
     with nedbus.connect(endpoint) as other:
         read = [each.subscribe(VLP, mode="every") for each in (client, other)]
-        assert [take(each, 1) for each in read] == [[1], [1]]
+        assert [receive_timestamps(each, 1) for each in read] == [[1], [1]]
         for first in range(2, 3_001, 100):
             numbers = range(first, min(first + 100, 3_001))
             publish(publisher, *numbers)
-            assert [take(each, len(numbers)) for each in read] == [list(numbers)] * 2
-    wait_for(lambda: stuck.counts.dropped, what="a message too many")
-    wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000], what="the last value")
+            assert [receive_timestamps(each, len(numbers)) for each in read] == [list(numbers)] * 2
+    wait_for(lambda: stuck.counts.dropped, what="a dropped message")
+    wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [3_000], what="the last message")
     assert client.subscribe(VLP).receive(DEADLINE).message.timestamp > 0
     start = time.monotonic()
     stuck.close()
-    assert time.monotonic() - start < 9.0, "Zenoh's own limit for a stuck close is 10 s"
+    assert time.monotonic() - start < 9.0, "slow: Zenoh's timeout for a blocked close is 10 s"
 
 
-def test_absent_is_counted_exactly(endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_messages_are_counted_exactly(
+    endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each message of a flood that exceeds buffers and queue is counted as received, lost or dropped."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 1000)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
@@ -109,21 +113,21 @@ def test_absent_is_counted_exactly(endpoint: str, publisher: nedbus.Publisher, m
         _, *rest = message(2).__dict__.values()
         for timestamp in range(2, total + 1):
             publisher.publish_row((timestamp, *rest))
-        wait_for(lambda: subscription.counts.dropped, what="a message too many")
-        lost, received, absent, last = first.lost, 1, first.lost, first.message.timestamp
+        wait_for(lambda: subscription.counts.dropped, what="a dropped message")
+        lost, received, missing, last = first.lost, 1, first.lost, first.message.timestamp
         while last != total:
             sample = subscription.receive(DEADLINE)
             assert sample.message.timestamp > last + sample.lost
             lost, received = lost + sample.lost, received + 1
-            absent += sample.message.timestamp - last - 1
+            missing += sample.message.timestamp - last - 1
             last = sample.message.timestamp
         counts = subscription.counts
         assert (counts.received, counts.lost, counts.invalid) == (received, lost, 0)
-        assert lost + counts.dropped == absent == total - received > 0
+        assert lost + counts.dropped == missing == total - received > 0
 
 
 def test_two_publishers_of_one_key_lose_nothing(client: nedbus.Bus, bus: nedbus.Bus, endpoint: str) -> None:
-    """Publishers of one key have independent sequences, also if one starts after the other has gone."""
+    """Publishers of one key have independent sequence numbers, even if one starts after the other has closed."""
     subscription = client.subscribe(VLP, mode="every")
     one = bus.publisher(VLP, vehicle="1")
     with nedbus.connect(endpoint) as other:
@@ -141,8 +145,8 @@ def test_two_publishers_of_one_key_lose_nothing(client: nedbus.Bus, bus: nedbus.
     assert subscription.counts == Counts(received=1200)
 
 
-def test_two_threads_get_a_message_each(bus: nedbus.Bus) -> None:
-    """A thread that receives for both wakes up the other one, which may be the only one to read on."""
+def test_two_reading_threads_receive_a_message_each(bus: nedbus.Bus) -> None:
+    """The thread that drains the ring wakes the other reading thread, which gets the second message."""
     publisher, subscription = bus.publisher(VLP, vehicle="1"), bus.subscribe(mode="every")
     wait_for_subscriber(publisher)
     with ThreadPoolExecutor(2) as pool, subscription:
@@ -152,12 +156,12 @@ def test_two_threads_get_a_message_each(bus: nedbus.Bus) -> None:
             assert sorted(each.result(DEADLINE).message.timestamp for each in taken) == [1, 2]
 
 
-def test_invalid_payload_never_ends_an_iteration(
+def test_invalid_samples_do_not_end_an_iteration(
     client: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Garbage, foreign keys, deletes and wildcard puts are counted and logged once; valid samples arrive."""
+    """Invalid payloads and keys, deletes and wildcard puts are counted and logged once per key; valid ones arrive."""
     subscription = client.subscribe("*", mode="every")
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     good = encode(message(2, x=1.0))
     for key, payload in (
         (KEY, b"garbage"),
@@ -174,41 +178,41 @@ def test_invalid_payload_never_ends_an_iteration(
     assert (sample.vehicle, sample.message, sample.sent) == ("2", message(2, x=1.0), None)
     assert subscription.counts == Counts(received=2, invalid=7)
     warned = warnings(caplog)
-    assert len(warned) == len({text.split(":")[0] for text in warned}), "each key is named once"
+    assert len(warned) == len({text.split(":")[0] for text in warned}), "a key is logged more than once"
     assert any("garbage" in text or "one msgpack value" in text for text in warned)
 
 
-def test_long_keys_cost_a_reader_nothing(
+def test_long_invalid_keys_are_not_kept(
     bus: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """150 invalid keys of 60 kB are counted but not kept, with 100 short log lines at most."""
+    """150 invalid keys of 60 kB are counted but not kept, and logged in at most 100 short lines."""
     subscription = bus.subscribe("*", mode="every")
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     tracemalloc.start()
     try:
         for number in range(150):
             zenoh_session.put(f"nedbus/{number}/{'x' * 60_000}", b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        wait_for(lambda: subscription.counts.invalid == 150, what="all to be counted")
-        kept, _ = tracemalloc.get_traced_memory()
+        wait_for(lambda: subscription.counts.invalid == 150, what="the count of all")
+        allocated, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert kept < 50 * 60_000
+    assert allocated < 50 * 60_000
     warned = warnings(caplog)
     assert len(warned) == 100
     assert max(map(len, warned)) < 1000
     assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [True]
 
 
-def test_newer_layout_is_read_by_its_schema(
+def test_newer_layout_is_looked_up(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An unknown layout is looked up once; its messages are invalid until then, and unknown fields are logged once."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     reply = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
-    asked: list[object] = []
+    queries: list[object] = []
 
     def count(query: zenoh.Query) -> None:
-        asked.append(query)
+        queries.append(query)
         reply(query)
 
     subscription = client.subscribe(mode="every")
@@ -220,13 +224,13 @@ def test_newer_layout_is_read_by_its_schema(
         taken = list(islice(subscription, 2))
     assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [(4, 2.5), (4, 2.5)]
     assert subscription.counts.invalid > 0
-    assert len(asked) == 1
-    unread = [text for text in caplog.messages if "not read" in text]
-    assert unread == ["layout 9 of VehicleLocalPosition is newer than this reader; not read: brand_new"]
+    assert len(queries) == 1
+    logged = [text for text in caplog.messages if "ignored fields" in text]
+    assert logged == ["layout 9 of VehicleLocalPosition is newer than this reader; ignored fields: brand_new"]
 
 
-def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """The query of last messages waits for the description of a layout that the reader does not know."""
+def test_last_message_of_a_newer_layout_is_decoded(client: nedbus.Bus, zenoh_session: Session) -> None:
+    """A query for last messages waits for the lookup of a layout that is not installed here."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)
@@ -237,53 +241,53 @@ def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_sessio
 @pytest.mark.parametrize(
     "answer", [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}']
 )
-def test_layout_without_a_description_is_invalid(bus: nedbus.Bus, zenoh_session: Session, answer: bytes) -> None:
-    """After a hostile or broken description of a layout its messages are counted as invalid."""
+def test_messages_of_a_malformed_layout_are_invalid(bus: nedbus.Bus, zenoh_session: Session, answer: bytes) -> None:
+    """If the reply to a layout lookup is malformed, messages of that layout count as invalid."""
     with answer_queries(zenoh_session, SCHEMA, reply_with({SCHEMA: answer})):
         subscription = bus.subscribe(VLP, mode="every")
         wait_for_matching(zenoh_session, KEY)
         zenoh_session.put(KEY, msgpack.packb([9, 1, 2]))
         zenoh_session.put(KEY, encode(message(2)))
-        assert take(subscription, 1) == [2]
+        assert receive_timestamps(subscription, 1) == [2]
         assert subscription.counts.invalid == 1
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, zenoh_session: Session, mode: Mode) -> None:
-    """A peer that sends unknown layouts and never replies delays no other stream, and is queried once."""
+def test_peer_that_never_replies_delays_no_other_stream(bus: nedbus.Bus, zenoh_session: Session, mode: Mode) -> None:
+    """A peer that sends unknown layouts and leaves lookups unanswered delays no other stream, and is queried once."""
     held = zenoh_session.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(VLP, mode=mode)
     wait_for_matching(zenoh_session, f"nedbus/2/{VLP}")
     for layout in range(100, 150):
         zenoh_session.put(f"nedbus/2/{VLP}", msgpack.packb([layout, 1, 2]))
-    wait_for(lambda: subscription.waiting or subscription.counts.invalid, what="the first of them")
+    wait_for(lambda: subscription.waiting or subscription.counts.invalid, what="the first unknown layout")
     publish(publisher, 1)
-    assert take(subscription, 1) == [1]
-    wait_for(lambda: subscription.counts.invalid == 50, what="all of them")
-    questions = []
-    while (question := held.handler.try_recv()) is not None:
-        questions.append(question)
-    assert len(questions) <= 1
+    assert receive_timestamps(subscription, 1) == [1]
+    wait_for(lambda: subscription.counts.invalid == 50, what="all unknown layouts")
+    queries = []
+    while (query := held.handler.try_recv()) is not None:
+        queries.append(query)
+    assert len(queries) <= 1
 
 
 def test_unexpected_error_in_the_pump_is_counted(
     bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An exception caused by a sample is logged and counted, the sample is requested again, and the reader goes on."""
+    """An exception in the pump is logged, its sample counted and requested again, and the reader continues."""
     subscription = bus.subscribe(mode="every")
-    assert take(subscription, 1) == [1]
+    assert receive_timestamps(subscription, 1) == [1]
     with monkeypatch.context() as patched:
         patched.setattr(PendingQueue, "_admit", lambda *_: 1 / 0)
         publish(publisher, 2)
         wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
     publish(publisher, 3)
-    assert take(subscription, 2) == [2, 3]
+    assert receive_timestamps(subscription, 2) == [2, 3]
     assert any("unexpected error, " in text and "discarded" in text for text in caplog.messages)
 
 
-def test_reports_arrive_with_their_reason(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A report of a service is read with its address; anything else is ignored."""
+def test_rejection_reports_have_address_and_reason(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """A rejection report has the address and reason of the message; malformed reports are ignored."""
     rejections = bus.rejections()
     wait_for_matching(zenoh_session, ADDRESS.rejected_key())
     for key, payload in (
@@ -297,19 +301,19 @@ def test_reports_arrive_with_their_reason(bus: nedbus.Bus, zenoh_session: Sessio
     PublisherRegistry(zenoh_session, queries, prefix="nedbus", is_client=True).reject(ADDRESS, {"reason": "x is NaN"})
     reports: list[RejectionReport] = []
 
-    def has_come() -> bool:
+    def has_arrived() -> bool:
         reports.extend(rejections.take())
         return bool(reports)
 
-    wait_for(has_come, what="the report")
+    wait_for(has_arrived, what="the report")
     assert [(report.address, report.reason) for report in reports] == [(ADDRESS, "x is NaN")]
     assert rejections.take() == []
     rejections.close()
     queries.close()
 
 
-def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
-    """A closed bus raises ClosedError, and closing is idempotent."""
+def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:
+    """After the bus is closed, its rejections raise ClosedError, and closing them is idempotent."""
     bus = nedbus.connect(endpoint)
     rejections = bus.rejections()
     bus.close()
@@ -320,11 +324,11 @@ def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
         bus.rejections()
 
 
-def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample receives it with at most 22 Python calls, in four classes of the client."""
+def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, endpoint: str) -> None:
+    """A reader that waits for each sample receives it with at most 22 Python calls, in four classes."""
     called: list[list[str]] = []
 
-    def note(frame: FrameType, event: str, _: object) -> None:
+    def trace(frame: FrameType, event: str, _: object) -> None:
         if event == "call":
             called[-1].append(frame.f_code.co_qualname)
 
@@ -332,11 +336,13 @@ def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None
         for number in range(20):
             publish(publisher, number + 2)
             called.append([])
-            sys.setprofile(note)
+            sys.setprofile(trace)
             next(subscription)
             sys.setprofile(None)
-    waited = [names for names in called if any(name.startswith("Receiver.") for name in names)]  # others came with one
-    usual = sorted(waited, key=len)[len(waited) // 2]
-    assert len(usual) <= 22
-    classes = {name.partition(".")[0] for name in usual if name[0].isupper()}
+    waited = [
+        names for names in called if any(name.startswith("Receiver.") for name in names)
+    ]  # samples received along with an earlier one need no wait
+    median = sorted(waited, key=len)[len(waited) // 2]
+    assert len(median) <= 22
+    classes = {name.partition(".")[0] for name in median if name[0].isupper()}
     assert classes == {"Subscription", "Receiver", "PendingQueue", "Decoder"}

@@ -1,4 +1,4 @@
-"""A reader with a maximum rate: the messages that pass; the others count as neither lost nor dropped."""
+"""The queue of a reader with a maximum rate: omitted messages count as neither lost nor dropped."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def at(
     sent: float, number: int | None, *, key: str = DOWNSAMPLED, timestamp: int | None = None, publisher: str = "a"
 ) -> RawSample:
-    """Return a sample sent at this second; its message's timestamp is the same in milliseconds."""
+    """Return a sample sent at the time `sent` [s]; the timestamp of its message is that time in milliseconds."""
     stamp = SimpleNamespace(get_time_as_ntp64=lambda: SimpleNamespace(as_nanos=lambda: round(sent * 1e9)))
     timestamp = round(sent * 1000) if timestamp is None else timestamp
     return raw(number, timestamp=timestamp, key=key, publisher=publisher, stamp=stamp)
 
 
-def test_downsampled_stream_passes() -> None:
-    """A stream that its publisher downsamples is not downsampled again, whatever its timestamp jitter."""
+def test_downsampled_stream_passes_unchanged() -> None:
+    """The reader does not downsample again what the publisher has downsampled, whatever the jitter of timestamps."""
     queue = make_queue()
     queue.put([at(sent, number) for number, sent in enumerate([1.0, 1.19, 1.41, 1.6, 1.79])])
     assert timestamps(queue) == [1000, 1190, 1410, 1600, 1790]
@@ -62,8 +62,8 @@ def test_downsampled_stream_passes() -> None:
     assert queue.has_downsampled(Address.from_key(KEY))
 
 
-def test_gap_of_a_downsampled_stream_is_lost() -> None:
-    """A downsampled stream has its own sequence numbers; gaps count as lost before the next message."""
+def test_gap_in_a_downsampled_stream_counts_as_lost() -> None:
+    """A gap in the sequence numbers of a downsampled stream counts as lost before the next message."""
     queue = make_queue()
     put(queue, [at(1.0, 0), at(1.2, 1), at(1.8, 4)])
     put(queue, [at(2.6, 8)])
@@ -72,8 +72,8 @@ def test_gap_of_a_downsampled_stream_is_lost() -> None:
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
-def test_rest_is_left_out_here(mode: Mode, clock: Clock) -> None:
-    """Below the lowest rate every second message is left out; a gap before it is reported with the next one."""
+def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> None:
+    """At half the lowest rate the reader omits every second message; the next one reports the losses before it."""
     queue = make_queue(mode, max_rate=0.5)
     assert queue.rate == 1
     taken = []
@@ -90,8 +90,8 @@ def test_rest_is_left_out_here(mode: Mode, clock: Clock) -> None:
     assert [sample.lost for sample in drain(queue)] == [1]
 
 
-def test_last_message_comes_once() -> None:
-    """The last message passes first if nothing else arrives; once overtaken, it and older ones are left out."""
+def test_last_message_is_received_once() -> None:
+    """The last message passes if it arrives first; earlier downsampled messages and later replies are omitted."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
@@ -100,8 +100,8 @@ def test_last_message_comes_once() -> None:
     assert queue.counts == Counts(received=2)
 
 
-def test_restart_with_an_earlier_clock_passes() -> None:
-    """A vehicle that restarts before its clock is set passes at once."""
+def test_message_after_restart_with_an_earlier_clock_passes() -> None:
+    """Messages of a vehicle that restarts with an unset clock pass at once."""
     queue = make_queue()
     queue.put_last([at(1000.0, None, key=KEY)])
     queue.put([at(5.0, 0), at(5.2, 1)])
@@ -109,7 +109,7 @@ def test_restart_with_an_earlier_clock_passes() -> None:
 
 
 def passed(rate: float, times: list[float]) -> list[float]:
-    """Return the times that pass [s]."""
+    """Return the times that pass a gate [s]."""
     gate = RateGate(rate)
     return [now for now in times if gate.passes(round(1e9 * now))]
 
@@ -120,7 +120,7 @@ def steady(rate: float, seconds: float) -> list[float]:
 
 
 def test_steady_stream_passes_evenly() -> None:
-    """From 100 Hz to 5 Hz every 20th message passes, at any jitter and without drift over ten minutes."""
+    """A gate of 5 Hz passes every 20th message of 100 Hz, with jitter and without drift over ten minutes."""
     times = [number / 100 + 0.002 * math.sin(number) for number in range(60_000)]
     taken = passed(5, times)
     assert len(taken) == 3_000
@@ -129,51 +129,51 @@ def test_steady_stream_passes_evenly() -> None:
 
 @pytest.mark.parametrize("rate", [0.3, 1, 3, 7, 30, 33, 70, 99, 100])
 @pytest.mark.parametrize("source", [100.0, 103.7, 250.0])
-def test_mean_is_the_rate(rate: float, source: float) -> None:
-    """If the rates do not divide evenly, the mean is the requested rate, not the next lower divisor."""
+def test_mean_rate_is_the_requested_rate(rate: float, source: float) -> None:
+    """The mean rate is the requested one, even if it does not divide the rate of the stream."""
     seconds = 10_000 / source
     assert len(passed(rate, steady(source, seconds))) == pytest.approx(seconds * rate, abs=2)
 
 
 @pytest.mark.parametrize("rate", [2, 5, 10])
-def test_slower_stream_passes_whole(rate: float) -> None:
+def test_slower_stream_passes_completely(rate: float) -> None:
     """A stream slower than the rate passes completely."""
     times = steady(2, 100.0)
     assert passed(rate, times) == times
 
 
 @given(st.lists(st.floats(-0.09, 0.09), min_size=50, max_size=50))
-def test_jitter_costs_one_message(jitter: list[float]) -> None:
-    """A stream at exactly the rate, with a jitter of half a period, loses at most one message."""
+def test_jitter_omits_at_most_one_message(jitter: list[float]) -> None:
+    """Of a stream at exactly the rate, with a jitter of half a period, at most one message is omitted."""
     times = [number / 5 + late for number, late in enumerate(jitter)]
     assert len(passed(5, times)) >= len(times) - 1
 
 
 @given(st.floats(0.1, 200.0), st.lists(st.floats(0.0, 3.0), min_size=1, max_size=200))
-def test_never_more_than_the_rate_and_two(rate: float, steps: list[float]) -> None:
+def test_rate_gate_never_exceeds_its_limit(rate: float, steps: list[float]) -> None:
     """In T seconds at most rate x (T + 2.5 ms) + 2 messages pass, at any arrival times."""
     taken = passed(rate, list(accumulate(steps, initial=1000.0)))
     for first, last in combinations_with_replacement(range(len(taken)), 2):
         assert last - first + 1 <= rate * (taken[last] - taken[first] + 0.0025) * (1 + 1e-6) + 2
 
 
-def test_clock_that_was_set_back_goes_on() -> None:
+def test_stream_passes_after_its_clock_was_set_back() -> None:
     """After a restart with an earlier clock the stream passes at once."""
     gate = RateGate(5)
     times = (10**18, 10**18 + 100_000_000, 5_000_000_000, 5_100_000_000, 5_200_000_000)
     assert [gate.passes(now) for now in times] == [True, False, True, False, True]
 
 
-def test_step_is_the_greatest_that_is_not_above() -> None:
-    """The publisher's rate is the highest one up to the requested rate, or the lowest of all."""
+def test_rate_step_is_the_highest_up_to_max_rate() -> None:
+    """The rate of the publisher is the highest one up to the requested rate, or the lowest of all."""
     assert [rate_step(rate) for rate in RATES] == list(RATES)
-    wishes = {0.1: 1, 1.9: 1, 4.99: 2, 7: 5, 30: 20, 99: 50, 1e6: 100}
-    assert {wish: rate_step(wish) for wish in wishes} == wishes
+    expected = {0.1: 1, 1.9: 1, 4.99: 2, 7: 5, 30: 20, 99: 50, 1e6: 100}
+    assert {max_rate: rate_step(max_rate) for max_rate in expected} == expected
 
 
 @pytest.mark.parametrize("value", [0, -1, -0.0, math.nan, math.inf, "5", True, None])
-def test_invalid_rate_is_refused(value: object) -> None:
-    """A rate that is not a finite number above 0 is an ArgumentError, and a ValueError, that names the option."""
+def test_invalid_max_rate_raises(value: object) -> None:
+    """A rate that is not a finite number above 0 raises ArgumentError, a ValueError, with the name of the argument."""
     with pytest.raises(ArgumentError, match="max_rate") as error:
         check_max_rate(value)
     assert isinstance(error.value, ValueError)

@@ -1,6 +1,6 @@
 """Recovery of lost messages by a reader of mode `every`, with real publishers and sessions on loopback.
 
-Loopback loses nothing, so messages are removed behind Zenoh, before the queue of one reader. The last test restarts a
+Loopback is lossless, so messages are removed between Zenoh and the queue of one reader. The last test restarts a
 real router.
 """
 
@@ -15,7 +15,6 @@ import zenoh
 
 import nedbus
 from nedbus import Counts
-from nedbus.client.io_thread import Job
 from nedbus.client.receiving import Receiver, pending_queue, retransmission
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
@@ -38,7 +37,7 @@ def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> It
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue(f"nedbus/*/{VLP}")
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         lossy = Lossy(session, queue, Receiver(session, queue), publisher)
-        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.ask)
+        monkeypatch.setattr(retransmission, "RetransmitRequest", lossy.request)
         with lossy.subscription:
             wait_for_subscriber(publisher)
             yield lossy
@@ -49,22 +48,24 @@ def fail(*_: object) -> None:
 
 
 @pytest.mark.parametrize("unanswered", [0, 3])
-def test_missing_samples_are_requested_by_the_exact_key(lossy: Lossy, unanswered: int) -> None:
-    """Requests have an exact key, as routers compare wildcards with all caches, and are repeated after a restart."""
+def test_lost_samples_are_requested_by_exact_key(lossy: Lossy, unanswered: int) -> None:
+    """Requests have an exact key, because routers match wildcards with all caches; they are repeated until answered."""
     lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
     lossy.publish(*range(7))
     assert lossy.receive(7) == list(range(7))
-    assert lossy.asked == [(KEY, 1, 5)] * (unanswered + 1)
+    assert lossy.requests == [(KEY, 1, 5)] * (unanswered + 1)
     assert lossy.subscription.counts == Counts(received=7)
 
 
 def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Messages no longer in the publisher's cache are lost, after a second request."""
 
-    def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> RetransmitRequest:
+    def request_available(
+        session: Session, key: str, name: str, numbers: range, *, timeout: float
+    ) -> RetransmitRequest:
         return RetransmitRequest(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
 
-    monkeypatch.setattr(retransmission, "RetransmitRequest", forget)
+    monkeypatch.setattr(retransmission, "RetransmitRequest", request_available)
     lossy.queue.missing = {1, 2, 3, 4}
     lossy.publish(*range(6))
     samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]
@@ -73,7 +74,7 @@ def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pyte
 
 
 def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, zenoh_session: Session, timings: Timings) -> None:
-    """A publisher of another program, with sequence numbers but no cache, gets one request per gap after a timeout."""
+    """A third-party publisher with sequence numbers but no cache gets one request per gap after a timeout."""
     timings.retransmit_timeout = 0.2
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
@@ -83,18 +84,18 @@ def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, zenoh_session:
     for timestamp in range(3):
         foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
     assert lossy.receive(2) == [0, 2]
-    tries = len(lossy.asked)
+    tries = len(lossy.requests)
     assert tries > 1
     for timestamp in (3, 4):
         foreign.put(encode(message(timestamp)), encoding=encoding_of("sim"))
     assert lossy.receive(1) == [4]
-    assert len(lossy.asked) == tries + 1
+    assert len(lossy.requests) == tries + 1
     assert lossy.subscription.counts == Counts(received=3, lost=2)
     foreign.undeclare()
 
 
-def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, timings: Timings) -> None:
-    """A publisher that timed out has lost nothing once it replies again."""
+def test_publisher_that_replies_again_is_retried(lossy: Lossy, timings: Timings) -> None:
+    """Once a publisher that timed out replies again, its losses are recovered."""
     timings.retransmit_timeout = 0.2
     lossy.queue.missing, lossy.unanswered = {1, 3, 5}, 1_000_000
     lossy.publish(0, 1, 2)
@@ -103,16 +104,16 @@ def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, timings:
     lossy.unanswered = 0
     lossy.publish(3, 4)
     assert lossy.receive(2) == [3, 4]
-    lossy.unanswered = len(lossy.asked) + 1
+    lossy.unanswered = len(lossy.requests) + 1
     lossy.publish(5, 6)
     assert lossy.receive(2) == [5, 6]
 
 
 @pytest.mark.parametrize("waits", ["without", "with a timeout"])
 def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: Session, waits: str) -> None:
-    """The newest message is recovered by a heartbeat, also if its reader waits in Zenoh's channel without timeout.
+    """A heartbeat reveals the loss of the newest messages, even to a reader that waits in Zenoh without timeout.
 
-    The sample that wakes it up is invisible to other readers of its session, and does not leave the process.
+    The sample that wakes it is invisible to other readers of its session, and does not leave the process.
     """
     received: list[int] = []
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
@@ -134,7 +135,7 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: S
     lossy.publish(0)
     wait_for(lambda: received == [0], what="the first message")
     lossy.publish(1, 2)
-    wait_for(lambda: received == [0, 1, 2], what="what heartbeats tell of")
+    wait_for(lambda: received == [0, 1, 2], what="the messages announced by heartbeats")
     wait_for(lambda: lossless.waiting == 3, what="the other reader")
     lossy.subscription.close()
     reader.join(DEADLINE)
@@ -147,10 +148,10 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: S
     foreign.undeclare()
 
 
-def test_answers_of_others_are_left_out(lossy: Lossy, zenoh_session: Session) -> None:
-    """Replies of peers other than the publisher are ignored."""
-    lie = reply_with({KEY: encode(message(666))}, encoding=encoding_of("sim"))
-    with answer_queries(zenoh_session, f"{KEY}/@adv/pub/**", lie):
+def test_replies_of_other_peers_are_ignored(lossy: Lossy, zenoh_session: Session) -> None:
+    """Replies to a retransmission request from peers other than the publisher are ignored."""
+    forged = reply_with({KEY: encode(message(666))}, encoding=encoding_of("sim"))
+    with answer_queries(zenoh_session, f"{KEY}/@adv/pub/**", forged):
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
@@ -158,13 +159,13 @@ def test_answers_of_others_are_left_out(lossy: Lossy, zenoh_session: Session) ->
 
 
 @pytest.mark.parametrize("when", ["open", "closed"])
-def test_flood_of_replies_delays_no_other(lossy: Lossy, zenoh_session: Session, when: str) -> None:
-    """A flood of replies to a request does not stop the session, not even after its reader has closed."""
-    asked = threading.Event()
+def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, zenoh_session: Session, when: str) -> None:
+    """A flood of replies to a request does not block the session, not even after its reader has closed."""
+    queried = threading.Event()
 
     def flood(query: zenoh.Query) -> None:
         with query:
-            asked.set()
+            queried.set()
             for _ in range(2000):
                 query.reply(KEY, b"junk")
 
@@ -172,26 +173,26 @@ def test_flood_of_replies_delays_no_other(lossy: Lossy, zenoh_session: Session, 
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         if when == "closed":
-            assert asked.wait(DEADLINE)
+            assert queried.wait(DEADLINE)
             lossy.subscription.close()
         else:
             assert lossy.receive(3) == [0, 1, 2]
         queue = LossyQueue(KEY)
         other = Receiver(lossy.session, queue)
 
-        def goes_on() -> bool:
+        def still_receives() -> bool:
             lossy.publish(7)
             return queue.waiting > 0
 
-        wait_for(goes_on, what="a message for another reader of this session")
+        wait_for(still_receives, what="a message for another reader of this session")
         other.close()
 
 
 @pytest.mark.parametrize(
     "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
 )
-def test_odd_heartbeats_are_none(lossy: Lossy, zenoh_session: Session, entity: str) -> None:
-    """A forged heartbeat causes no request, and prevents no other."""
+def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, entity: str) -> None:
+    """A malformed heartbeat causes no request and prevents no other one."""
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
     lossy.queue.missing = {1}
@@ -199,43 +200,23 @@ def test_odd_heartbeats_are_none(lossy: Lossy, zenoh_session: Session, entity: s
     assert lossy.receive(3) == [0, 1, 2]
     lossy.publish(3)
     assert lossy.receive(1) == [3]
-    assert {key for key, _, _ in lossy.asked} == {KEY}
+    assert {key for key, _, _ in lossy.requests} == {KEY}
     assert not lossy.queue.counters.requesting
 
 
-def test_requests_without_replies_delay_no_others(lossy: Lossy, zenoh_session: Session) -> None:
+def test_unanswered_requests_delay_no_others(lossy: Lossy, zenoh_session: Session) -> None:
     """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"
     with answer_queries(zenoh_session, f"{evil}/**", taken.append):
         for number in range(1, 300):
             zenoh_session.put(f"{evil}/{number:x}/1/_", b"\x05\x00\x00\x00")
-        wait_for(lambda: taken, what="a question for one that is invented")
+        wait_for(lambda: taken, what="a request to an invented publisher")
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
-        assert lossy.queue.counters.requesting  # the others still wait
+        assert lossy.queue.counters.requesting  # the unanswered ones are still open
         taken.clear()
-
-
-def test_job_that_fails_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
-    """An exception in the job of one subscription is logged once, and delays neither it nor others."""
-    calls: list[float] = []
-
-    def fail_at_first(now: float) -> float:
-        calls.append(now)
-        return 0.0 if len(calls) > 2 else 1 / 0
-
-    def go_on(now: float) -> float:
-        others.append(now)
-        return 0.01
-
-    others: list[float] = []
-    jobs = [Job(fail_at_first), Job(go_on)]
-    wait_for(lambda: len(calls) > 5 and len(others) > 5, what="both")
-    for job in jobs:
-        job.end()
-    assert sum("unexpected error" in text for text in caplog.messages) == 1
 
 
 def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,21 +230,21 @@ def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monke
         publish(publisher, 0, 1, 2)
     assert sorted(lossy.receive(180)) == [0] * 60 + [1] * 60 + [2] * 60
     assert lossy.subscription.counts == Counts(received=180)
-    assert 1 < lossy.most <= 4
+    assert 1 < lossy.max_open <= 4
 
 
-def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
-    """A close counts the missing messages as lost."""
+def test_close_counts_open_gaps_as_lost(lossy: Lossy) -> None:
+    """Closing a subscription counts its open gaps as lost."""
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
     lossy.publish(*range(4))
     assert lossy.receive(1) == [0]
-    wait_for(lambda: lossy.queue.counters.requesting, what="the hole")
+    wait_for(lambda: lossy.queue.counters.requesting, what="the gap")
     lossy.subscription.close()
     assert lossy.subscription.counts.lost == 2
 
 
 def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of held back samples is bounded; beyond it gaps are lost, and the samples arrive."""
+    """Samples held back behind gaps are bounded; beyond that gaps count as lost, and the samples arrive."""
     monkeypatch.setattr(pending_queue, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
@@ -271,24 +252,24 @@ def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytes
     assert lossy.subscription.counts == Counts(received=59, lost=1)
 
 
-def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recovered messages do not displace those that a slow reader has not read yet."""
+def test_slow_reader_requests_after_reading(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow reader requests lost messages only after reading: recovered messages would displace unread ones."""
     monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
     wait_for(
         lambda: (lossy.queue.waiting, lossy.queue.counters.held) == (10, 9),
-        what="what comes before the hole and after it",
+        what="the messages before and after the gap",
     )
-    asked_before = list(lossy.asked)
+    requests_before = list(lossy.requests)
     assert lossy.receive(20) == list(range(20))
-    assert (asked_before, lossy.asked) == ([], [(KEY, 10, 11)])
+    assert (requests_before, lossy.requests) == ([], [(KEY, 10, 11)])
 
 
-def test_unexpected_error_costs_what_caused_it(
+def test_unexpected_error_loses_only_the_recovered_message(
     lossy: Lossy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An exception caused by a recovered message is logged, the message is lost, and the reader goes on."""
+    """An exception caused by a recovered message is logged, the message counts as lost, and the reader continues."""
     take = lossy.queue.on_retransmission
     monkeypatch.setattr(
         lossy.queue,
@@ -303,8 +284,8 @@ def test_unexpected_error_costs_what_caused_it(
 
 
 @pytest.mark.parametrize("rest", [0, 1])
-def test_newest_messages_survive_a_restart_of_the_router(rest: int) -> None:
-    """A reader that was disconnected gets the newest messages, whether another one follows or not."""
+def test_newest_messages_are_recovered_after_a_router_restart(rest: int) -> None:
+    """After a router restart a reader recovers the newest messages, whether another one follows or not."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     received: list[int] = []
@@ -318,9 +299,9 @@ def test_newest_messages_survive_a_restart_of_the_router(rest: int) -> None:
         router.close()
         publish(publisher, *range(1, 50))
         with closing(open_router(listen=(endpoint,))):
-            wait_for(lambda: vehicle.connected and reader.connected, what="both to be back")
+            wait_for(lambda: vehicle.connected and reader.connected, what="both to reconnect")
             publish(publisher, *range(50, 50 + rest))
-            wait_for(lambda: len(received) == 50 + rest, what="what was published meanwhile")
+            wait_for(lambda: len(received) == 50 + rest, what="the messages published during the outage")
             subscription.close()
             thread.join(DEADLINE)
     assert received == list(range(50 + rest))

@@ -24,7 +24,7 @@ from tests.peers.command_line import run_command
 from tests.peers.processes import Start
 from tests.waits import DEADLINE
 
-REJECTED: Final = {  # a bool that PX4 did not set
+REJECTED: Final = {  # bool fields that PX4 left uninitialized
     ("cuav_1.16_gps_interference", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 194)"): 31,
     ("nxp_v0_ekf_failure", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 94)"): 39,
 }
@@ -38,13 +38,13 @@ STREAMS: Final = {  # addresses, messages
     "sitl_1.13_three_topics": (96, 21229),
     "sitl_1.15_events": (69, 29480),
 }
-CONVERTED: Final = {  # of older layouts, by PX4's source
+CONVERTED: Final = {  # fields of older layouts, converted as PX4's source code does
     "lat": ("latitude_deg", 1e7),
     "lon": ("longitude_deg", 1e7),
     "alt": ("altitude_msl_m", 1e3),
     "alt_ellipsoid": ("altitude_ellipsoid_m", 1e3),
 }
-DROPPED: Final = {  # fields of older layouts that PX4 took out again, and the model does not have
+DROPPED: Final = {  # fields of older layouts that PX4 removed; the model does not have them
     "battery_status": {"run_time_to_empty", "average_current_a"},
     "vehicle_land_detected": {"alt_max"},
     "vehicle_status": {"rc_input_mode"},
@@ -59,19 +59,19 @@ UTC: Final = {  # source of UTC, and the date of the boot
     "cubeorange_1.12_small": ("vehicle_gps_position", "2021-04-21T06:30:38"),
     "nxp_v0_ekf_failure": ("sensor_gps/0", "2025-02-10T13:55:42"),
     "sitl_1.13_three_topics": ("sensor_gps/0", "2022-04-29T08:45:26"),
-    "sitl_1.15_events": ("timestamp", "1970-01-01T00:00:00"),  # which is Unix time already
+    "sitl_1.15_events": ("timestamp", "1970-01-01T00:00:00"),  # Unix time already
 }
 
 pytestmark = [
     pytest.mark.logs,
-    pytest.mark.usefixtures("patient_lookups"),
-    pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there"),
+    pytest.mark.usefixtures("long_lookup_timeout"),
+    pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} does not exist"),
 ]
 each_flight = pytest.mark.parametrize("flight", FLIGHTS, ids=lambda path: path.stem)
 
 
 def raw_streams(flight: Path) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
-    """Return the streams read by pyulog, by their names in nedbus."""
+    """Return the streams read by pyulog, by nedbus stream name."""
     log = ULog(str(flight))
     found: dict[str, Mapping[str, npt.NDArray[Any]]] = {}
     for data in log.data_list:
@@ -99,7 +99,7 @@ def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArra
                 assert fields or name in DROPPED[topic], (stream, column)
         for field in fields:
             ours = array[field]
-            if ours.dtype.kind == "S":  # pyulog reads a text as its characters
+            if ours.dtype.kind == "S":  # pyulog returns a string as an array of characters
                 ours = np.ascontiguousarray(ours).view(np.uint8).reshape(len(array), -1)
             ours = ours[:, int(index[:-1])] if index else ours
             assert ours.tobytes() == expected.astype(ours.dtype).tobytes(), (stream, column)
@@ -112,10 +112,10 @@ TEXTS = "log_message"
 
 
 @each_flight
-def test_every_message_of_a_log_is_its_value(flight: Path) -> None:
-    """Every topic of every log is read, bit for bit; the parts left out are known, with their reason."""
+def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
+    """`nedbus.read` returns all topics of a log bit for bit, except the messages known to be invalid."""
     raw, arrays = raw_streams(flight), nedbus.read(flight, ["*"])
-    arrays.pop(TEXTS)  # made of the texts and events
+    arrays.pop(TEXTS)  # derived from texts and events
     assert arrays.keys() == raw.keys()
     left_out = {topic: count for (log, topic, _), count in REJECTED.items() if log == flight.stem}
     compared = 0
@@ -128,8 +128,8 @@ def test_every_message_of_a_log_is_its_value(flight: Path) -> None:
 
 @pytest.mark.slow
 @each_flight
-def test_every_message_of_a_replay_is_its_value(flight: Path) -> None:
-    """A replay delivers every topic of a log, equal to the arrays; nothing else is rejected."""
+def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
+    """A replay delivers all messages that the arrays have, and rejects the known invalid ones."""
     run = open_replay(f"ulog:{flight}?topics=*")
     arrays = nedbus.read(flight, ["*"])
     messages: dict[str, list[Any]] = {}
@@ -154,10 +154,8 @@ def test_every_message_of_a_replay_is_its_value(flight: Path) -> None:
 
 @pytest.mark.slow
 @each_flight
-def test_every_message_of_a_log_reaches_another_process(
-    flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
-) -> None:
-    """All topics of a log arrive at a reader through daemon and router, equal to the arrays and complete."""
+def test_replayed_log_reaches_another_process(flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A reader receives all topics of a log through daemon and router, complete and equal to the arrays."""
     arrays = {stream: array for stream, array in nedbus.read(flight, ["*"]).items() if len(array)}
     rejected = sum(count for (log, _, _), count in REJECTED.items() if log == flight.stem)
     messages: dict[str, list[Any]] = {}
@@ -177,8 +175,8 @@ def test_every_message_of_a_log_reaches_another_process(
 
 @pytest.mark.slow
 @each_flight
-def test_log_is_the_same_after_conversion(flight: Path, tmp_path: Path) -> None:
-    """A recording has every message and all missing fields of a log, also of topics described by the log alone."""
+def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None:
+    """A converted recording has every message and all missing fields of all topics in a log."""
     path = tmp_path / "flight.mcap"
     convert_replay(f"ulog:{flight}?topics=*", path)
     before, after = nedbus.read(flight, ["*"]), nedbus.read(path, ["*"])
@@ -194,17 +192,17 @@ def test_log_is_the_same_after_conversion(flight: Path, tmp_path: Path) -> None:
 
 
 @each_flight
-def test_utc_is_what_a_log_tells(flight: Path) -> None:
-    """UTC comes from a GNSS receiver, a companion's clock or the log's information; without these it is absent."""
+def test_utc_is_found_in_a_log(flight: Path) -> None:
+    """UTC comes from GNSS, a companion computer's clock or the log's information messages; otherwise it is None."""
     found = nedbus.utc_of(flight)
-    told = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")
-    assert told == UTC.get(flight.stem)
+    source_and_time = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")
+    assert source_and_time == UTC.get(flight.stem)
     assert found is None or found.spread_us < 1_000_000
 
 
 @each_flight
-def test_log_is_one_table(flight: Path) -> None:
-    """All topics of a log in one table have their latest value at the times of one of them."""
+def test_aligned_table_has_all_topics(flight: Path) -> None:
+    """Each row of an aligned table has the latest values of all topics at the time of a position."""
     raw = raw_streams(flight)
     table = nedbus.align(flight, topics=["*"], utc=True)
     assert len(table) == len(raw["vehicle_local_position"]["timestamp"])
@@ -228,15 +226,15 @@ def test_log_is_one_table(flight: Path) -> None:
     assert compared > len(raw)
 
 
-def test_plot_of_another_topic_says_why_not(tmp_path: Path) -> None:
-    """Only positions have a track; the error names the way to plot other topics."""
+def test_plot_of_topic_without_track_fails(tmp_path: Path) -> None:
+    """Only positions have a track; for other topics `nedbus plot` fails with a reason."""
     plot = run_command("plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png"))
     assert plot.exit_code == 2
     assert "vehicle_attitude has no track" in plot.err
 
 
 @pytest.mark.slow
-def test_plot_of_all_topics_has_the_positions(tmp_path: Path) -> None:
-    """Of all topics of a log, `nedbus plot` draws those that have a track."""
+def test_plot_of_all_topics_draws_positions(tmp_path: Path) -> None:
+    """With `-t "*"`, `nedbus plot` draws the topics that have a track."""
     drawn = run_command("plot", str(LOGS.parent / "px4" / "twelve_messages.ulg"), "-t", "*", "-o", f"{tmp_path}/a.png")
     assert drawn.exit_code == 0, drawn.err

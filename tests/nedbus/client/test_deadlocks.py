@@ -1,4 +1,4 @@
-"""A process whose publishers come and go, while others query and subscribe, never stops."""
+"""Deadlocks between Python and Zenoh while a process opens and closes publishers, queries and subscribes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tests.peers.processes import Start
 
 
 @pytest.mark.slow
-def test_process_never_stands_still_while_publishers_come_and_go(start: Start) -> None:
-    """No Python code runs on Zenoh's threads, and none holds the interpreter's lock while waiting for Zenoh.
+def test_opening_and_closing_publishers_causes_no_deadlock(start: Start) -> None:
+    """No Python code runs on Zenoh's threads, and none holds the GIL while waiting for Zenoh.
 
     A deadlock lasts 10 s or forever; the limit of 5 s tolerates a busy machine.
     """

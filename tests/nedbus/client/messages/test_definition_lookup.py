@@ -1,4 +1,4 @@
-"""Messages without a file in nedbus: from a log through a service to readers that query their definition."""
+"""Messages that nedbus does not define, read with the definition queried from their publisher."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ COUNT = 500
 
 @pytest.mark.process
 @pytest.mark.parametrize("form", ["models", "rows", "batches"])
-def test_message_of_a_log_is_read_without_a_file(
+def test_message_with_queried_definition_is_read_completely(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
-    """No message is lost during the lookup, in any form; the values are those of the log."""
+    """No message is lost during the lookup of its definition, in any form; the values are those of the log."""
     log = write_wheels(tmp_path / "rover.ulg", COUNT)
     with bus.subscribe("wheel_encoders", mode="every") as subscription:
         run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
@@ -66,12 +66,12 @@ def test_message_of_a_log_is_read_without_a_file(
         {"fields": []},
     ],
 )
-def test_hostile_description_harms_no_other_stream(
+def test_hostile_definition_affects_no_other_stream(
     client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session, answer: bytes | dict[str, Any]
 ) -> None:
-    """If a peer sends a wrong description, its own message is invalid, and others are read."""
+    """If a peer replies with an invalid definition, only its own message is invalid."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
-    with suppress(ValueError):  # most hashes are right, so that the description itself is rejected
+    with suppress(ValueError):  # the right hash, if the definition has one: it is rejected for another reason
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/peer/Evil"
@@ -91,11 +91,11 @@ def test_hostile_description_harms_no_other_stream(
                 subscription.receive(0.1)
             return subscription.counts.invalid == 1
 
-        wait_for(is_rejected, what="the other one, of another priority")
+        wait_for(is_rejected, what="the invalid message, which has another priority")
 
 
 def read_once(endpoint: str, topic: str, form: str) -> int:
-    """Connect, read the last message in a form, close, and return its timestamp."""
+    """Connect, read the last message in the given form, close, and return its timestamp."""
     with nedbus.connect(endpoint) as reader:
         if form == "latest":
             return int(reader.latest(topic)[0].message.timestamp)
@@ -105,8 +105,8 @@ def read_once(endpoint: str, topic: str, form: str) -> int:
             return int(subscription.receive_batch(DEADLINE).messages["timestamp"][0])
 
 
-def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
-    """Of readers that connect, read a message without a file and close, no definition remains, in any form."""
+def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
+    """Closing a bus frees the definitions that it looked up, for all forms of reading."""
     definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
     publisher = bus.publisher("comes_and_goes", vehicle="1", definition=definition)
     publisher.publish({"timestamp": 1})
@@ -117,13 +117,13 @@ def test_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> Non
         found = [each for each in gc.get_objects() if isinstance(each, Definition) and each.name == definition.name]
         return len(found) == 1
 
-    wait_for(is_freed, what="the definitions of closed readers")
+    wait_for(is_freed, what="the definitions of closed readers to be freed")
 
 
-def test_message_of_unknown_encoding_says_so(
+def test_encoding_without_name_and_hash_is_invalid(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Without name and hash in its encoding a message cannot be looked up, and the error says so."""
+    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log has the reason."""
     with client.subscribe("wheel_encoders") as subscription:
         wait_for_matching(zenoh_session, "nedbus/7/wheel_encoders")
         zenoh_session.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
@@ -133,5 +133,5 @@ def test_message_of_unknown_encoding_says_so(
                 subscription.receive(0.05)
             return subscription.counts.invalid == 1
 
-        wait_for(is_counted, what="it to be counted")
-    assert "the encoding 'text/plain' has no name and hash of a message" in caplog.text
+        wait_for(is_counted, what="the count of the invalid message")
+    assert "the encoding 'text/plain' has no message name and hash" in caplog.text

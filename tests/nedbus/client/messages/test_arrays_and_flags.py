@@ -1,4 +1,4 @@
-"""Messages other than the position, through a real router: one with arrays, and one of flags with instances."""
+"""Messages other than positions, through a real router: one with arrays, and one with flags and instances."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, d
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.local_position import encode
 from tests.flights.messages import VLP, message
-from tests.nedbus.client.downsampling import MS, Clock, clock, wait_for_demand
+from tests.nedbus.client.downsampling import MS, Clock, clock, wait_for_downsampling_reader
 from tests.nedbus.client.lossy import LossyQueue
-from tests.nedbus.client.numbered import take, wait_for_subscriber
+from tests.nedbus.client.numbered import receive_timestamps, wait_for_subscriber
 from tests.peers.command_line import run_command
 from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_matching
@@ -41,7 +41,7 @@ def definition_of(address: Address) -> Definition[Any]:
 
 
 def make(address: Address, number: int) -> Message:
-    """Return a message with this timestamp and values derived from it; some fields are not provided."""
+    """Return a message with values derived from its timestamp; some fields are not provided."""
     half = number / 20
     fields: dict[str, object] = {
         "q": (math.cos(half), 0.0, 0.0, math.sin(half)),
@@ -63,22 +63,22 @@ def publisher_of(bus: nedbus.Bus, address: Address, **options: Any) -> nedbus.Pu
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to everything; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
+    """Subscribe to all topics. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
 
 @BOTH
-def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, address: Address) -> None:
-    """With either client a message arrives as its model, bit for bit, with its missing fields; latest has the last."""
+def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, address: Address) -> None:
+    """Both clients return a message as its model, bit for bit and with its missing fields; so does `latest`."""
     publisher, sent = publisher_of(bus, address, source="ins"), make(address, 5)
     publisher.publish(make(address, 4))
     subscription = client.subscribe(address.topic, mode="every")
-    assert take(subscription, 1) == [4]
+    assert receive_timestamps(subscription, 1) == [4]
     wait_for_subscriber(publisher)
     publisher.publish(sent)
     sample = subscription.receive(DEADLINE)
-    wait_for(lambda: client.latest(address.topic)[0].message == sent, what="the last one")
+    wait_for(lambda: client.latest(address.topic)[0].message == sent, what="the last message")
     for each in (sample, *client.latest(address.topic), *client.latest("*", vehicle="7")):
         assert type(each.message) is definition_of(address).model
         assert encode(each.message) == encode(sent)
@@ -88,8 +88,8 @@ def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, address:
 
 
 @BOTH
-def test_invalid_message_names_its_field(bus: nedbus.Bus, address: Address) -> None:
-    """A wrong length, type or message is an error, and nothing is published."""
+def test_publishing_an_invalid_message_raises(bus: nedbus.Bus, address: Address) -> None:
+    """An invalid field raises an error that names it, another message raises TypeError; nothing is published."""
     publisher = publisher_of(bus, address)
     wrong = {"q": (1.0, 0.0, 0.0)} if address == ATTITUDE else {"cs_in_air": 1}
     with pytest.raises(nedbus.InvalidMessageError, match=next(iter(wrong))):
@@ -100,10 +100,10 @@ def test_invalid_message_names_its_field(bus: nedbus.Bus, address: Address) -> N
 
 
 @BOTH
-def test_rows_and_batches_hold_everything(
+def test_rows_and_batches_are_complete(
     subscription: nedbus.Subscription[Any], bus: nedbus.Bus, address: Address
 ) -> None:
-    """Messages sent as rows and as an array are read as rows and as arrays: the same bytes, in order, complete."""
+    """Messages published as rows and as an array are read as rows and batches, bit for bit, in order and complete."""
     publisher, sent = publisher_of(bus, address, lossless=True), array_of(address, range(1, 301))
     wait_for_subscriber(publisher)
     for number in range(1, 301):
@@ -121,8 +121,8 @@ def test_rows_and_batches_hold_everything(
     assert subscription.counts == Counts(received=2 * len(sent))
 
 
-def test_a_batch_is_of_one_message(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
-    """Messages of mixed types are read as arrays of one dtype each, with all addresses of that type."""
+def test_batch_has_one_message_type(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
+    """Messages of mixed types are read in batches of one type each, with all addresses of that type."""
     addresses = [ATTITUDE, FLAGS, Address("7", VLP), Address("8", "vehicle_attitude")]
     publishers = {address: publisher_of(bus, address) for address in addresses}
     for publisher in publishers.values():
@@ -142,13 +142,13 @@ def test_a_batch_is_of_one_message(subscription: nedbus.Subscription[Any], bus: 
 
 
 @BOTH
-def test_max_rate_downsamples_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
-    """Of 1 s at 100 Hz, ten messages arrive, evenly spaced and unchanged."""
+def test_max_rate_downsamples(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
+    """Of 1 s at 100 Hz, `max_rate=10` delivers ten messages, evenly spaced and unchanged."""
     publisher = publisher_of(bus, address)
     publisher.publish(make(address, 0))
     subscription = client.subscribe(address.topic, mode="every", max_rate=10)
-    assert take(subscription, 1) == [0]
-    wait_for_demand(publisher)
+    assert receive_timestamps(subscription, 1) == [0]
+    wait_for_downsampling_reader(publisher)
     for number in range(1, 101):
         clock.now += 10 * MS
         publisher.publish(make(address, number))
@@ -158,8 +158,8 @@ def test_max_rate_downsamples_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clo
 
 
 @BOTH
-def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: Address) -> None:
-    """A reader of mode `every` gets missing messages from the publisher's history cache, in order."""
+def test_lost_messages_are_recovered(endpoint: str, bus: nedbus.Bus, address: Address) -> None:
+    """A reader of mode `every` gets lost messages from the publisher's history cache, in order."""
     publisher, queue = publisher_of(bus, address), LossyQueue(address.key())
     queue.missing = {1, 2, 3, 6}
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
@@ -173,8 +173,8 @@ def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: A
             assert subscription.counts == Counts(received=10)
 
 
-def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
-    """Commands show arrays as numbers of nine digits, columns of CSV, and lists of JSON with NaN as text."""
+def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
+    """Commands print arrays as numbers with nine digits, as CSV columns, and as JSON lists with NaN as a string."""
     with publisher_of(bus, ATTITUDE) as publisher:
         publisher.publish(make(ATTITUDE, 2))
         wait_for(lambda: bus.latest(ATTITUDE.topic), what="the message")
@@ -193,8 +193,8 @@ def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
         assert json.loads(run_command("schema", ATTITUDE.topic).out)["title"] == "VehicleAttitude"
 
 
-def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: nedbus.Bus) -> None:
-    """Any published message can be described, whatever defines it; an unknown name is an error with the known ones."""
+def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bus: nedbus.Bus) -> None:
+    """`nedbus schema` queries publishers for a topic that nedbus does not define; other names are usage errors."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )
@@ -210,8 +210,8 @@ def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: 
         assert "and no such topic is published: known messages are VehicleLocalPosition, " in ended.err
 
 
-def test_script_publishes_a_message_of_its_own(client: nedbus.Bus, endpoint: str) -> None:
-    """A .msg text defines it, with its ranges; any reader learns it from its publisher. Without one it is refused."""
+def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
+    """A .msg text defines a message and its ranges, and readers query it; an unknown topic without one raises."""
     text = "uint64 timestamp\nfloat32 range # [m] [@range 0, 100]\nuint8 beacon\n"
     definition = nedbus.define_msg("RangeBeacon", text)
     with nedbus.connect(endpoint) as reader, reader.subscribe("range_beacon", vehicle="mine") as subscription:
@@ -225,7 +225,7 @@ def test_script_publishes_a_message_of_its_own(client: nedbus.Bus, endpoint: str
 
 
 @pytest.mark.parametrize("topic", [None, "vehicle_attitude_groundtruth"])
-def test_subscription_by_class(client: nedbus.Bus, bus: nedbus.Bus, topic: str | None) -> None:
+def test_class_selects_its_topic(client: nedbus.Bus, bus: nedbus.Bus, topic: str | None) -> None:
     """A class selects its first topic, or another one of its topics by name, for `subscribe` and `latest`."""
     chosen, options = topic or ATTITUDE.topic, dict[str, Any](topic=topic) if topic else {}
     for number, each in enumerate(["vehicle_attitude", "vehicle_attitude_groundtruth", "estimator_attitude"]):
@@ -238,7 +238,7 @@ def test_subscription_by_class(client: nedbus.Bus, bus: nedbus.Bus, topic: str |
 
 
 def test_class_without_the_topic_raises(client: nedbus.Bus) -> None:
-    """A topic of another message, or a class without topics, raises an error that says what to do."""
+    """A topic of another message, or a class without topics, raises an error with the valid choices."""
     undeclared = nedbus.define_msg("RangeBeacon", "uint64 timestamp\n").model
     for call in (client.subscribe, client.latest):
         with pytest.raises(nedbus.AddressError, match="expected one of VehicleAttitude: vehicle_attitude, "):
@@ -248,7 +248,7 @@ def test_class_without_the_topic_raises(client: nedbus.Bus) -> None:
                 call(without)
 
 
-OWN_CLASS = """
+CUSTOM_CLASS = """
 import signal, sys, nedbus
 from nedbus_msgs.model.px4_types import Float32x2, field
 
@@ -269,22 +269,22 @@ with nedbus.connect(sys.argv[1]) as bus, bus.publisher("wheel_speeds", vehicle=1
 
 
 @pytest.mark.process
-def test_class_of_a_script_is_subscribed_to(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """A script's own class is read as that class, and by others, without the class, with the same fields."""
-    process = start("-c", OWN_CLASS, endpoint)
+def test_custom_class_is_received(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A custom message class is received as that class, and with the same fields by readers without the class."""
+    process = start("-c", CUSTOM_CLASS, endpoint)
     wait_for(lambda: process.out.count("\n") == 2 or process.err, what="the script")
     assert process.out == 2 * "WheelSpeeds(timestamp=1, speed=(2.0, 3.0))\n", process.err
     assert dict(bus.subscribe("wheel_speeds").receive(DEADLINE).message) == {"timestamp": 1, "speed": (2.0, 3.0)}
 
 
-def test_line_says_what_was_lost_before_what_has_no_room() -> None:
+def test_echo_line_has_losses_before_fields() -> None:
     """A terminal cuts long lines at the end, so the status of a sample comes before its fields."""
     sample = nedbus.Sample(make(FLAGS, 2), FLAGS, received=1, lost=3)
     assert to_line(sample).split(" s  ")[1] == "[3 lost]  control_status_changes 4294967293  cs_in_air  fs_bad_hdg"
 
 
-def test_size_is_that_of_its_own_codec(bus: nedbus.Bus) -> None:
-    """A payload of another message under the key is invalid, and counted."""
+def test_payload_of_another_message_is_invalid(bus: nedbus.Bus) -> None:
+    """A payload of another message on the key counts as invalid."""
     with bus.subscribe(ATTITUDE.topic, mode="every") as subscription:
         session = bus._session
         session.put(ATTITUDE.key(), encode(message(1)))

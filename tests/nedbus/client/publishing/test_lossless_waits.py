@@ -1,4 +1,4 @@
-"""Lossless publishers of asyncio whose reader never reads: their waits end when cancelled, and delay nothing else."""
+"""Lossless publishers wait for their readers; the waits can be cancelled, and delay nothing else."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.transport import Session
+from nedbus.client.publishing.flow_control import CACHE, WINDOW
+from nedbus.transport import Session, open_router
 from tests.flights.messages import VLP
-from tests.nedbus.client.numbered import numbered, take
+from tests.nedbus.client.numbered import numbered, publish, receive_timestamps, wait_for_subscriber
+from tests.peers.ports import free_endpoint
 from tests.peers.processes import Start
 from tests.peers.queryables import answer_queries
 from tests.waits import DEADLINE, wait_for, wait_for_router
 
-COUNT = 5000  # messages, more than are sent without a reader that reads
+COUNT = 5000  # messages, more than a publisher sends to a stuck reader
 
 SCRIPT = """
 import asyncio
@@ -37,8 +39,8 @@ asyncio.run(main())
 """
 
 
-async def until_waiting(publisher: nedbus.AsyncPublisher) -> None:
-    """Return once a publisher has sent something and waits for its reader, if another has taken most of the window."""
+async def wait_for_minimum_share(publisher: nedbus.AsyncPublisher) -> None:
+    """Wait until a publisher has published at least its minimum share of the window."""
     async with asyncio.timeout(DEADLINE):
         while publisher.published < 100:
             await asyncio.sleep(0.01)
@@ -46,18 +48,18 @@ async def until_waiting(publisher: nedbus.AsyncPublisher) -> None:
 
 @pytest.fixture
 def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe without reading."""
+    """Return a subscription whose messages stay unread unless the test reads them."""
     with bus.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
 
 @asynccontextmanager
 async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator[list[nedbus.AsyncPublisher]]:
-    """Let publishers wait for a reader, and cancel their waits."""
+    """Yield publishers that wait for a reader; finally cancel the waits."""
     publishers = [await bus.publisher(VLP, vehicle=each, lossless=True) for each in range(number)]
     waiting = [asyncio.create_task(each.publish_many(numbered(COUNT))) for each in publishers]
     for publisher in publishers:
-        await until_waiting(publisher)
+        await wait_for_minimum_share(publisher)
     yield publishers
     for task in waiting:
         task.cancel()
@@ -70,7 +72,7 @@ async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator
 def test_waiting_publishers_delay_no_query(endpoint: str) -> None:
     """`latest` and a subscription work while 40 publishers wait for a reader, more than there are threads for queries.
 
-    Once the waits are cancelled, no thread of theirs waits any more, and an error in the block closes without waiting.
+    Cancelling the waits frees their threads, and an error in the block closes the bus without waiting.
     """
 
     async def scenario() -> None:
@@ -88,7 +90,7 @@ def test_waiting_publishers_delay_no_query(endpoint: str) -> None:
 def test_cancelled_publish_many_can_be_continued(
     endpoint: str, stuck: nedbus.Subscription[nedbus.VehicleLocalPosition]
 ) -> None:
-    """After a timeout, `published` has the number of messages sent; after the rest, nothing is lost or doubled."""
+    """After a cancelled call, `published` has the number sent; publishing the rest loses and repeats nothing."""
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as bus:
@@ -96,7 +98,7 @@ def test_cancelled_publish_many_can_be_continued(
                 pass
             sent = publisher.published
             assert 100 <= sent < COUNT
-            reading = asyncio.create_task(asyncio.to_thread(take, stuck, COUNT))
+            reading = asyncio.create_task(asyncio.to_thread(receive_timestamps, stuck, COUNT))
             await publisher.publish_many(numbered(COUNT - sent, first=sent + 1))
             assert await reading == list(range(1, COUNT + 1))
             assert publisher.published == COUNT
@@ -107,7 +109,7 @@ def test_cancelled_publish_many_can_be_continued(
 
 def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Session, bus: nedbus.Bus) -> None:
     """A reader that acknowledges nothing delays a close until it is cancelled; then everything is closed."""
-    asked: list[zenoh.Query] = []
+    queries: list[zenoh.Query] = []
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as other:
@@ -115,10 +117,10 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Se
             await first.publish({"timestamp": 1})
             await second.publish({"timestamp": 1})
             for close, vehicles in ((first.close, ["2"]), (other.close, [])):
-                before = len(asked)
+                before = len(queries)
                 closing = asyncio.create_task(close())
                 async with asyncio.timeout(DEADLINE):
-                    while len(asked) == before:
+                    while len(queries) == before:
                         await asyncio.sleep(0.01)
                 assert not closing.done()
                 closing.cancel()
@@ -129,20 +131,18 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Se
             with pytest.raises(nedbus.ClosedError):
                 await second.publish({"timestamp": 2})
 
-    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append):
         asyncio.run(scenario())
     wait_for(
         lambda: not any(each.name.startswith("nedbus-close_") for each in threading.enumerate()),
-        what="the end of its thread",
+        what="the closing thread to end",
     )
 
 
-def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(
-    client: nedbus.Bus, zenoh_session: Session
-) -> None:
-    """A `with` block that ends with an exception, as Ctrl-C does, waits for no reader."""
-    asked: list[zenoh.Query] = []
-    silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append)
+def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus, zenoh_session: Session) -> None:
+    """A `with` block that ends with an exception, such as Ctrl-C, waits for no reader."""
+    queries: list[zenoh.Query] = []
+    silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
         publisher.publish({"timestamp": 1})
         raise RuntimeError("on purpose")
@@ -150,23 +150,23 @@ def test_error_in_the_block_of_a_publisher_closes_it_without_waiting(
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_close_with_a_timeout_gives_up(client: nedbus.Bus, zenoh_session: Session, whole_bus: bool) -> None:
-    """A reader that acknowledges nothing delays a close by its timeout at most, and with 0 not at all."""
-    asked: list[zenoh.Query] = []
-    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", asked.append):
+def test_close_returns_after_its_timeout(client: nedbus.Bus, zenoh_session: Session, whole_bus: bool) -> None:
+    """A reader that acknowledges nothing delays a close by its timeout at most, and not at all with timeout 0."""
+    queries: list[zenoh.Query] = []
+    with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append):
         for vehicle, timeout in (("1", 0.0), ("2", 0.05)):
             publisher = client.publisher(VLP, vehicle=vehicle, lossless=True)
             publisher.publish({"timestamp": 1})
-            before = len(asked)
+            before = len(queries)
             (client if whole_bus and timeout else publisher).close(timeout=timeout)
             assert publisher.closed
-            assert (len(asked) > before) == (timeout > 0)
+            assert (len(queries) > before) == (timeout > 0)
     assert client.closed == whole_bus
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
 def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool) -> None:
-    """Ctrl-C ends the wait of a close for readers, and everything is closed."""
+    """Ctrl-C during a close ends the wait for readers and closes everything."""
 
     def interrupt(*_: object) -> bool:
         raise KeyboardInterrupt
@@ -181,9 +181,76 @@ def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.usefixtures("stuck")
 def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """One Ctrl-C ends a script of which six publishers wait for a reader."""
+    """One Ctrl-C ends a script in which six publishers wait for a reader."""
     process = start("-c", SCRIPT, NEDBUS_CONNECT=endpoint, coverage=False)
     wait_for(lambda: len(bus.latest()) == 6, what=f"the messages: {process.err}")
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
-    wait_for(lambda: not bus.vehicles(), what="the vehicles to go")
+    wait_for(lambda: not bus.vehicles(), what="the vehicles to disappear")
+
+
+@pytest.fixture
+def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
+    """Subscribe to positions. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        yield subscription
+
+
+@pytest.mark.parametrize("whole_bus", [False, True])
+def test_lossless_close_waits_for_readers(
+    subscription: nedbus.Subscription[Any], bus: nedbus.Bus, whole_bus: bool
+) -> None:
+    """A lossless publisher, or its bus, closes only once a paused reader has received all messages."""
+    count = 3 * WINDOW
+    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+    wait_for_subscriber(publisher)
+
+    def send() -> None:
+        publisher.publish_many(numbered(count))
+        (bus if whole_bus else publisher).close()
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    sending.join(0.2)
+    assert sending.is_alive()
+    assert receive_timestamps(subscription, count) == list(range(1, count + 1))
+    sending.join(DEADLINE)
+    assert not sending.is_alive()
+    assert subscription.counts == nedbus.Counts(received=count)
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
+    """A `with` block that ends with an exception closes without a flush; otherwise it flushes, with either client."""
+    flushed: list[nedbus.Publisher] = []
+
+    def flush(publisher: nedbus.Publisher, *_: float) -> bool:
+        flushed.append(publisher)
+        return True
+
+    monkeypatch.setattr(nedbus.Publisher, "flush", flush)
+    client.publisher(VLP, vehicle="1", lossless=True)
+    client.__exit__(*((KeyError, KeyError(), None) if fails else (None, None, None)))  # the end of a `with` block
+    assert bool(flushed) is not fails
+
+
+def test_lossless_publisher_loses_nothing_in_a_router_restart() -> None:
+    """Without a router, a lossless publisher sends no more than its history cache, and continues with its reader."""
+    endpoint, count = free_endpoint(), CACHE + 1000
+    router = open_router(listen=(endpoint,))
+    with nedbus.connect(endpoint) as other, nedbus.connect(endpoint) as bus:
+        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        publish(publisher, 1)
+        subscription = other.subscribe(VLP, mode="every")
+        assert receive_timestamps(subscription, 1) == [1]
+        router.close()
+        wait_for(lambda: not bus.connected and not other.connected, what="the loss of the link")
+        sending = threading.Thread(target=publisher.publish_many, args=[numbered(count - 1, first=2)], daemon=True)
+        sending.start()
+        wait_for(lambda: publisher.published > WINDOW, what="a window of messages")
+        router = open_router(listen=(endpoint,))
+        assert receive_timestamps(subscription, count - 1) == list(range(2, count + 1))
+        sending.join(DEADLINE)
+        assert publisher.flush()
+        assert subscription.counts == nedbus.Counts(received=count)
+    router.close()

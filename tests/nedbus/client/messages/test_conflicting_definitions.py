@@ -1,4 +1,4 @@
-"""Two firmware builds with different messages of one name, in one network: each is read with its own fields."""
+"""Firmware builds that define a message differently, in one network: each is read with its own fields."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from tests.peers.queryables import answer_queries, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 NAME, TOPIC = "WindCell", "wind_cell"
-pytestmark = pytest.mark.usefixtures("patient_lookups")
+pytestmark = pytest.mark.usefixtures("long_lookup_timeout")
 
 FIELDS: Final = {
     "A": ("timestamp", "north", "east"),
-    "B": ("timestamp", "east", "north"),  # the same types: only the hash tells them apart
+    "B": ("timestamp", "east", "north"),  # the same types: only the hash distinguishes them
     "C": ("timestamp", "east", "north", "down"),
 }
 VALUES: Final = {"north": 1.0, "east": 2.0, "down": 3.0}
@@ -94,7 +94,7 @@ class Reader:
 
 
 class Network:
-    """Three firmwares, each with a vehicle of its name, three readers, and vehicle 1, which changes its firmware."""
+    """Three readers, and four vehicles: one for each firmware build, and vehicle 1, which changes its firmware."""
 
     def __init__(self, endpoint: str) -> None:
         self.endpoint = endpoint
@@ -102,7 +102,7 @@ class Network:
         self.buses: dict[str, nedbus.Bus] = {}
         self.publishers: dict[str, tuple[str, nedbus.Publisher]] = {}
         self.last: dict[str, Sent] = {}  # of each publisher
-        self.slowest = 0.0  # s from the first arrival of a message until all have read it
+        self.slowest = 0.0  # s, the longest time until all readers have read a message
         self.readers = {form: Reader(endpoint, form) for form in FORMS}
         for firmware in FIELDS:
             self.restart(firmware)
@@ -150,8 +150,8 @@ STEPS: Final = st.lists(
 
 
 @pytest.mark.router
-def test_no_name_is_wrong_after_restarts(router: str) -> None:
-    """A vehicle that restarts with another firmware before new readers look it up is read with the right fields."""
+def test_restart_with_other_firmware_changes_fields(router: str) -> None:
+    """After a vehicle restarts with another firmware, a new reader reads it with its new fields."""
     before = [(Network.publish, "C"), (Network.restart_reader, "rows")]
     run(router, [*before, (Network.restart, "C"), *before])
 
@@ -159,13 +159,13 @@ def test_no_name_is_wrong_after_restarts(router: str) -> None:
 @pytest.mark.router
 @pytest.mark.slow
 @hypothesis.given(steps=STEPS)
-def test_no_name_is_wrong_after_restarts_in_any_order(router: str, steps: Steps) -> None:
-    """Firmwares and readers that restart in any order: each message is read once, with the fields of its sender."""
+def test_restarts_in_any_order_do_not_mix_up_fields(router: str, steps: Steps) -> None:
+    """While vehicles and readers restart in any order, each message is read once, with the fields of its sender."""
     hypothesis.target(run(router, steps), label="seconds until a message is read")
 
 
 def run(router: str, steps: Steps) -> float:
-    """Take these steps, check what was read, and return the longest time from the arrival of a message to its read."""
+    """Run the steps, check what was read, and return the longest time until all readers had read a message [s]."""
     with closing(Network(router)) as network:
         for step, which in [*steps, *((Network.publish, firmware) for firmware in FIELDS)]:
             step(network, which)
@@ -174,14 +174,14 @@ def run(router: str, steps: Steps) -> float:
                 assert fields.keys() == (set(FIELDS[vehicle]) if vehicle in FIELDS else fields.keys())
                 assert all(fields[name] == VALUES[name] for name in fields if name != "timestamp")
             counts = reader.subscription.counts
-            # A message under way during the query for the last ones arrives twice, and is discarded once.
+            # A message in transit during the query for last messages arrives twice, and is discarded once.
             assert counts == Counts(received=len(reader.read), discarded=counts.discarded)
             assert len({fields["timestamp"] for _, fields in reader.read}) == len(reader.read)
         return network.slowest
 
 
-def test_definition_is_kept_while_its_vehicle_changes(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """One address that changes its firmware back and forth: samples wait unread, and each has its own fields."""
+def test_unread_samples_keep_their_definition(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """Unread samples of a vehicle that changed its firmware are each decoded with their own fields."""
     with client.subscribe(TOPIC, mode="every") as subscription:
         sent = []
         for number, firmware in enumerate("ABCBA"):
@@ -197,8 +197,8 @@ def test_definition_is_kept_while_its_vehicle_changes(client: nedbus.Bus, bus: n
     assert [as_dict(sample.message) for sample in client.latest(TOPIC)] == [fields_of("B", 9)]
 
 
-def test_encoding_names_the_definition(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """The hash is in the encoding of messages without a file; a query for it is answered with that definition."""
+def test_encoding_has_the_hash_of_the_definition(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """The encoding has the hash of a definition that nedbus does not include; readers query it by that hash."""
     for firmware in "AB":
         publisher_of(bus, firmware).publish(fields_of(firmware, 1))
     short = {firmware: short_hash(NAME, definition_of(firmware).types) for firmware in "AB"}
@@ -213,8 +213,8 @@ def test_encoding_names_the_definition(bus: nedbus.Bus, zenoh_session: Session) 
         assert {each["hash"] for each in found} == {short[firmware] for firmware in expected}
 
 
-def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """A peer that describes a message with other fields, whatever hash it claims, leaves it undecoded."""
+def test_definition_with_wrong_hash_is_ignored(client: nedbus.Bus, zenoh_session: Session) -> None:
+    """A definition whose fields do not match the requested hash is not used, whatever hash the peer claims."""
     wrong, definition = definition_of("B"), definition_of("A")
     schema = f"nedbus/@schema/peer/{NAME}"
     layout = {"wire": 0, "fields": [{"name": name, "type": str(kind)} for name, kind in wrong.types.items()]}
@@ -235,8 +235,8 @@ def test_definition_of_another_hash_is_not_used(client: nedbus.Bus, zenoh_sessio
         wait_for(is_rejected, what="the message to be rejected")
 
 
-def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A message is read once one publisher has described it, while another one, which is stopped, does not answer."""
+def test_unresponsive_publisher_delays_no_reader(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """A message is read once one publisher has sent its definition, even if another one does not reply."""
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))
     with (
@@ -249,8 +249,8 @@ def test_publisher_without_an_answer_delays_no_reader(endpoint: str, bus: nedbus
         held.clear()
 
 
-def test_payload_of_another_size_is_invalid(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A payload that does not fit the definition that its encoding names is invalid."""
+def test_payload_that_contradicts_its_encoding_is_invalid(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """A payload that does not fit the definition in its encoding is invalid."""
     publisher_of(bus, "A")
     with bus.subscribe(TOPIC, mode="every") as subscription:
         key, encoding = f"nedbus/1/{TOPIC}", encoding_of(definition_of("A"), None)
@@ -262,8 +262,8 @@ def test_payload_of_another_size_is_invalid(bus: nedbus.Bus, zenoh_session: Sess
 
 
 @pytest.mark.parametrize("distinct", [True, False])
-def test_recording_has_a_schema_for_each(bus: nedbus.Bus, tmp_path: Path, distinct: bool) -> None:
-    """Each firmware is recorded with its own schema, and read back with the right fields; also under one address."""
+def test_recording_has_a_schema_per_firmware(bus: nedbus.Bus, tmp_path: Path, distinct: bool) -> None:
+    """Each firmware is recorded with its own schema and read back with its fields, even on one address."""
     path, stop = tmp_path / "flight.mcap", threading.Event()
     recorder = Recorder(bus.subscribe(TOPIC, mode="every"), path)
     thread = threading.Thread(target=recorder.run, args=(stop,))
@@ -284,7 +284,9 @@ def test_recording_has_a_schema_for_each(bus: nedbus.Bus, tmp_path: Path, distin
 
 
 @pytest.mark.process
-def test_replay_changes_the_definition(tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_replay_uses_the_definition_of_each_message(
+    tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """A recording of a vehicle that changed its firmware is replayed with the definition of each message."""
     made = [(number, firmware, definition_of(firmware).model) for number, firmware in enumerate("AACB", 1)]
     with RecordingWriter(tmp_path / "flight.mcap") as writer:
@@ -315,8 +317,10 @@ with nedbus.connect(sys.argv[1]) as bus:
 
 
 @pytest.mark.process
-def test_one_service_describes_both_of_its_logs(tmp_path: Path, run_nedbus: Start, start: Start, endpoint: str) -> None:
-    """A service with two logs of different firmwares describes both; a fresh reader of the second alone is right."""
+def test_service_with_several_firmware_builds_replies_with_each_definition(
+    tmp_path: Path, run_nedbus: Start, start: Start, endpoint: str
+) -> None:
+    """If a service replays logs of several firmware builds, a new reader of any of them gets the right fields."""
     logs = [write_log(tmp_path / f"{name}.ulg", name, number) for number, name in enumerate("ABC", 1)]
     sources = [each for log in logs for each in ("--source", f"ulog:{log}?topics=*")]
     run_nedbus("serve", "-c", endpoint, *sources)
