@@ -30,7 +30,7 @@ _SOURCE: Final = """name => {
 
 _ROWS: Final = """rows => rows.map(row => ({
   vehicle: row.dataset.with, grade: row.children[0].className, state: row.children[2].textContent,
-  chosen: row.getAttribute("aria-selected") == "true",
+  chosen: row.getAttribute("aria-current") == "true",
 }))"""
 _ALL: Final = """
 const all = (root, found = []) => {
@@ -202,8 +202,8 @@ class Tab:
         """URL in the address bar; Playwright's own property may be outdated."""
         return str(self.page.evaluate("location.href"))
 
-    def part(self, name: str) -> str:
-        """Return the visible text of a part of the page."""
+    def panel(self, name: str) -> str:
+        """Return the visible text of a panel."""
         return self.page.locator(f"div.{name} .bk-clearfix").first.inner_text()
 
     def cells(self, selector: str) -> list[Cell]:

@@ -78,33 +78,29 @@ class FoxgloveServer:
                 if time.monotonic() >= next_poll:
                     self._close_unpublished()
                     for address, (message, time_ns) in list(self._unseen.items()):
-                        self._show_fields(address, message, time_ns)
+                        self._log_fields(address, message, time_ns)
                     next_poll = time.monotonic() + TIMINGS.bridge_poll
                 try:
-                    self.show(subscription.receive(0.1))
+                    self.log(subscription.receive(0.1))
                 except NoDataError:
                     continue
 
-    def show(self, sample: Sample[Any]) -> None:
+    def log(self, sample: Sample[Any]) -> None:
         """Log a sample to the channels of its address and of its vehicle."""
         time_ns = sample.sent or sample.received
-        self._show_fields(sample.address, sample.message, time_ns)
+        self._log_fields(sample.address, sample.message, time_ns)
         if sample.topic == _ATTITUDE:
             self._attitudes[sample.vehicle] = sample.message
         if sample.topic == DEFAULT_TOPIC:
-            self._show_position(sample.vehicle, sample.message, time_ns)
-
-    def close(self) -> None:
-        """Stop the server and disconnect its clients."""
-        self._server.stop()
+            self._log_position(sample.vehicle, sample.message, time_ns)
 
     def __enter__(self) -> FoxgloveServer:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.close()
+        self._server.stop()
 
-    def _show_fields(self, address: Address, message: Message, time_ns: int) -> None:
+    def _log_fields(self, address: Address, message: Message, time_ns: int) -> None:
         definition = message.DEFINITION
         channel = self._fields.get((address, definition))
         if channel is None:
@@ -118,7 +114,7 @@ class FoxgloveServer:
         elif not get_topic(address.topic).rate:
             self._unseen[address] = message, time_ns  # it may be the only message
 
-    def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
+    def _log_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         if vehicle not in self._channels:
             pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
             self._channels[vehicle] = pose, LocationFixChannel(f"/{vehicle}/location", context=self._context)
@@ -141,21 +137,21 @@ class FoxgloveServer:
                 for parent, child, moved, turned in frames
             ]
             self._transforms.log(messages.FrameTransforms(transforms=transforms), log_time=time_ns)
-        place = to_global(message)
-        if place and message.xy_valid:
+        fix = to_global(message)
+        if fix and message.xy_valid:
             variance = message.eph**2 / 2
             is_known = math.isfinite(variance + message.epv)
             types = messages.LocationFixPositionCovarianceType
-            fix = messages.LocationFix(
+            location = messages.LocationFix(
                 timestamp=stamp,
                 frame_id=vehicle,
-                latitude=place.latitude,
-                longitude=place.longitude,
-                altitude=place.altitude,
+                latitude=fix.latitude,
+                longitude=fix.longitude,
+                altitude=fix.altitude,
                 position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2] if is_known else [],
                 position_covariance_type=types.Approximated if is_known else types.Unknown,
             )
-            locations.log(fix, log_time=time_ns)
+            locations.log(location, log_time=time_ns)
 
     def _locate(self, message: VehicleLocalPosition) -> messages.Vector3:
         """Return the translation from `map` to the local frame of a message with a global origin, in ENU [m]."""

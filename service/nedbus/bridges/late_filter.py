@@ -8,22 +8,22 @@ from nedbus.timings import TIMINGS
 from nedbus_msgs import Address
 
 DRIFT: Final = 60 * 10**9
-"""Nanoseconds for which the fastest sample is the reference; limited, as the two clocks drift apart."""
+"""Nanoseconds for which the fastest sample is the reference; limited, because the two clocks drift apart."""
 
 _STALLED: Final = 1000  # ns; timestamps closer together come from a stalled clock
 
 
 class LateFilter:
-    """Admit current samples; hold back and count late ones, and retained ones, whose age is unknown."""
+    """Admit current samples; hold back and count late samples, and retained samples, whose age is unknown."""
 
     def __init__(self) -> None:
         self._clocks: dict[Address, tuple[str, _PublisherClock]] = {}  # id of the publishing session, and its clock
         self._held = Counter[Address]()
-        self._latest = 0  # ns, maximum lateness of these
+        self._latest = 0  # ns; maximum lateness of the samples held back
         self._limit = round(1e9 * TIMINGS.lateness)  # ns
 
     def admits(self, sample: Sample[Any], *, arrived: int) -> bool:
-        """Return whether a sample is current; one without a timestamp is.
+        """Return whether a sample is current; a sample without a timestamp counts as current.
 
         `arrived`: arrival time on this host's monotonic clock [ns].
         """
@@ -50,10 +50,10 @@ class LateFilter:
         if not self._held:
             return None
         first, *others = sorted(self._held)
-        of = f"{first} and {len(others)} others" if others else f"{first}"
-        by = f", up to {self._latest / 1e9:.1f} s late" if self._latest else ""
+        addresses = f"{first} and {len(others)} others" if others else f"{first}"
+        lateness = f", up to {self._latest / 1e9:.1f} s late" if self._latest else ""
         count = self._held.total()
-        text = f"{of}: {count} old message{'s' if count > 1 else ''} held back{by}"
+        text = f"{addresses}: {count} old message{'s' if count > 1 else ''} held back{lateness}"
         self._held.clear()
         self._latest = 0
         return text
@@ -62,8 +62,8 @@ class LateFilter:
 class _PublisherClock:
     """Clock offset of one publisher, estimated from timestamps and arrival times [ns].
 
-    The smallest arrival minus timestamp is the clock offset plus the transit time of the fastest sample. The lateness
-    of a sample is its excess over that, so the clocks need not agree. A clock set back is detected within 2 * DRIFT.
+    Arrival time minus timestamp is clock offset plus transit time; the fastest sample has the minimum. The lateness of
+    a sample is its excess over it, so the clocks need not agree. A clock set back is detected within 2 * DRIFT.
     """
 
     def __init__(self, sent: int, arrived: int) -> None:

@@ -40,7 +40,7 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 _log = logging.getLogger(__name__)
 
 _MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; above the 20 s of recovery
-_MAX_LEFT_OUT: Final = 1000  # addresses that are logged as unsupported
+_MAX_UNSUPPORTED: Final = 1000  # addresses that are logged as unsupported
 _REFUSALS: Final = {
     "conflict": "%s is not published: %s already uses the topic /%s: set --namespace",
     "defer": "%s is not published: node %s already publishes /%s",
@@ -82,7 +82,7 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # by topic, as the workspace has them
+        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {}  # definition, layout and type hash, by topic
         for topic, definition in BY_TOPIC.items():
             if found := definition.layout_of_release(layout):
                 type_hash = hash_of(found, ros2_type(definition)) if hashed else transport.NO_HASH
@@ -90,10 +90,10 @@ class Ros2Bridge:
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
-        self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter keeps their clocks
+        self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter still has its clock
         self._publishers: dict[Address, _Ros2Publisher] = {}
-        self._entities = 0
-        self._left_out: set[Address] = set()
+        self._entities = 0  # entity ids used so far
+        self._unsupported: set[Address] = set()
         self._held: dict[Address, Sample[Any]] = {}  # last sample of streams without a rate, kept until published
 
     def run(self, stop: threading.Event) -> None:
@@ -223,8 +223,8 @@ class Ros2Bridge:
             return False
         if address.topic in self._types:
             return True
-        if address not in self._left_out and len(self._left_out) < _MAX_LEFT_OUT:
-            self._left_out.add(address)
+        if address not in self._unsupported and len(self._unsupported) < _MAX_UNSUPPORTED:
+            self._unsupported.add(address)
             known = address.topic in BY_TOPIC
             reason = f"PX4 {self._layout} has no such message" if known else "its px4_msgs type is unknown"
             _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))

@@ -59,7 +59,7 @@ class Ros2Arbiter:
     ) -> list[Decision]:
         """Return the changes since the last call.
 
-        `addresses`: those on the bus; `other_nodes`: the other node that publishes the topic of an address.
+        `addresses`: the addresses on the bus; `other_nodes`: the other node that publishes the topic of an address.
         `now`: time on any monotonic clock [s].
         """
         present = set(addresses)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
 _MAX_ROWS: Final = 10_000_000  # rows at a given rate; a damaged timestamp must not exhaust memory
-_STALE: Final = 1_000_000  # us; messages older than this at the start of recording were sent before it
-_STRAY: Final = 0.01  # fraction of messages that may be out of order; a larger one indicates several boots
+_STALE: Final = 1_000_000  # us; a first message older than this at the start of recording was sent before it
+_STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
 _Floats = npt.NDArray[np.float64]
@@ -140,8 +140,8 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
-    """Return for each time the row of its message (-1: none), the next row, and the interpolation weight of that."""
-    if method == "own" or not len(stamps):  # by index, as messages may share a timestamp
+    """Return for each time the row of its message (-1: none), the row of the next message, and its weight."""
+    if method == "own" or not len(stamps):  # by index, because messages may share a timestamp
         rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
         return rows, rows, np.zeros(len(times))
     order = np.argsort(stamps, kind="stable")
@@ -208,21 +208,21 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
 def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start: int) -> _Ints:
     """Return the given times, or times at the given rate from the first to the last message [us].
 
-    The first message may be much older than the recording, as PX4 logs the last one of slow topics: begin at `start`.
+    At `start`, PX4 also logs the last message of slow topics, which may be much older: then begin at `start`.
     """
     given = np.asarray(on)
     if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):
         raise ArgumentError("on", on, "a stream, a rate above 0 [Hz], or times [us]")
     if given.ndim:
         return given.astype(np.int64)
-    set_ones = {name: times[times > 0] for name, times in stamps.items() if times.any()}  # a timestamp of 0 is unset
-    firsts, lasts = ({name: int(end(each)) for name, each in set_ones.items()} for end in (np.min, np.max))
+    valid = {name: times[times > 0] for name, times in stamps.items() if times.any()}  # a timestamp of 0 is unset
+    firsts, lasts = ({name: int(end(each)) for name, each in valid.items()} for end in (np.min, np.max))
     rate, first, last = float(given), min(firsts.values(), default=2**62), max(lasts.values(), default=0)
     first = start if first + _STALE < start <= last else first
     count = max(0.0, (last - first) / 1e6 * rate + 1)
     if count > _MAX_ROWS:
         earliest, latest = min(firsts, key=firsts.__getitem__), max(lasts, key=lasts.__getitem__)
         ends = f"{earliest} begins at {first / 1e6:.0f} s, {latest} ends at {last / 1e6:.0f} s"
-        problem = f"Hz has too many rows: {ends}"
+        problem = f"Hz results in too many rows: {ends}"
         raise ArgumentError("on", rate, "topics on one clock, a lower rate, or times", problem=problem)
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

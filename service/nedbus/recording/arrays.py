@@ -100,16 +100,13 @@ class Flight(ExitStack):
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return the messages of each address, with a mask of the messages that lack a field, by field."""
-        found = dict[Address, tuple[MessageArray, Absent]]()
         if isinstance(self._file, UlogReader):
-            for address in addresses:
-                stream = self._file.streams[address]
-                found[address] = self._valid(address, _decode_ulog(stream, self._payloads[stream]))
-            return found
-        parts = self._converted or self._decode_recording(addresses)
-        for address in addresses:
-            found[address] = self._valid(address, _Decoded(*map(np.concatenate, zip(*parts[address], strict=True))))
-        return found
+            streams = {address: self._file.streams[address] for address in addresses}
+            decoded = ((each, _decode_ulog(stream, self._payloads[stream])) for each, stream in streams.items())
+        else:
+            parts = self._converted or self._decode_recording(addresses)
+            decoded = ((each, _Decoded(*map(np.concatenate, zip(*parts[each], strict=True)))) for each in addresses)
+        return {address: self._drop_invalid(address, each) for address, each in decoded}
 
     def _decode_recording(self, addresses: Collection[Address]) -> dict[Address, list[_Decoded]]:
         parts = {address: [_Decoded.empty(self.definitions[address], 0)] for address in addresses}
@@ -124,7 +121,7 @@ class Flight(ExitStack):
             self.start = max(0, min(logged) - round(np.median(np.concatenate(ages))))
         return parts
 
-    def _valid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
+    def _drop_invalid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
         """Drop invalid messages, and store the names of missing fields in the dtype."""
         messages, valid, absent = decoded
         if not valid.all():
@@ -147,7 +144,7 @@ def _by_address(messages: Iterator[Any]) -> Iterator[tuple[Address, list[Any]]]:
 
 
 class _Decoded(NamedTuple):
-    """Messages of one definition, a mask of the valid ones, and by field a mask of those that lack it."""
+    """Messages of one definition, a mask of the valid messages, and a mask per field of the messages that lack it."""
 
     messages: MessageArray
     valid: _Mask
@@ -161,7 +158,7 @@ class _Decoded(NamedTuple):
 
 
 def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
-    """Decode messages of a log, vectorized; those with fields of another type one by one."""
+    """Decode messages of a log, vectorized; streams with fields of another type message by message."""
     table: npt.NDArray[np.void] = np.frombuffer(payloads, np.dtype(stream.subscription.layout.dtype))
     definition, columns = stream.definition, {name: table[name] for name in stream.names}
     decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(tuple(columns))
@@ -182,13 +179,13 @@ def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
     decoded.valid[:] = arrays_of(definition).valid_mask(messages)
     for name, column in columns.items():
         if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
-            wrong = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1 is invalid
-            decoded.valid[wrong.reshape(len(messages), -1).any(axis=1)] = False
+            invalid = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1
+            decoded.valid[invalid.reshape(len(messages), -1).any(axis=1)] = False
     return decoded
 
 
 def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> _Decoded:
-    """Decode CDR messages, vectorized; those that this rejects or does not support one by one."""
+    """Decode CDR messages, vectorized; messages that the vectorized decoder rejects are decoded one by one."""
     arrays = arrays_of(definition)
     decoded = _Decoded.empty(definition, len(chunk))
     by_stream: dict[RecordedStream, list[int]] = {}
@@ -201,14 +198,14 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
             decoded.messages[rows], decoded.valid[rows] = arrays.decode_cdr(payloads, stream.layout)
         for name in definition.all_fields - (definition.plan(stream.layout.fields).provided - stream.missing):
             decoded.absent[name][rows] = True
-    alone: dict[int, Message] = {}
+    single: dict[int, Message] = {}
     for index in np.flatnonzero(~decoded.valid).tolist():
         with suppress(DecodeError, ValidationError):
             fields = decode_with(definition, chunk[index].payload, chunk[index].stream.layout)
-            alone[index] = upgrade_with(definition, fields)
-    if alone:
-        decoded.messages[list(alone)] = arrays.of(list(alone.values()))
-        decoded.valid[list(alone)] = True
+            single[index] = upgrade_with(definition, fields)
+    if single:
+        decoded.messages[list(single)] = arrays.of(list(single.values()))
+        decoded.valid[list(single)] = True
     return decoded
 
 

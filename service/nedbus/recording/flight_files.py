@@ -57,7 +57,7 @@ def open_flight(path: Path) -> BinaryIO:
 
 
 def recording_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return the MCAP files of a recording or bag folder, in order, and missing ones; raise SourceError without any."""
+    """Return the MCAP files of a recording or bag folder in order, and the missing ones; raise SourceError if empty."""
     if not path.is_dir():
         return [path], []
     found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
@@ -82,7 +82,7 @@ def _why_unreadable(path: Path) -> str:
 
 
 def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict[str, str]]:
-    """Map each file's vehicles to unique names; a vehicle that is in several files is named after its file."""
+    """Map the vehicles of each file to unique names; a vehicle that is in several files is named after its file."""
     counts = Counter(vehicle for _, vehicles in flights for vehicle in vehicles)
     taken, found = set(counts), []
     for path, vehicles in flights:
@@ -108,9 +108,9 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
 
 
 def single_match(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
-    """Return the single selected address of a file in a list; raise AddressError for none or more than one.
+    """Return a list with the selected address of a file; raise AddressError unless exactly one matches.
 
-    Of a topic that only the file defines, the first instance has no instance number; the plain topic selects it.
+    The first instance of a topic that only the file defines has no instance number: the topic alone selects it.
     """
     found = matching(path, addresses, selection)
     plain = [address for address in found if address.instance is None]

@@ -36,8 +36,8 @@ ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 """Magic number of zstd frames."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
-_SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that a record may exceed its fields by: too few for another record
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of the compression's name
+_SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that may follow a record's known fields: too few for another record
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of the compression name
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
 _FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, start of summary and summary offsets, CRC, magic
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
@@ -77,8 +77,8 @@ class ChunkFile:
         except READ_ERRORS:
             self.warn("the index is damaged: reading without it")
 
-    def parts(self, only: Collection[int] | None = None) -> Iterator[bytes]:
-        """Yield the records of each intact chunk, in file order.
+    def blocks(self, only: Collection[int] | None = None) -> Iterator[bytes]:
+        """Yield each intact chunk, decompressed, and each record outside chunks, in file order.
 
         `only`: channels of interest; chunks without any of them may be skipped.
         """
@@ -88,7 +88,7 @@ class ChunkFile:
             # A chunk that lists no channels may contain any.
             if only is None or not (own := chunk.message_index_offsets.keys()) or not own.isdisjoint(only)
         )
-        for opcode, offset, end in chunks if self._chunks else self._follow():
+        for opcode, offset, end in chunks if self._chunks else self._scan():
             record = self._read(offset, end - offset)
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
@@ -143,21 +143,21 @@ class ChunkFile:
             raise ValueError(places)
         self._chunks, self.summary = chunks, records
 
-    def _follow(self) -> Iterator[tuple[int, int, int]]:
+    def _scan(self) -> Iterator[tuple[int, int, int]]:
         """Scan the file; yield opcode, begin and end of chunks, and of schemas, channels and messages between them."""
         offset, after_chunk = len(MCAP0_MAGIC), False
         while True:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
             opcode, length = _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
             end = offset + _RECORD_HEAD.size + length
-            surplus = length - _own_length(opcode, begin[_RECORD_HEAD.size :], length)
+            surplus = length - _expected_length(opcode, begin[_RECORD_HEAD.size :], length)
             if opcode == 0 or end > self._size or surplus not in _SURPLUS:
                 self.warn(f"truncated or damaged: skipped from byte {offset} of {self._size} to the end", lost=True)
                 return
             if opcode in _LENGTHS:
                 return
             # The message index after a chunk has no CRC: one flipped bit turns its opcode into that of a message.
-            is_index = length == _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length)
+            is_index = length == _expected_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :], length)
             if after_chunk and opcode == Opcode.MESSAGE and is_index:
                 opcode = Opcode.MESSAGE_INDEX
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
@@ -168,7 +168,7 @@ class ChunkFile:
             offset = end
 
 
-def _own_length(opcode: int, body: bytes, length: int) -> int:
+def _expected_length(opcode: int, body: bytes, length: int) -> int:
     """Return the record length implied by the lengths of its fields; `length` for types without such fields."""
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
@@ -178,23 +178,23 @@ def _own_length(opcode: int, body: bytes, length: int) -> int:
     return _LENGTHS.get(opcode, length)
 
 
-def records_of(part: bytes) -> Iterator[McapRecord]:
-    """Yield the schemas, channels, messages, chunk indexes and statistics in a part of a file.
+def records_of(block: bytes) -> Iterator[McapRecord]:
+    """Yield the schemas, channels, messages, chunk indexes and statistics in a block of records.
 
-    Raises one of READ_ERRORS if the part is damaged.
+    Raises one of READ_ERRORS if the block is damaged.
     """
     offset = 0
-    while offset < len(part):
-        opcode, length = _RECORD_HEAD.unpack_from(part, offset)
+    while offset < len(block):
+        opcode, length = _RECORD_HEAD.unpack_from(block, offset)
         start = offset + _RECORD_HEAD.size
         offset = start + length
-        if opcode == 0 or offset > len(part):  # no record has opcode 0
+        if opcode == 0 or offset > len(block):  # no record has opcode 0
             raise ValueError(opcode)
         if opcode == Opcode.MESSAGE:
-            channel, sequence, logged, published = _MESSAGE_HEAD.unpack_from(part, start)
-            yield Message(channel, logged, part[start + _MESSAGE_HEAD.size : offset], published, sequence)
+            channel, sequence, logged, published = _MESSAGE_HEAD.unpack_from(block, start)
+            yield Message(channel, logged, block[start + _MESSAGE_HEAD.size : offset], published, sequence)
         elif opcode in _DESCRIPTIONS:
-            yield _DESCRIPTIONS[opcode].read(ReadDataStream(BytesIO(part[start:offset])))
+            yield _DESCRIPTIONS[opcode].read(ReadDataStream(BytesIO(block[start:offset])))
 
 
 def _unpack_chunk(record: bytes) -> bytes:

@@ -28,8 +28,7 @@ from .flight_files import recording_files
 from .mcap_chunks import READ_ERRORS, ZSTD_MAGIC, ChunkFile, records_of
 
 _MAX_PAYLOAD: Final = 2**16  # decompressed size of a message compressed by rosbag2
-
-_MAX_DEFINITIONS: Final = 16_000  # cost in fields: a message costs 32 more, 256 characters 1 more
+_DEFINITION_BUDGET: Final = 16_000  # for all definitions of a file: 32 per message, 1 per field, 1 per 256 characters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +98,7 @@ class RecordingReader(ExitStack):
     @property
     def boot_utc(self) -> int:
         """Unix time of the boot, from the log that was converted to this file [us]; 0 if unknown."""
-        known = {boot for file in self._files for boot in file.boots}
+        known = {boot for file in self._files for boot in file.boot_times}
         return int(known.pop()) if len(known) == 1 else 0
 
     @property
@@ -124,16 +123,16 @@ class _RecordedFile:
     def __init__(self, path: Path, vehicle: str) -> None:
         self.name = path.name
         self._vehicle = vehicle
-        self.boots: set[str] = set()
+        self.boot_times: set[str] = set()
         self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
-        self._definition_budget = _MAX_DEFINITIONS
+        self._definition_budget = _DEFINITION_BUDGET
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
         self.counts: Mapping[RecordedStream, int]
         for record in sorted(self.chunks.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
-            # A summary may repeat channels without schemas; the schemas are in the chunks then.
+            # A summary may repeat channels but not schemas, which are then in the chunks.
             if not isinstance(record, Channel) or record.schema_id in {0, *self._schemas}:
                 self._register(record)
             if isinstance(record, Statistics):
@@ -145,15 +144,15 @@ class _RecordedFile:
             self.counts = Counter(each.stream for each in self.messages())
 
     def check(self) -> None:
-        for _ in self.chunks.parts(self._channels()):
+        for _ in self.chunks.blocks(self._channels()):
             pass
         if self.chunks.damaged:
             self.counts = Counter(each.stream for each in self.messages())
 
     def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
-        for part in self.chunks.parts(self._channels(only)):
+        for block in self.chunks.blocks(self._channels(only)):
             try:
-                for record in records_of(part):
+                for record in records_of(block):
                     if not isinstance(record, Message):
                         self._register(record)
                         continue
@@ -167,14 +166,14 @@ class _RecordedFile:
                 self.chunks.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
 
     def _channels(self, only: Collection[Address] | None = None) -> list[int] | None:
-        """Return the readable channels, of these addresses or all; None while not all channels are known."""
+        """Return the readable channels, by default of all addresses; None if the summary does not list all channels."""
         if not self._all_known:
             return None
         streams = self._streams.items()
         return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
     def _register(self, record: McapRecord) -> None:
-        """Register a schema or channel; later ones with the same id are ignored."""
+        """Register a schema or channel; ignore later records with the same id."""
         if isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
         elif isinstance(record, Channel) and record.id not in self._streams:
@@ -185,8 +184,8 @@ class _RecordedFile:
             return None
         try:
             if schema.encoding and (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
-                forms = f"{channel.message_encoding} with {schema.encoding}, not cdr with ros2msg"
-                raise ValueError(f"its encoding is {forms}: record it where px4_msgs is installed")
+                encodings = f"{channel.message_encoding} with {schema.encoding}, not cdr with ros2msg"
+                raise ValueError(f"its encoding is {encodings}: record it where px4_msgs is installed")
             if not schema.data:
                 raise ValueError(f"the file has no definition of {schema.name}: record it where px4_msgs is installed")
             definition, layout = self._layout(schema, channel.topic)
@@ -203,7 +202,7 @@ class _RecordedFile:
             self.chunks.warn(f"skipped {channel.topic}: {exc}")
             return None
         if (boot := metadata.get("boot_time_utc_us", "")).isdecimal():
-            self.boots.add(boot)
+            self.boot_times.add(boot)
         missing = frozenset(metadata.get("missing", "").split())
         return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
 
@@ -211,7 +210,7 @@ class _RecordedFile:
         """Return the definition and layout of a schema; raise ValueError if they do not match the message."""
         if schema.id not in self._layouts:
             if self._definition_budget < 0:
-                raise ValueError("the definitions in this file exceed the limit, which is that of 250 PX4 topics")
+                raise ValueError("the definitions in this file exceed the limit, which is the size of 250 PX4 topics")
             self._definition_budget -= len(schema.data) // 256
             known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
             self._definition_budget -= 32 + len(read_msg(text))
@@ -222,7 +221,7 @@ class _RecordedFile:
         return self._layouts[schema.id]
 
     def _own_layout(self, known: Definition[Any], types: Mapping[str, FieldType], topic: str) -> Layout:
-        """Return a layout that only this file has; warn about unknown fields, which are left out."""
+        """Return a layout that is in no PX4 release; warn about fields unknown to nedbus, which are left out."""
         wrong = [name for name, kind in types.items() if kind not in known.known_types.get(name, {kind})]
         if lacking := sorted({*wrong, *(known.always - types.keys())}):
             raise ValueError(f"its definition of {', '.join(lacking)} matches no PX4 release")
@@ -232,7 +231,7 @@ class _RecordedFile:
 
 
 def _unpack(payload: bytes) -> bytes:
-    """Decompress a message compressed by rosbag2; on failure return it unchanged, for the decoder to reject."""
+    """Decompress a message compressed by rosbag2; if that fails, return it unchanged, and the decoder rejects it."""
     with suppress(ZstdError):
         if payload.startswith(ZSTD_MAGIC) and frame_content_size(payload) <= _MAX_PAYLOAD:
             return ZstdDecompressor().decompress(payload, max_output_size=_MAX_PAYLOAD)

@@ -51,8 +51,8 @@ _Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, 
 class RecordingWriter:
     """Write messages to a new MCAP file; a context manager that finishes the file on exit.
 
-    Each address, definition and provenance has its own channel, in the message's current layout. If no PX4 layout has
-    all fields of the message, a PX4 layout with exactly the fields provided by the source is preferred.
+    Each combination of address, definition and provenance has its own channel. Its layout is the current one; if no
+    PX4 release has all its fields, a release with exactly the fields that the source provides is preferred.
     PX4's texts are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
     `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
     vehicle's boot [us], for `utc_of` if the messages do not provide it.

@@ -186,14 +186,14 @@ def _draw_lines(
     valid = [stream.messages[flag] for stream in streams]
     in_scale = not any(np.any(each & np.isfinite(y)) for each, (_, y) in zip(valid, lines, strict=True))
     for stream, each, line in zip(streams, valid, lines, strict=True):
-        thin = Line2D(*line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)  # below all others
+        thin = Line2D(*line, color=stream.color, linewidth=0.5, alpha=0.6, zorder=1.9)  # below all other lines
         (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
         thick = (np.where(each, values, np.nan) for values in line)
         axes.plot(*thick, color=stream.color, linewidth=width, label=str(stream.address))
 
 
 def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
-    """Return label, stream and field of each row: flags, heading resets, and resets of other quantities with any."""
+    """Return label, stream and field of each row: flags, heading resets, and other reset counters that change."""
     rows: list[tuple[str, _Stream, str]] = []
     for stream in streams:
         suffix, missing = f" {stream.address}" if len(streams) > 1 else "", missing_of(stream.messages)
@@ -221,7 +221,7 @@ def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
 def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> dict[str, list[_Mark]]:
     """Return the marks of the plotted vehicles by row, the most severe row first, each row in order of time.
 
-    Events far from all messages are left out, as their time must be damaged.
+    Events far from all messages are left out, because their timestamps must be damaged.
     """
     timed = [event for event in events if event.boot is not None]
     rows = defaultdict[str, dict[Event, _Mark]](dict)
@@ -241,7 +241,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
             text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
             marks = rows[f"{row} {vehicle}" if len(vehicles) > 1 else row]
             end = max(begin, last if span.until is None else min(span.until + offset, last))
-            # Conditions that began together share a mark, which ends with the last of them.
+            # Conditions that begin with the same event share a mark, which ends when the last condition ends.
             marks[event] = _Mark(event, text, begin, max(end, marks[event].end) if event in marks else end)
 
     def order(marks: list[_Mark]) -> tuple[int, float]:

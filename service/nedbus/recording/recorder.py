@@ -65,7 +65,7 @@ class Recorder:
             raise NoDataError(self._subscription.name, time.monotonic() - start)
 
     def _write(self, batch: Batch) -> None:
-        now = clock.utc_ns()  # messages recovered late keep their order
+        now = clock.utc_ns()  # log times in order of arrival, also for recovered messages
         addresses = (batch.addresses[index] for index in batch.address_index.tolist())
         self._writer.write(
             batch.messages,

@@ -13,16 +13,16 @@ from nedbus_msgs import TOPICS, Address
 from .flight_files import open_flight
 
 _CHUNK: Final = 2**17  # bytes read at a time
-_MAX_NAMED: Final = 5  # places of damage listed in the warnings
+_MAX_NAMED: Final = 5  # damaged locations listed in the warnings
 _MAX_TOPICS: Final = 10  # topics listed in an error
 
 
 class UlogReader:
     """Read the messages of a log in file order, with memory independent of its size.
 
-    `topics`: those to read, None for all. `vehicle`: by default the log's MAV_SYS_ID, else `default_vehicle`.
+    `topics`: the topics to read, None for all. `vehicle`: by default the log's MAV_SYS_ID, else `default_vehicle`.
     `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if unknown. `position`: bytes read.
-    `dropout`: seconds lost by the logger since the caller last reset it. `streams`: those with a message so far.
+    `dropout`: seconds lost by the logger since the caller last reset it. `streams`: all streams with a message so far.
     `damaged`: True if damage may have cost messages so far.
     """
 
@@ -32,7 +32,7 @@ class UlogReader:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
         self._parser, self._texts = ulog.UlogParser(verify=True), ulog.LogMessageBuilder()
-        self._places = self.start = self.boot_utc = self.position = 0
+        self._damages = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
@@ -46,12 +46,14 @@ class UlogReader:
     @property
     def warnings(self) -> list[str]:
         """Damage found and parts skipped so far."""
-        ends = {f"damaged: {self._places - _MAX_NAMED} further locations": self._places > _MAX_NAMED}
-        ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
-        ends |= {f"left out: {self._texts.limit.omitted} texts above 100 per second": self._texts.limit.omitted > 0}
-        ends |= {self._texts.problem: bool(self._texts.problem)}
-        reasons = [reason for stream in self.streams.values() for reason in stream.omitted.values()]
-        return self._warnings + reasons + [text for text, holds in ends.items() if holds]
+        warnings = self._warnings + [reason for stream in self.streams.values() for reason in stream.omitted.values()]
+        if self._damages > _MAX_NAMED:
+            warnings.append(f"damaged: {self._damages - _MAX_NAMED} further locations")
+        if self._parser.undecodable:
+            warnings.append(f"damaged: {self._parser.undecodable} messages without a definition")
+        if self._texts.limit.omitted:
+            warnings.append(f"left out: {self._texts.limit.omitted} texts above 100 per second")
+        return [*warnings, *filter(None, [self._texts.problem])]
 
     def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:
         """Yield each message as its stream and payload.
@@ -62,7 +64,7 @@ class UlogReader:
         for records in self._records():
             for record in self._texts.merge(records):
                 if not isinstance(record, data):
-                    self._note(record)
+                    self._process(record)
                     continue
                 subscription, payload = record
                 try:
@@ -101,7 +103,7 @@ class UlogReader:
         except OSError as exc:
             raise SourceError(str(self._path), (exc.strerror or str(exc)).lower()) from exc
 
-    def _note(self, record: ulog.Record) -> None:
+    def _process(self, record: ulog.Record) -> None:
         """Process a record that is not a message."""
         if isinstance(record, ulog.Header):
             self.start = record.timestamp
@@ -117,9 +119,9 @@ class UlogReader:
         elif isinstance(record, ulog.Unsubscription):
             self._by_id.pop(record.message_id, None)
         elif isinstance(record, ulog.Damage):
-            self._places += not record.is_end
+            self._damages += not record.is_end
             self.damaged |= not record.is_end
-            if self._places <= _MAX_NAMED:
+            if self._damages <= _MAX_NAMED:
                 self._warnings.append(f"{'truncated' if record.is_end else 'damaged'}: {record.reason}")
 
     def _open(self, subscription: ulog.Subscription) -> ulog.LoggedStream | None:

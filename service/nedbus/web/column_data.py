@@ -16,9 +16,10 @@ from .style import PALETTE
 _MAX_POINTS: Final = 6_000  # points of all tracks together, which a browser can draw ten times a second
 _MIN_TRACK_POINTS: Final = 60
 _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
-_DOUBT, _TRUE = "doubtful", "truth"
-NAMES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBT, _TRUE)
-"""Line types: valid tracks in each vehicle colour, doubtful tracks, and ground truth."""
+_DOUBTFUL_LINE, _TRUTH_LINE = "doubtful", "truth"
+LINE_TYPES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBTFUL_LINE, _TRUTH_LINE)
+"""Line types of tracks: valid positions in each vehicle colour, doubtful positions, and ground truth."""
+_COLUMNS: Final = ("east", *LINE_TYPES)
 
 Track = tuple[History, int]  # points, and colour number
 
@@ -42,16 +43,16 @@ def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None
 
 
 class Tracks:
-    """Tracks of all streams: a column for east and one per line type for north, NaN where that line has a gap.
+    """Tracks of all streams in one data source: a column for east, and a column for north per line type.
 
-    Each track is a ring buffer of slots with a moving gap after the newest point, followed by a copy of the first slot
-    and a permanent gap before the next track.
+    North is NaN where a line has a gap. Each track is a ring buffer of slots with a gap after the newest point, then a
+    copy of its first slot and a permanent gap.
     """
 
     def __init__(self) -> None:
-        self.source = table("east", *NAMES)
+        self.source = table(*_COLUMNS)
         self._tracks: Mapping[Address, Track] = {}
-        self._seen: list[int] = []
+        self._seen: list[int] = []  # points of each history that are in the data source
         self._step = self._slots = 1
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
@@ -64,8 +65,8 @@ class Tracks:
             written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
             self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
             self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
-            self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
-        cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
+            self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in _COLUMNS}
+        cells: dict[str, dict[int, float]] = {name: {} for name in _COLUMNS}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
         if cells["east"]:
@@ -78,7 +79,7 @@ class Tracks:
         if end == seen:
             return
         self._seen[index] = end
-        names = (_TRUE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBT)
+        names = (_TRUTH_LINE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBTFUL_LINE)
 
         def put(slot: int, point: Mapping[str, float]) -> None:
             for name in ("east", *names):

@@ -1,4 +1,4 @@
-"""Events of a page in order of time, the spans, stories and verdicts derived from them, and formatted times."""
+"""Event timeline of a page: events in order of time, with their spans, stories and verdicts."""
 
 import functools
 import math
@@ -23,19 +23,19 @@ from nedbus.events import (
 
 PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
-_TENTH: Final = 0.1  # s; time resolution of the page's URL
+_URL_RESOLUTION: Final = 0.1  # s; times in the URL are rounded to this
 
 
 class EventTimeline:
-    """The events of an event log and earlier ones (`before`); derived values are cached until the next event.
+    """The events of an event log, and earlier events (`before`); derived values are cached until the next event.
 
-    `start`: offset from times of the event log to the clock of the time axes [s]; `unit`: the name of that clock.
+    `clock_offset`: added to event times to get the time on the axes [s]; `unit`: the name of the axes' clock.
     """
 
     def __init__(self, event_log: EventLog, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
         self.event_log = event_log
         self.times = times or Times(is_live=True)
-        self.start, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
+        self.clock_offset, self.unit = 0.0, unit_of("host" if self.times.is_live else "start")
         self._before = before
         self._reported = -1
         self._events: list[Event] = []
@@ -56,36 +56,38 @@ class EventTimeline:
         self._refresh()
         return self._spans
 
-    def set_start(self, vehicle: str, boot: float, time: float) -> None:
+    def set_clock(self, vehicle: str, boot: float, time: float) -> None:
         """Set the clock of a recording's time axes, given a message received at `time`, `boot` seconds after boot."""
         utc = self.times.utc_of_boot(vehicle, boot)
         if utc is not None or len(self.event_log.vehicles) < 2:  # vehicles boot at different times
-            self.start, self.unit = (boot if utc is None else utc) - time, unit_of("boot" if utc is None else "vehicle")
+            self.clock_offset = (boot if utc is None else utc) - time
+            self.unit = unit_of("boot" if utc is None else "vehicle")
 
-    def moment(self, seconds: float) -> str:
-        """Format a time of the event log on the clock of the time axes."""
-        return format_utc(seconds + self.start) if self.unit == "UTC" else f"{seconds + self.start:.1f}"
+    def format_time(self, seconds: float) -> str:
+        """Format an event time on the clock of the axes."""
+        seconds += self.clock_offset
+        return format_utc(seconds) if self.unit == "UTC" else f"{seconds:.1f}"
 
-    def clock(self, seconds: float) -> str:
-        """Format a time with the name of its clock and, for a recording, also as seconds since its start."""
-        since = "" if self.times.is_live or not self.start else f", {seconds:.1f} {unit_of('start')}"
-        return f"{self.moment(seconds)} {self.unit}{since}"
+    def format_clock(self, seconds: float) -> str:
+        """Format an event time with the name of its clock; for a recording, add the seconds since its start."""
+        since = "" if self.times.is_live or not self.clock_offset else f", {seconds:.1f} {unit_of('start')}"
+        return f"{self.format_time(seconds)} {self.unit}{since}"
 
-    def story(self, vehicle: str, now: float, at: Event | float | None, held: Sequence[Condition]) -> Story | None:
-        """Return the story of an event or time; without one, that of the current state, else of a recent condition.
+    def story(self, vehicle: str, now: float, at: Event | float | None, active: Sequence[Condition]) -> Story | None:
+        """Return the story of the event or time `at`; if None, of the current state or the latest recent condition.
 
-        `at`: the selected event or time, or None. `held`: the active conditions, the one that names the state first.
+        `active`: the active conditions; the first determines the state.
         """
         self._refresh()
-        if at is None and held:
-            at = held[0].begin
+        if at is None and active:
+            at = active[0].begin
         stories = self._find_stories_cached(vehicle, at)
         if at is None:
             stories = [story for story in stories if story.since <= now and now - (story.until or now) < PAST][::-1]
         return next(iter(stories), None)
 
     def verdict(self, vehicle: str, end: float, at: float | None = None) -> Verdict:
-        """Return the verdict at a time, by default on the whole recording or the last ten minutes before `end`."""
+        """Return the verdict on a time, by default on the whole recording or the ten minutes before `end`."""
         self._refresh()
         computed, verdict = self._verdicts.get((vehicle, at), (-math.inf, None))
         if verdict is None or end - computed >= 1.0:
@@ -107,7 +109,7 @@ class EventTimeline:
         if isinstance(at, Event):
             story = story_of(at, events, held, topics=topics)
             return [] if story is None else [story]
-        moment = None if at is None else at + _TENTH
+        moment = None if at is None else at + _URL_RESOLUTION
         return stories_of(events[-_MAX_EVENTS:], held, topics=topics, at=moment)
 
     def _evidence(self, vehicle: str) -> tuple[list[str], list[Condition]]:

@@ -1,4 +1,4 @@
-"""Vehicles and streams of a page, and the snapshot of them that all parts of the page show; no I/O."""
+"""State of a page: its vehicles and streams, and the snapshot that all panels show; no I/O."""
 
 import math
 import re
@@ -28,8 +28,8 @@ from nedbus_msgs.messages import VehicleStatus
 from .stream import LONG, Origin, PageStream, is_position
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
-MAX_STREAMS: Final = 1000  # streams shown on a page, positions first; further ones are only counted
-_SILENT: Final = 60.0  # s without a message after which a stream may be replaced
+MAX_STREAMS: Final = 1000  # streams shown on a page, positions first; further streams are only counted
+_SILENT: Final = 60.0  # s without a message after which a stream may be evicted
 _MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _OK: Final = State("info", "ok", None, ())
@@ -58,7 +58,7 @@ class StreamView:
 
 
 class StatusValue(NamedTuple):
-    """A value from a message other than the position, "" if unknown; `age` [s] if its stream is silent, else None."""
+    """A status value such as the flight mode, "" if unknown; `age` [s] if its stream is silent, else None."""
 
     text: str = ""
     age: float | None = None
@@ -68,7 +68,7 @@ class StatusValue(NamedTuple):
 class VehicleView:
     """Snapshot of one vehicle: its state and its streams.
 
-    `main`: the stream that its map marker shows; `status`: mode, armed, battery and gps; `number`: selects its colour;
+    `main`: the stream of its map marker; `status`: mode, armed, battery and gps; `number`: index of its colour;
     `log`: its ULog stream over MAVLink, if any.
     """
 
@@ -132,7 +132,7 @@ class Fleet:
     """All streams of a page; one thread may add samples while another one takes snapshots.
 
     `origin`: the common origin, by default the first global origin in any message.
-    `long`: number of points in the longer histories, and seconds between two points.
+    `long`: number of points in the long histories, and seconds between two points.
     """
 
     def __init__(self, origin: Origin | None = None, long: tuple[int, float] = LONG) -> None:
@@ -143,7 +143,7 @@ class Fleet:
         numbers = count()
         self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
         self._left_out: set[Address] = set()
-        self._gone: list[Address] = []  # removed by the thread that adds samples
+        self._gone: list[Address] = []  # to be removed by the thread that adds samples
         self._rejected: Counter[Address] = Counter()
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
 
@@ -154,7 +154,7 @@ class Fleet:
         address = sample.address
         stream = self.streams.get(address)
         if stream is None:
-            if len(self.streams) >= MAX_STREAMS and not (is_position(address) and self._make_room(time)):
+            if len(self.streams) >= MAX_STREAMS and not (is_position(address) and self._evict(time)):
                 if len(self._left_out) < MAX_STREAMS:
                     self._left_out.add(address)
                 return
@@ -172,9 +172,9 @@ class Fleet:
                 del self._rejected[next(iter(self._rejected))]
 
     def clear(self) -> None:
-        """Remove all streams and reports but keep the common origin, for a seek."""
-        for part in (self.streams, self._left_out, self._rejected, self._reports):
-            part.clear()
+        """Remove all streams and reports for a seek; keep the common origin."""
+        for collection in (self.streams, self._left_out, self._rejected, self._reports):
+            collection.clear()
 
     def update(
         self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus] = MappingProxyType({})
@@ -197,15 +197,15 @@ class Fleet:
         vehicles = []
         for name, each in views.items():
             main = min(each, key=lambda view: (view.address.topic != DEFAULT_TOPIC, not is_position(view.address)))
-            held, number = states.get(name, _OK), self._number_of(name)
-            vehicles.append(VehicleView(name, held, main, tuple(each), _status(each), number, logs.get(name)))
+            vehicle_state, number = states.get(name, _OK), self._number_of(name)
+            vehicles.append(VehicleView(name, vehicle_state, main, tuple(each), _status(each), number, logs.get(name)))
         vehicles.sort(key=lambda view: rank_vehicle(view.vehicle, view.state.severity))
         alarms = [each for each in (now.link, now.behind.replace("this reader", "this page")) if each]
         rejected = self._rejected.total()
         self.snapshot = FleetSnapshot(time, vehicles, tuple(self._reports), rejected, len(self._left_out), alarms)
 
-    def _make_room(self, time: float) -> bool:
-        """Remove the least recent stream, positions last and only if silent; return whether one was removed."""
+    def _evict(self, time: float) -> bool:
+        """Remove the least recent stream, positions last and only if silent; return whether a stream was removed."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False

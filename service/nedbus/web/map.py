@@ -14,7 +14,7 @@ from nedbus.events import Event
 from nedbus_msgs import Address
 
 from .background import Background
-from .column_data import NAMES, Track, Tracks, replace, table
+from .column_data import LINE_TYPES, Track, Tracks, replace, table
 from .fleet import TRUTH, Fleet, FleetSnapshot, VehicleView
 from .stream import Position
 from .style import MARKERS, Style
@@ -34,7 +34,7 @@ class Map:
     """The map of one viewer.
 
     `marks`: a row per vehicle in `shown`; `events`: a row per event in `shown_events`; both can be tapped.
-    `focus`: one of FOCUSES; `is_long`: draw trails longer than a minute; `truth`: draw the ground truth.
+    `focus`: one of FOCUSES; `is_long`: draw trails longer than a minute; `truth`: also draw the ground truth.
     """
 
     def __init__(self, style: Style, background: Background | None) -> None:
@@ -53,23 +53,23 @@ class Map:
         self.figure = self._draw()
 
     def update(self, snapshot: FleetSnapshot, overview: Fleet, chosen: VehicleView | None) -> None:
-        """Move the markers and extend the tracks; `chosen`: the selected vehicle, `overview`: has the long tracks."""
+        """Move the markers and extend the tracks; `chosen`: the selected vehicle, `overview`: its long histories."""
         tracks: dict[Address, Track] = {}
         for each in sorted(snapshot.vehicles, key=lambda each: each.number):
             for stream in each.streams:
                 if stream is each.main or (self.truth and stream.address.topic == TRUTH):
-                    kept = overview.streams.get(stream.address) if self.is_long else None
-                    tracks[stream.address] = kept.long if kept is not None else stream.stream.minute, each.number
+                    stored = overview.streams.get(stream.address) if self.is_long else None
+                    tracks[stream.address] = stored.long if stored is not None else stream.stream.minute, each.number
         self._tracks.update(tracks)
         placed = [(each, position) for each in snapshot.vehicles if (position := each.main.stream.valid) is not None]
         focused = [(each, position) for each, position in placed if each is chosen]
-        frame = self._frame_of(focused or placed if self.focus == "vehicle" else placed, tracks)
+        frame = self._extent(focused or placed if self.focus == "vehicle" else placed, tracks)
         if self.focus == "follow" and focused:
             half = _FOLLOWED_SIDE / 2
             frame = [[middle - half, middle + half] for middle in focused[0][1][:2]]
         replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
         labels = self._labels(placed, chosen, frame)
-        replace(self.marks, [self._mark(each, position, labels.get(each.vehicle)) for each, position in placed])
+        replace(self.marks, [self._marker(each, position, labels.get(each.vehicle)) for each, position in placed])
         self.shown = [each.vehicle for each, _ in placed]
         ephs = [each.main.stream.last.message.eph for each, _ in focused if each.main.stream.last is not None]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
@@ -78,7 +78,7 @@ class Map:
             self._background.draw(self.figure, self._style, overview.origin.projection)
             self._background = None
 
-    def mark(self, events: Sequence[Event], chosen: VehicleView | None, overview: Fleet) -> None:
+    def mark_events(self, events: Sequence[Event], chosen: VehicleView | None, overview: Fleet) -> None:
         """Mark where the selected vehicle was at each of its events."""
         placed: list[tuple[Event, Position]] = []
         if chosen is not None:
@@ -99,7 +99,7 @@ class Map:
         if found := _SIZE.fullmatch(size):
             self.size = float(found[1]), float(found[2])
 
-    def _frame_of(self, shown: _Placed, tracks: dict[Address, Track]) -> list[list[float]]:
+    def _extent(self, shown: _Placed, tracks: dict[Address, Track]) -> list[list[float]]:
         """Return the extent of the map: [west, east], [south, north] [m]."""
         points = [np.array([position[:2] for _, position in shown] or [(0.0, 0.0)])]
         points += [tracks[each.main.address][0].points()[:, 1:3] for each, _ in shown]
@@ -112,7 +112,7 @@ class Map:
         return sides
 
     def _labels(self, shown: _Placed, chosen: VehicleView | None, frame: list[list[float]]) -> dict[str, bool]:
-        """Return the labels that fit, the most severe vehicles first, and whether each is left of its marker."""
+        """Return the vehicles whose labels fit, most severe first; True if the label is left of its marker."""
         (west, east), (south, north) = frame
         width, height = self.size
         scale, right = max((east - west) / width, (north - south) / height), east  # m per pixel
@@ -120,7 +120,8 @@ class Map:
         if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
             scale, right = (end - start) / width, end
         places = [(each, at.east / scale, at.north / scale) for each, at in shown]
-        severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is chosen}  # may cover markers
+        # Labels of these vehicles may cover markers.
+        severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is chosen}
         taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
         labels: dict[str, bool] = {}
         for each, x, y in sorted(places, key=lambda known: known[0] is not chosen):
@@ -128,19 +129,19 @@ class Map:
             is_left = x + size > right / scale  # otherwise it would extend beyond the map
             begin, end = (x - size, x) if is_left else (x, x + size)
             if each is chosen or all(
-                end < left or wide < begin or low + _HEIGHT <= bottom or top <= low
-                for owner, left, wide, bottom, top in taken
+                end < left or far < begin or low + _HEIGHT <= bottom or top <= low
+                for owner, left, far, bottom, top in taken
                 if owner != name and (owner in ("", *severe) or name not in severe)
             ):
                 taken.append(("", begin, end, low, low + _HEIGHT))
                 labels[name] = is_left
         return labels
 
-    def _mark(self, view: VehicleView, at: Position, is_left: bool | None) -> dict[str, Any]:
-        """Return a marker shaped by grade: filled at the current position, open at the last valid one."""
+    def _marker(self, view: VehicleView, at: Position, is_left: bool | None) -> dict[str, Any]:
+        """Return a marker shaped by grade: filled at the current position, open at the last valid position."""
         last = view.main.stream.last
         heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
-        colour = self._style.vehicle(view.number)
+        colour = self._style.vehicle_colour(view.number)
         return {
             "east": round(at.east, 3), "north": round(at.north, 3), "angle": round(math.pi / 2 - heading, 3),
             "shape": MARKERS[view.grade], "colour": colour, "fill": colour if view.has_position else self._style.ground,
@@ -159,10 +160,10 @@ class Map:
         frame = plot.scatter("east", "north", source=self._frame, size=0, alpha=0)
         for axis in (plot.x_range, plot.y_range):
             axis.update(renderers=[frame], range_padding=0)
-        *valid, doubtful, truth = NAMES
+        *valid, doubtful, truth = LINE_TYPES
         plot.line("east", truth, source=tracks, color=style.truth, line_dash="dotted", line_width=2)
         for number, name in enumerate(valid):
-            plot.line("east", name, source=tracks, color=style.vehicle(number), line_width=1.5)
+            plot.line("east", name, source=tracks, color=style.vehicle_colour(number), line_width=1.5)
         plot.line("east", doubtful, source=tracks, color=style.grades["watch"], line_dash="dashed", line_width=2)
         plot.circle(
             "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=style.text, line_dash="dashed"

@@ -27,17 +27,16 @@ _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s of history loaded before the playback position
 _OVERVIEW: Final = 20_000, 0.5  # number of points of a whole flight, and s between two points
-_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # topics with shown values
+_STATUS_TOPICS: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
 class Recording:
     """The messages of one or several files in order of time, loaded in a background thread.
 
-    Positions and topics whose values are shown are kept as payloads; of all others, only PX4's timestamp.
     `overview`: the whole flight at two points per second; `timeline`: the events, in seconds since the first message.
-    `entries`: address of each message, and its payload, timestamp or reason of rejection.
-    `dues`: time of each message since the first one [s].
+    `entries`: the address of each message with its payload (positions and status topics), rejection reason, or only
+    PX4's timestamp (other topics). `dues`: time of each message since the first one [s].
 
     Raises ConfigError and SourceError if a file cannot be read.
     """
@@ -64,16 +63,16 @@ class Recording:
             self.timeline.times = flights.times
             for message, reason, payload in follow(flights.messages(), event_log, ended=flights.ended):
                 address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
-                kept: bytes | str | int = stamp if reason is None else reason
-                if payload is not None and (is_position(address) or address.topic in _KEPT):
-                    kept = payload
+                entry: bytes | str | int = stamp if reason is None else reason
+                if payload is not None and (is_position(address) or address.topic in _STATUS_TOPICS):
+                    entry = payload
                     if is_position(address):
                         row = codec_of(DEFAULT).decode_row(payload)
                         self.overview.add(Sample(row, address, round(message.due * 1e9)), message.due)
                 if reason is None and address not in self.indices and is_position(address):
-                    self.timeline.set_start(address.vehicle, stamp / 1e6, message.due)
+                    self.timeline.set_clock(address.vehicle, stamp / 1e6, message.due)
                 self.indices.setdefault(address, []).append(len(self.entries))
-                self.entries.append((address, kept))
+                self.entries.append((address, entry))
                 self.dues.append(message.due)
             for warning in flights.warnings:
                 _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
@@ -84,9 +83,9 @@ class Recording:
 
 
 class Player:
-    """Playback of a recording for one viewer; `fleet` shows the playback position.
+    """Playback of a recording for one viewer; `fleet` is at the playback position.
 
-    `on_seek`: called after each seek; `controls`: play button, speed menu and slider of the page.
+    `on_seek`: called after each seek; `controls`: play button, speed menu and slider.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -97,7 +96,7 @@ class Player:
         self._monitor = Monitor()
         self._next = 0
         self._ticked = time.monotonic()
-        self._shown = 0.0  # last value set by the player; the slider has another one while it is dragged
+        self._shown = 0.0  # last slider value set by the player; differs from the slider's while the user drags it
         self._play = Toggle(label="pause", active=True, width=80)
         self._speed = Select(options=_SPEEDS, value="1", width=80)
         self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
@@ -129,8 +128,8 @@ class Player:
         self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
         indices = list(self.recording.indices.values())
         silent = (known[at - 1] for known in indices if (at := bisect_left(known, self._next)))
-        for index in sorted(silent):  # the last message of each stream that was silent in this minute
-            self._show(index)
+        for index in sorted(silent):  # the last message before this minute of each stream
+            self._add(index)
         for address, stream in self.fleet.streams.items():
             overview = self.recording.overview.streams.get(address)
             if stream.valid is None and overview is not None:
@@ -141,22 +140,22 @@ class Player:
     def _feed(self) -> None:
         end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
-            self._show(index)
+            self._add(index)
         self._next = max(self._next, end)
         states = {name: state_at(spans, self.time) for name, spans in self.recording.timeline.spans.items()}
         self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states)
 
-    def _show(self, index: int) -> None:
-        due, (address, kept) = self.recording.dues[index], self.recording.entries[index]
+    def _add(self, index: int) -> None:
+        due, (address, entry) = self.recording.dues[index], self.recording.entries[index]
         received = round(due * 1e9)
-        if isinstance(kept, str):
-            self.fleet.reject([RejectionReport(address, kept, received)])
+        if isinstance(entry, str):
+            self.fleet.reject([RejectionReport(address, entry, received)])
             return
         message: Any
-        if isinstance(kept, bytes):
-            message = codec_of(BY_TOPIC[address.topic]).decode_row(kept)
+        if isinstance(entry, bytes):
+            message = codec_of(BY_TOPIC[address.topic]).decode_row(entry)
         else:
-            message = SimpleNamespace(timestamp=kept)
+            message = SimpleNamespace(timestamp=entry)
         sample = Sample(message, address, received)
         self._monitor.add(sample, received=received)
         self.fleet.add(sample, due)

@@ -43,14 +43,14 @@ from .viewer import Viewer
 _log = logging.getLogger(__name__)
 
 MAX_VIEWERS: Final = 32  # pages open at the same time, each with a WebSocket
-_ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - wildcard hosts, only compared
+_WILDCARDS: Final = {"0.0.0.0", "::"}  # noqa: S104 - only compared
 _STOP_POLL: Final = 100  # ms between checks of `stop`
 _MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before the Host header is checked
 _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
-_MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket; all but the newest are about to expire
+_MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, including expiring ones
 _MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
 _PING: Final = 15.0  # s between WebSocket pings; without a pong before the next one, the connection is closed
-_UNUSED_LIFETIME: Final = 15_000  # ms that a page is kept without its browser, which may be suspended
+_UNUSED_LIFETIME: Final = 15_000  # ms that a page is kept without a connection, e.g. from a suspended browser
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def serve_recording(
 
 
 class LiveFleet(Exporter):
-    """Exporter that also maintains the fleet and the event timeline of a page."""
+    """Exporter that also updates the fleet and the event timeline of a page."""
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         super().__init__(bus, selection, version=version)
@@ -123,7 +123,7 @@ class LiveFleet(Exporter):
         """Poll all vehicles; update the fleet and the clock of the timeline."""
         snapshot, event_log = super().poll(), self.event_log
         ahead = round(clock.to_utc(), 1)  # rounded: each change redraws the time axes
-        self.timeline.start, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
+        self.timeline.clock_offset, self.timeline.times = ahead, Times(is_live=True, ahead=ahead)
         vehicles = {*event_log.vehicles, *(address.vehicle for address in [*self.fleet.streams])}
         states = {vehicle: event_log.state(vehicle, snapshot.time) for vehicle in vehicles}
         self.fleet.update(snapshot, states, self.log_streams)
@@ -150,10 +150,10 @@ class WebServer:
         def open_or_refuse(document: Document) -> None:
             sessions = self._server.get_sessions("/")
             waiting = [each for each in sessions if not each.connection_count]
-            for each in waiting[:-MAX_VIEWERS]:  # requested by clients that open no WebSocket
+            for each in waiting[:-MAX_VIEWERS]:  # their clients have opened no WebSocket
                 each.request_expiration()
             if len(sessions) - len(waiting) >= MAX_VIEWERS or len(waiting) >= _MAX_WAITING:
-                _log_once("limit of open pages reached (%d): further ones are refused", MAX_VIEWERS)
+                _log_once("limit of %d open pages reached: further pages are refused", MAX_VIEWERS)
                 document.add_root(Div(text=f"limit of {MAX_VIEWERS} open pages reached: close one"))
             else:
                 open_page(document)
@@ -167,10 +167,10 @@ class WebServer:
         tornado = BokehTornado(
             {"/": Application(FunctionHandler(open_or_refuse))},
             extra_websocket_origins=["*"], auth_provider=_HostCheck(options),
-            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's own job drops sessions during a message
+            keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's keep-alive may drop a busy session
             unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
             websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
-            extra_patterns=[(path, _TextHandler, {"make": make, "options": options}) for path, make in pages.items()],
+            extra_patterns=[(path, _TextHandler, {"render": each, "options": options}) for path, each in pages.items()],
         )  # fmt: skip
         http = _HttpServer(
             tornado, max_body_size=_MAX_BODY_BYTES, max_buffer_size=2 * _MAX_MESSAGE_BYTES,
@@ -178,7 +178,7 @@ class WebServer:
         )  # fmt: skip
         self._loop.add_callback(http.add_sockets, sockets)
         self._server = BaseServer(self._loop, tornado, http)
-        shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
+        shown = "127.0.0.1" if host in _WILDCARDS else f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{port}"
 
     def run(self, stop: threading.Event) -> None:
@@ -203,7 +203,7 @@ class _HttpServer(HTTPServer):
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         self._streams = [each for each in self._streams if not each.closed()]
         if len(self._streams) >= self._limit:
-            _log_once("limit of connections reached (%d): further ones are closed", self._limit)
+            _log_once("limit of %d connections reached: further connections are closed", self._limit)
             stream.close()
             return
         self._streams.append(stream)
@@ -251,13 +251,13 @@ def _check_host(handler: RequestHandler, options: PageOptions) -> None:
 
 
 class _TextHandler(RequestHandler):
-    def initialize(self, make: Callable[[], Page], options: PageOptions) -> None:
-        self._make, self._options = make, options
+    def initialize(self, render: Callable[[], Page], options: PageOptions) -> None:
+        self._render, self._options = render, options
 
     def get(self) -> None:
         if is_loopback(self._options.host):
             _check_host(self, self._options)
-        page = self._make()
+        page = self._render()
         self.set_status(page.status)
         self.set_header("Content-Type", page.content_type)
         self.set_header("X-Content-Type-Options", "nosniff")

@@ -15,7 +15,7 @@ from nedbus_msgs import BY_TOPIC, DEFAULT, Address, ResetTracker, VehicleLocalPo
 from nedbus_msgs.frames import MapProjection, to_global
 
 POINTS: Final = 600  # number of points in the history of the last minute
-LONG: Final = 900, 1.0  # number of points in the longer history, and seconds between two points: 15 minutes
+LONG: Final = 900, 1.0  # number of points in the long history, and seconds between two points: 15 minutes
 COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
 """Columns of a history, NaN where the message was not valid.
 
@@ -40,7 +40,7 @@ def is_position(address: Address) -> bool:
 class Position(NamedTuple):
     """A position [m].
 
-    `common`: True if relative to the common origin, False if relative to the vehicle's own.
+    `common`: True if relative to the common origin, False if relative to the vehicle's own origin.
     `altitude`: above mean sea level if known, else above the vehicle's own origin.
     """
 
@@ -56,7 +56,7 @@ class History:
     def __init__(self, size: int, step: float) -> None:
         self.size, self.step = size, step
         self.written = 0
-        self._points = np.empty((size, len(COLUMNS)))  # uses memory only once written, as for positions
+        self._points = np.empty((size, len(COLUMNS)))  # uses no memory until written; only positions are
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
         """Return points `begin` to `end` that are not overwritten yet, oldest first; shape (n, columns)."""

@@ -43,20 +43,20 @@ class Style:
     truth: str
     chosen: str
 
-    def vehicle(self, number: int) -> str:
-        """Return the colour of a vehicle."""
+    def vehicle_colour(self, number: int) -> str:
+        """Return the colour of a vehicle, by its number."""
         return self.vehicles[number % PALETTE]
 
     @property
     def colours(self) -> dict[str, str]:
-        """Colours by their names in CSS and in the plot theme."""
+        """Colours by name in CSS and in the plot theme."""
         plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
         return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
 
 
 @cache
 def panels() -> jinja2.Template:
-    """Return the template of `panels.html`; its context is a style, a timeline and the timeline's `moment`."""
+    """Return the template of `panels.html`; its context has a style, a timeline and its `format_time`."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters.update(age=format_duration, degrees=math.degrees)
     environment.tests.update(finite=math.isfinite, position=is_position)

@@ -15,24 +15,24 @@ from .style import MARKERS, SHAPES, Style
 
 _MAX_ROWS: Final = 7  # vehicles; if there are more, the last row counts the hidden ones
 _MAX_MARKS: Final = 2000
-_MIN_ROWS: Final = 4  # minimum height in rows, which keeps the bars of few vehicles thin
+_MIN_ROWS: Final = 4  # minimum height in rows; fewer rows would have thick bars
 _PLOTS: Final = {
     "height above own origin [m]": ("height",),
     "horizontal speed [m/s]": ("speed",),
     "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
 }
-_LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} phase of flight  ▬ duration  ┊ now"
+_LEGEND: Final = f"{SHAPES['bad']} bad  {SHAPES['watch']} watch  {SHAPES['info']} flight phase  ▬ duration  ┊ now"
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
-_OF_TRUTH: Final = {"height", "speed"}
+_TRUTH_COLUMNS: Final = {"height", "speed"}
 
 
 def notable(events: Iterable[Event]) -> list[Event]:
-    """Return the events to show: faults and flight phases; if more than 2,000, only the latest faults."""
+    """Return the events to mark: faults and flight phases; if more than 2,000, only the latest faults."""
     shown = [event for event in events if event.severity != "info" or KINDS[event.kind].phase]
     return shown if len(shown) <= _MAX_MARKS else [each for each in shown if each.severity != "info"][-_MAX_MARKS:]
 
 
-def move(axis: Range1d, begin: float, end: float) -> None:
+def set_time_range(axis: Range1d, begin: float, end: float) -> None:
     """Set the range of a time axis [s]."""
     axis.update(start=begin * 1e3, end=end * 1e3)
 
@@ -65,7 +65,7 @@ class TimelinePlot:
         self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
         begin: float, end: float, now: float,
     ) -> None:  # fmt: skip
-        """Show the events from `begin` to `end` [s]; `vehicles`: the most important first."""
+        """Show the events from `begin` to `end` [s]; `vehicles`: the selected one first, then by severity."""
         events = notable(event for event in events if begin <= event.time <= end)
         held = [  # bad last, drawn over watch
             (name, span)
@@ -99,8 +99,8 @@ class TimelinePlot:
         labels |= {0: f"+{hidden} more"} if hidden else {}
         self._ticker.ticks = list(labels)
         self.figure.yaxis.major_label_overrides = labels
-        room = max(_MIN_ROWS - len(names), 0) / 2
-        self.figure.y_range.update(start=0.4 - room - bool(hidden), end=len(names) + 0.6 + room)
+        padding = max(_MIN_ROWS - len(names), 0) / 2
+        self.figure.y_range.update(start=0.4 - padding - bool(hidden), end=len(names) + 0.6 + padding)
 
 
 class Plots:
@@ -115,7 +115,7 @@ class Plots:
         self._style, self._clock = style, clock
 
     def draw(self) -> Iterator[figure]:
-        """Yield new plots one by one, as each takes as long to draw as the map."""
+        """Yield new plots one by one, because each takes a browser as long to draw as the map."""
         return (self._draw(title, names) for title, names in _PLOTS.items())
 
     def update(self, chosen: History | None, truth: History | None) -> None:
@@ -131,7 +131,7 @@ class Plots:
             elif history is not None and len(points):
                 source.stream(columns, rollover=history.size)
 
-    def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
+    def mark_events(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
         """Mark the events of the vehicle and shade its conditions; active ones end at `end` [s]."""
         colours = self._style.grades
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
@@ -148,7 +148,7 @@ class Plots:
         for name, colour in zip(names, self._style.vehicles, strict=False):
             legend: dict[str, Any] = {"legend_label": name} if len(names) > 1 else {}
             plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
-            if name in _OF_TRUTH:
+            if name in _TRUTH_COLUMNS:
                 plot.line("time", name, source=self._truth, color=self._style.truth, line_dash="dotted", line_width=1.5)
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)

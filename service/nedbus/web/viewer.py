@@ -26,7 +26,7 @@ from .map import FOCUSES, Map
 from .playback import Player
 from .stream import is_position
 from .style import DARK, LIGHT, panels, read_asset
-from .time_plots import Plots, TimelinePlot, move, notable
+from .time_plots import Plots, TimelinePlot, notable, set_time_range
 
 _TICK: Final = 100  # ms between updates of the map
 _TEXT_TICKS: Final = 5  # map updates per update of text and plots
@@ -55,10 +55,10 @@ class Viewer:
         query = {name: values[0].decode(errors="replace")[:_MAX_MESSAGE] for name, values in given if values}
         self.chosen: str | None = query.get("vehicle")
         self.pinned: float | None = None  # selected moment of live vehicles
-        asked = query.get("time", "")
-        self._requested_time = float(asked) if _SECONDS.fullmatch(asked) else None
+        time = query.get("time", "")
+        self._requested_time = float(time) if _SECONDS.fullmatch(time) else None
         self._is_choice = self.chosen is not None
-        self._event: Event | None = None  # the selected event of that vehicle
+        self._event: Event | None = None  # the selected event of the selected vehicle
         self._is_open = False  # True if the table of streams is open
         self._listed: list[str] = []
         self._faults: list[Event] = []
@@ -72,7 +72,7 @@ class Viewer:
         self._undrawn = self._plots.draw()
         self._map = Map(self._style, background)
         self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
-        context = {"style": self._style, "timeline": timeline, "moment": timeline.moment}
+        context = {"style": self._style, "timeline": timeline, "format_time": timeline.format_time}
         self._panels: Any = panels().make_module(context)
         sheets: list[Any] = [read_asset("text.css")]
         wide: dict[str, Any] = {"stylesheets": sheets, "sizing_mode": "stretch_width"}
@@ -86,7 +86,7 @@ class Viewer:
         self._update_number.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
         self._url.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
         self._message.on_change("value", lambda _, __, message: self._act(message))
-        self._search.on_change("value_input", lambda _, __, ___: self._show_now())
+        self._search.on_change("value_input", lambda _, __, ___: self._update_text_soon())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
         self._on_tap(self._map.events, lambda: self._map.shown_events, self._show)
         self._on_tap(self._timeline_plot.marks, lambda: self._timeline_plot.shown, self._show)
@@ -99,10 +99,10 @@ class Viewer:
         document.add_root(self._lay_out(sheets))
         document.add_periodic_callback(self.update, _TICK)
         if player is not None:
-            player.on_seek = self._show_now
+            player.on_seek = self._update_text_soon
 
     def update(self) -> None:
-        """Send changes: the map each time, the rest twice a second; do nothing while the browser falls behind."""
+        """Send changes: map at each tick, text and plots twice a second; do nothing while the browser falls behind."""
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]
@@ -112,7 +112,7 @@ class Viewer:
         if self._drawn.value and (plot := next(self._undrawn, None)):  # plots follow one by one after map and list
             self._grid.children = [*self._grid.children, plot]
         snapshot = self._fleet.snapshot
-        if not self._is_choice and snapshot.vehicles:  # the most severe one until the user selects one
+        if not self._is_choice and snapshot.vehicles:  # select the most severe vehicle until the user selects one
             self.chosen = snapshot.vehicles[0].vehicle
         chosen = snapshot.vehicle(self.chosen)
         self._grid.visible = bool(self._grid.children) and chosen is not None and is_position(chosen.main.address)
@@ -120,12 +120,12 @@ class Viewer:
         if self._ticks % _TEXT_TICKS == 0:
             self._go_to_requested()
             moment = snapshot.time if self.pinned is None else self.pinned
-            self._write_all(snapshot, chosen, moment)
-            self._plot(snapshot, chosen, moment)
+            self._update_text(snapshot, chosen, moment)
+            self._update_plots(snapshot, chosen, moment)
         self._ticks += 1
         self._update_number.value = str(self._sent)
 
-    def _show_now(self) -> None:
+    def _update_text_soon(self) -> None:
         self._ticks = 0
 
     def _show(self, event: Event) -> None:
@@ -154,12 +154,12 @@ class Viewer:
             self._go_to(time)
             self._requested_time = None
 
-    def _write_all(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
+    def _update_text(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in snapshot.vehicles)
         self._document.title = f"({bad} bad) {self._name}" if bad else self._name
-        self._clock.args = {"start": self._timeline.start, "clock": self._timeline.unit}
-        clock = self._timeline.clock(snapshot.time) if snapshot.time or player else ""
+        self._clock.args = {"start": self._timeline.clock_offset, "clock": self._timeline.unit}
+        clock = self._timeline.format_clock(snapshot.time) if snapshot.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
         rows = [each for each in snapshot.vehicles if wanted in f"{each.vehicle}\n{each.state.text}".lower()]
         self._listed = [each.vehicle for each in rows]
@@ -190,39 +190,39 @@ class Viewer:
             "view": self._map.focus if self._map.focus != "all" else None,
             "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
-        if self._drawn.value:  # only once the browser is connected: it would miss the first change
+        if self._drawn.value:  # before the browser is connected, it would miss the change
             self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
 
-    def _plot(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
+    def _update_plots(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:
         vehicle, is_long_trail = self.chosen or "", self._map.is_long
         is_long = is_long_trail or now < snapshot.time - _MINUTE
         main = truth = None
         if chosen is not None and is_position(chosen.main.address):
             streams = self._overview.streams if is_long else self._fleet.streams
-            kept = streams.get(chosen.main.address), streams.get(Address(vehicle, TRUTH))
-            main, truth = (None if each is None else each.long if is_long else each.minute for each in kept)
+            pair = streams.get(chosen.main.address), streams.get(Address(vehicle, TRUTH))
+            main, truth = (None if each is None else each.long if is_long else each.minute for each in pair)
         self._plots.update(main, truth)
         begin, end = (0.0, self._player.recording.length) if self._player else (snapshot.time - PAST, snapshot.time)
         if self.pinned is not None:
-            move(self._plots.range, now - _AROUND, now + _AROUND)
+            set_time_range(self._plots.range, now - _AROUND, now + _AROUND)
         elif is_long_trail:
-            move(self._plots.range, begin, end)
+            set_time_range(self._plots.range, begin, end)
         else:
             first = max(begin, now - _MINUTE)
-            move(self._plots.range, first, min(first + _MINUTE, max(end, 1.0)))
+            set_time_range(self._plots.range, first, min(first + _MINUTE, max(end, 1.0)))
         if self._player is None:  # live, the timeline begins with the first event
             first = next((event.time for event in self._timeline.events if event.time > begin), now)
             begin = max(begin, min(first, now - _MINUTE) - 1.0)
         events = self._events_of_chosen()
-        self._plots.mark(events, self._timeline.spans.get(vehicle, ()), end)
+        self._plots.mark_events(events, self._timeline.spans.get(vehicle, ()), end)
         order = [*filter(None, [vehicle]), *(each.vehicle for each in snapshot.vehicles if each.vehicle != vehicle)]
         self._timeline_plot.update(self._timeline.events, self._timeline.spans, order, begin=begin, end=end, now=now)
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:
-            move(self._timeline_plot.range, begin, max(end, begin + 1.0))
+            set_time_range(self._timeline_plot.range, begin, max(end, begin + 1.0))
         if self._player is not None:
             self._text["marks"].text = self._panels.strip(self._timeline_plot.shown, self._player.recording.length)
         since = 0.0 if is_long_trail else now - _MINUTE
-        self._map.mark([event for event in events if since < event.time <= now + 1.0], chosen, self._overview)
+        self._map.mark_events([event for event in events if since < event.time <= now + 1.0], chosen, self._overview)
 
     def _events_of_chosen(self) -> list[Event]:
         return notable(event for event in self._timeline.events if event.vehicle == self.chosen)
@@ -257,7 +257,7 @@ class Viewer:
                 self._show_next(is_later=name == "next")
             case "play" | "left" | "right" | "LEFT" | "RIGHT" if player is not None:
                 player.toggle() if name == "play" else player.seek(player.time + _STEPS[name])
-        self._show_now()
+        self._update_text_soon()
 
     def _choose_next(self, step: int) -> None:
         if names := self._listed:  # wraps around
@@ -278,7 +278,7 @@ class Viewer:
         def tap(_: str, __: object, rows: list[int]) -> None:
             if rows and 0 <= rows[0] < len(shown()):
                 show(shown()[rows[0]])
-                self._show_now()
+                self._update_text_soon()
             source.selected.indices = []
 
         source.selected.on_change("indices", tap)

@@ -1,6 +1,6 @@
-"""A ROS 2 node by zenoh-ros2-sdk for a subprocess: `talk` publishes rows, `listen` prints received messages.
+"""ROS 2 node based on zenoh-ros2-sdk, for a subprocess: `talk` publishes rows, `listen` prints received messages.
 
-It is independent of nedbus: type definition and rows are in the JSON file named by its second argument.
+It is independent of nedbus: the JSON file named by its second argument has the type definition and the rows.
 """
 
 from __future__ import annotations

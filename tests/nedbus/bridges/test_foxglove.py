@@ -134,13 +134,13 @@ def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
     there = here.model_copy(update={"ref_lat": 47.001, "ref_alt": 410.0})
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
         for vehicle, each in (("1", here), ("2", there)):
-            server.show(sample := Sample(each, Address(vehicle, VLP), received=1))
+            server.log(sample := Sample(each, Address(vehicle, VLP), received=1))
         names = {"/1/pose", "/1/location", "/2/pose", "/2/location", "/tf", f"/1/{VLP}"}
         client.until(lambda: names <= client.topics.keys())
         assert client.channels[client.topics["/tf"]]["schemaName"] == "foxglove.FrameTransforms"
         client.subscribe("/2/pose", "/2/location", "/tf")
         while client.data.keys() < {"/2/pose", "/2/location", "/tf"}:
-            server.show(sample)
+            server.log(sample)
             client.receive_soon()
     position = to_global(there)
     assert position
@@ -181,15 +181,15 @@ def test_pose_has_position_and_attitude(bus: nedbus.Bus) -> None:
     """The pose uses the vehicle_attitude of its vehicle, not that of another vehicle or the ground truth."""
     level, rolled = (VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)))
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
-        server.show(Sample(rolled, Address("1", "vehicle_attitude"), received=1))
+        server.log(Sample(rolled, Address("1", "vehicle_attitude"), received=1))
         for other in (Address("2", "vehicle_attitude"), Address("1", "vehicle_attitude_groundtruth")):
-            server.show(Sample(level, other, received=1))
+            server.log(Sample(level, other, received=1))
         sample = Sample(message(1, x=1.0, y=2.0, z=3.0), Address("1", VLP), received=1)
-        server.show(sample)
+        server.log(sample)
         client.until(lambda: "/1/pose" in client.topics)
         client.subscribe("/1/pose")
         while "/1/pose" not in client.data:
-            server.show(sample)
+            server.log(sample)
             client.receive_soon()
     x, y, z, _ = orientation_of(sample.message, rolled)
     assert (x, y, z) == pytest.approx((0.5, 0.5, 0.5))

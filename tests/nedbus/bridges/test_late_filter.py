@@ -53,7 +53,7 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
 
 
 def test_slowly_recovered_samples_are_held_back() -> None:
-    """Over a slow link the backlog shrinks slowly; its samples are held back all the same."""
+    """Over a slow link the backlog shrinks slowly; its samples are held back, too."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))
@@ -62,7 +62,7 @@ def test_slowly_recovered_samples_are_held_back() -> None:
 
 
 def test_retained_sample_is_held_back() -> None:
-    """A retained message is held back, as its age is unknown; the next message is current."""
+    """A retained message is held back, because its age is unknown; the next message is current."""
     late = LateFilter()
     assert not late.admits(sample(NOW, retained=True), arrived=50 * SECOND)
     assert admitted(late, (3600.0, 3650.0)) == [True]
@@ -97,7 +97,7 @@ def test_clock_drift_does_not_make_samples_late() -> None:
 
 
 def test_restarted_publisher_has_a_new_clock() -> None:
-    """A vehicle that restarts with a clock from 1970 is current at once; a forgotten one, too."""
+    """Samples of a vehicle that restarts with a clock from 1970, or was forgotten, are current at once."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     assert late.admits(sample(SECOND, by=8), arrived=SECOND)
@@ -106,7 +106,7 @@ def test_restarted_publisher_has_a_new_clock() -> None:
 
 
 def test_sample_without_a_timestamp_is_current() -> None:
-    """A sample without a timestamp is admitted, as its age cannot be measured."""
+    """A sample without a timestamp is admitted, because its age cannot be measured."""
     late = LateFilter()
     assert late.admits(sample(None), arrived=0)
     assert late.admits(sample(None), arrived=3600 * SECOND)

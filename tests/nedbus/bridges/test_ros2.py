@@ -46,7 +46,7 @@ from tests.waits import DEADLINE, repeating, wait_for, wait_for_matching
 PEER = str(Path(__file__).with_name("ros2_peer.py"))
 KEY = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
 
-TWELVE = LOGS.parent / "px4" / "twelve_messages.ulg"
+TWELVE_MESSAGES = LOGS.parent / "px4" / "twelve_messages.ulg"
 
 Peer = Callable[..., Process]
 RunBridge = Callable[..., None]
@@ -170,16 +170,16 @@ def test_bridge_publishes_like_px4(run_bridge: RunBridge, bus: nedbus.Bus, zenoh
 
 
 @pytest.mark.logs
-@pytest.mark.skipif(not TWELVE.exists(), reason=f"no PX4 log at {TWELVE}")
+@pytest.mark.skipif(not TWELVE_MESSAGES.exists(), reason=f"no PX4 log at {TWELVE_MESSAGES}")
 @pytest.mark.parametrize("release", ["1.13", "1.15", "main"])
 def test_messages_have_the_layout_of_the_release(
     run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture, release: str
 ) -> None:
-    """Key, type hash and CDR fields of every topic in a real log are those of the selected release.
+    """Key, type hash and CDR fields of every topic in a real log match the selected release.
 
     Messages that the release lacks are logged once. Of streams without a rate, the last message is published.
     """
-    last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE}").messages}
+    last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE_MESSAGES}").messages}
     messages = {each: upgrade_with(BY_TOPIC[each.topic], fields) for each, fields in last.items()}
     publishers = [bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in messages]
     for publisher, each in zip(publishers, messages.values(), strict=True):
@@ -248,7 +248,7 @@ def test_retained_message_is_not_bridged(
 def test_late_messages_of_a_returning_vehicle_are_held_back(
     run_bridge: RunBridge, zenoh_session: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A vehicle may be gone for a moment after a router restart: messages recovered then are held back."""
+    """After a router restart a vehicle may be gone for a moment; messages recovered afterwards are held back."""
     timings.lateness = 0.2
     address = Address("1", VLP)
     subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
@@ -333,7 +333,7 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
     ],
 )
 def test_gid_matches_rmw_zenoh(type_hash: str, gid: str) -> None:
-    """The gids were computed by rmw_zenoh's code (simplified_xxhash3.cpp), for short and long inputs."""
+    """The gid equals the one computed by rmw_zenoh (simplified_xxhash3.cpp), for short and long inputs."""
     key = TopicKey(0, f"fmu/out/{VLP}", "px4_msgs::msg::dds_::VehicleLocalPosition_", type_hash)
     token = key.token("MP", "0123456789abcdef" * 2, "nedbus_4711", 1)
     assert gid_of_token(token).hex() == gid
@@ -346,7 +346,7 @@ def test_topic_of_another_node_is_not_published_twice(
     timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A topic that PX4 publishes itself is not published, except in another layout, which is a translation."""
+    """A topic that PX4 publishes itself is not published, except as a translation to another layout."""
     timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))

@@ -56,7 +56,7 @@ HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timesta
 
 
 def test_last_uses_no_future_message() -> None:
-    """With method "last" a row has the last message at or before it, and its age; before the first one NaN."""
+    """With method "last" a row has the last message at or before it, and its age; before the first message NaN."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME})
     assert table["timestamp"].tolist() == POSITIONS["timestamp"].tolist()
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4]
@@ -70,7 +70,7 @@ def test_last_uses_no_future_message() -> None:
 
 
 def test_nearest_may_use_a_future_message() -> None:
-    """With method "nearest" a later message has a negative age; of two equally near ones the earlier is used."""
+    """With method "nearest" a later message has a negative age; of two equally near messages the earlier is used."""
     table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
     assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
     assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
@@ -111,7 +111,7 @@ def test_angles_are_interpolated_the_shorter_way(field: str, first: float, secon
 
 
 def test_quaternions_are_interpolated_by_slerp() -> None:
-    """Quaternions rotate at a constant rate with norm 1, even if the sign flips; equal ones and NaN are handled."""
+    """Interpolated quaternions rotate at a constant rate with norm 1, even if the sign flips; NaN remains NaN."""
     turns = [yaw(0.0), tuple(-each for each in yaw(2.0)), yaw(2.0), (math.nan,) * 4]
     messages = array_of("vehicle_attitude", *({"timestamp": 4 * n, "q": q} for n, q in enumerate(turns)))
     table = nedbus.align({"vehicle_attitude": messages}, on=[0, 1, 2, 3, 4, 6, 10], method="linear")
@@ -130,7 +130,7 @@ def test_floats_are_not_interpolated_across_a_reset() -> None:
 
 
 def test_fields_select_the_columns() -> None:
-    """A field selects a column, or that of every stream; time columns are always present; an unknown field raises."""
+    """`stream.field` selects one column, `field` one of every stream; time columns remain; unknown fields raise."""
     flight = {VLP: POSITIONS, "home_position": HOME}
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
     assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
@@ -205,7 +205,7 @@ def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
 
 
 def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
-    """`read` returns a dict by stream, for one vehicle; `align` has the selected streams and that of its rows."""
+    """`read` returns a dict by stream for one vehicle; `align` has the selected streams and the stream of its rows."""
     batteries = [array_of("battery_status", {"timestamp": 1_200_000, "voltage_v": volts}) for volts in (16.0, 12.0)]
     streams = {
         VLP: POSITIONS,
@@ -245,20 +245,20 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     gps = array_of("sensor_gps", {"timestamp": 1_100_000, "time_utc_usec": BOOT + 1_100_000, "satellites_used": 9})
     attitude = array_of("vehicle_attitude", {"timestamp": 1_100_000, "q": yaw(1.0)})
     path = write(tmp_path / "a.mcap", {VLP: POSITIONS, "sensor_gps/0": gps, "vehicle_attitude": attitude})
-    panda = nedbus.align(path, dataframe="pandas", utc=True)
-    bear = nedbus.align(path, dataframe="polars", utc=True)
-    assert list(panda.columns) == bear.columns
-    assert bear["sensor_gps/0.satellites_used"].to_list() == [None, 9, 9, 9, 9]
-    assert panda["sensor_gps/0.satellites_used"].isna().tolist() == [True] + [False] * 4
-    assert panda["vehicle_attitude.q[3]"].iloc[1] == np.float32(math.sin(0.5))
-    assert bear["utc"].dtype == pl.Datetime("us", "UTC")
-    assert panda["utc"].iloc[1] == bear["utc"][1] == datetime.fromtimestamp(BOOT / 1e6 + 1.1, UTC)
+    in_pandas = nedbus.align(path, dataframe="pandas", utc=True)
+    in_polars = nedbus.align(path, dataframe="polars", utc=True)
+    assert list(in_pandas.columns) == in_polars.columns
+    assert in_polars["sensor_gps/0.satellites_used"].to_list() == [None, 9, 9, 9, 9]
+    assert in_pandas["sensor_gps/0.satellites_used"].isna().tolist() == [True] + [False] * 4
+    assert in_pandas["vehicle_attitude.q[3]"].iloc[1] == np.float32(math.sin(0.5))
+    assert in_polars["utc"].dtype == pl.Datetime("us", "UTC")
+    assert in_pandas["utc"].iloc[1] == in_polars["utc"][1] == datetime.fromtimestamp(BOOT / 1e6 + 1.1, UTC)
     assert nedbus.utc_of(path) == nedbus.UtcOffset("sensor_gps/0", BOOT, 1, 0)
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
 
 
 def test_utc_source_is_gnss_then_companion_else_none() -> None:
-    """UTC comes from GNSS, else from a companion after 2000; zeros, other clocks and disagreement do not count."""
+    """UTC comes from GNSS, else from a companion's clock after 2000; zeros and inconsistent offsets are ignored."""
     times = range(1_000_000, 11_000_000, 1_000_000)
     gnss = array_of(
         "sensor_gps",

@@ -1,4 +1,4 @@
-"""Files of other MCAP writers and `ros2 bag record`, which are read completely, and files of other kinds."""
+"""Files of other MCAP writers and `ros2 bag record`, and files in unsupported formats."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def write_bag(
     return path
 
 
-def assert_whole(path: Path, *, warnings: tuple[str, ...] = ()) -> None:
+def assert_complete(path: Path, *, warnings: tuple[str, ...] = ()) -> None:
     """Assert that all ten positions are read as an array, and replayed."""
     assert nedbus.read(path)["x"].tolist() == list(range(10))
     run = open_replay(f"mcap:{path}")
@@ -81,10 +81,10 @@ def test_fields_unknown_to_px4_are_left_out_and_named(tmp_path: Path, where: str
         text = f"{first}uint64 timestamp_sample{rest}\n{own}{text}"
         path = write_bag(tmp_path / "a.mcap", definition=text, change=add_in_middle)
     left_out = f"{TOPIC}: wind_east, wind_north left out: unknown to nedbus in VehicleLocalPosition"
-    assert_whole(path, warnings=(left_out,))
+    assert_complete(path, warnings=(left_out,))
 
 
-def test_definition_of_no_release_raises(tmp_path: Path) -> None:
+def test_definition_that_matches_no_release_raises(tmp_path: Path) -> None:
     """A definition that lacks required fields, or has them with other types, raises; the error names the fields."""
     text = message_definition("1.16").replace("float32 x ", "float64 x ").replace("float32 y ", "float32 y2 ")
     with pytest.raises(SourceError, match=r"its definition of x, y matches no PX4 release"):
@@ -218,10 +218,10 @@ def bag_in_sqlite(path: Path) -> None:
         (bag_in_sqlite, "an SQLite bag: convert it to MCAP with 'ros2 bag convert'"),
     ],
 )
-def test_file_of_another_kind_raises_with_remedy(
+def test_unsupported_file_format_raises_with_remedy(
     tmp_path: Path, make: Callable[[Path], object], reason: str, suffix: str
 ) -> None:
-    """Other kinds of files are recognized by content in every command, and the error names the remedy."""
+    """Every command recognizes an unsupported format by its content, and the error names the remedy."""
     path = tmp_path / f"a{suffix}"
     make(path)
     with pytest.raises(SourceError, match=reason):
@@ -254,8 +254,8 @@ def test_recording_without_readable_messages_raises(
 
 
 def test_bag_with_compressed_messages_is_read(tmp_path: Path) -> None:
-    """`ros2 bag record --compression-mode message` compresses each payload."""
-    assert_whole(write_bag(tmp_path / "a.mcap", change=zstandard.compress))
+    """A bag of `ros2 bag record --compression-mode message`, which compresses each payload, is read."""
+    assert_complete(write_bag(tmp_path / "a.mcap", change=zstandard.compress))
 
 
 def test_message_that_expands_above_the_limit_is_rejected(tmp_path: Path) -> None:
@@ -266,7 +266,7 @@ def test_message_that_expands_above_the_limit_is_rejected(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("suffix", ["", ".zstd"])
 def test_split_bag_is_one_recording(tmp_path: Path, suffix: str) -> None:
-    """The files of a bag folder are read in order; a file that is listed in the metadata but missing is reported."""
+    """The files of a bag folder are read in order; a missing file that the metadata lists is reported."""
     folder = tmp_path / "bag"
     folder.mkdir()
     for number, part in enumerate([range(4), range(4, 9), range(9, 10)]):
@@ -276,7 +276,7 @@ def test_split_bag_is_one_recording(tmp_path: Path, suffix: str) -> None:
             path.unlink()
     listed = "".join(f"    - bag_{number}.mcap{suffix}\n" for number in (8, 9, 10))
     (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}")
-    assert_whole(folder)
+    assert_complete(folder)
     assert run_command("events", str(folder)).exit_code == 0
     (folder / "metadata.yaml").write_text(f"bag:\n  relative_file_paths:\n{listed}    - bag_11.mcap\n")
     assert open_replay(f"mcap:{folder}").damage == (
@@ -294,11 +294,11 @@ def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
 
 
 def test_compressed_recording_is_read(tmp_path: Path) -> None:
-    """`--compression-mode file` compresses a whole file; everything before damage is read, up to a size limit."""
+    """A file of `--compression-mode file`, compressed as a whole, is read up to the first damage or a size limit."""
     path = tmp_path / "a.mcap.zstd"
     data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
     path.write_bytes(data)
-    assert_whole(path)
+    assert_complete(path)
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
         nedbus.read(path)

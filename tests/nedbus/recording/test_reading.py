@@ -64,20 +64,20 @@ def test_data_frames_have_all_columns(flight: Path) -> None:
     """Data frames of pandas and polars have all columns, with the values and types of the array."""
     pd, pl = pytest.importorskip("pandas"), pytest.importorskip("polars")
     array = nedbus.read(flight)
-    panda = nedbus.read(flight, dataframe="pandas")
-    bear = nedbus.read(flight, dataframe="polars")
-    assert isinstance(panda, pd.DataFrame)
-    assert isinstance(bear, pl.DataFrame)
-    assert list(panda.columns) == bear.columns
-    assert len(bear.columns) == len(FIELD_TYPES) + 2
-    assert panda["x"].dtype == np.float32
-    assert bear["timestamp"].dtype == pl.UInt64
-    assert np.array_equal(panda["delta_xy[1]"], array["delta_xy"][:, 1], equal_nan=True)
-    assert np.array_equal(bear["ref_lat"].to_numpy(), array["ref_lat"], equal_nan=True)
+    in_pandas = nedbus.read(flight, dataframe="pandas")
+    in_polars = nedbus.read(flight, dataframe="polars")
+    assert isinstance(in_pandas, pd.DataFrame)
+    assert isinstance(in_polars, pl.DataFrame)
+    assert list(in_pandas.columns) == in_polars.columns
+    assert len(in_polars.columns) == len(FIELD_TYPES) + 2
+    assert in_pandas["x"].dtype == np.float32
+    assert in_polars["timestamp"].dtype == pl.UInt64
+    assert np.array_equal(in_pandas["delta_xy[1]"], array["delta_xy"][:, 1], equal_nan=True)
+    assert np.array_equal(in_polars["ref_lat"].to_numpy(), array["ref_lat"], equal_nan=True)
 
 
 def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
-    """A selection that matches no stream or several raises; the error lists the available ones."""
+    """A selection that matches no stream or several raises; the error lists the available streams."""
     with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match: set instance to one of 1/"):
         nedbus.read(flight, "estimator_local_position")
     has = f"expected one of 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
@@ -257,18 +257,18 @@ def test_missing_fields_are_named(tmp_path: Path) -> None:
     missing = nedbus.missing_of(array)
     assert {"dead_reckoning", "heading_var", "dist_bottom_reset_counter"} <= missing
     assert not {"x", "xy_valid", "hagl_max_z", "hagl_max_xy"} & missing
-    for kept in (array[1:3], array[array["x"] > 0], array.copy(), np.sort(array, order="timestamp"), array[0]):
-        assert nedbus.missing_of(kept) == missing
-    panda = nedbus.read(path, dataframe="pandas")
-    bear = nedbus.read(path, dataframe="polars")
-    assert panda.attrs["missing"] == sorted(missing)
+    for part in (array[1:3], array[array["x"] > 0], array.copy(), np.sort(array, order="timestamp"), array[0]):
+        assert nedbus.missing_of(part) == missing
+    in_pandas = nedbus.read(path, dataframe="pandas")
+    in_polars = nedbus.read(path, dataframe="polars")
+    assert in_pandas.attrs["missing"] == sorted(missing)
     for name in ("dead_reckoning", "heading_var", "dist_bottom_reset_counter"):
-        assert panda[name].isna().all()
-        assert bear[name].is_null().all()
-    assert str(panda["dead_reckoning"].dtype) == "boolean"
-    assert str(bear["dead_reckoning"].dtype) == "Boolean"
-    assert panda["xy_valid"].dtype == np.bool_
-    assert not bear["x"].has_nulls()
+        assert in_pandas[name].isna().all()
+        assert in_polars[name].is_null().all()
+    assert str(in_pandas["dead_reckoning"].dtype) == "boolean"
+    assert str(in_polars["dead_reckoning"].dtype) == "Boolean"
+    assert in_pandas["xy_valid"].dtype == np.bool_
+    assert not in_polars["x"].has_nulls()
 
 
 def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
@@ -281,9 +281,9 @@ def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
             writer.write(row, DEFAULT, [(Address("1", VLP), provenance)], logged=[1], published=[1])
     assert nedbus.missing_of(nedbus.read(path)) == without.missing
     assert nedbus.read(path, dataframe="pandas")["dead_reckoning"].isna().tolist() == [False, True]
-    bear = nedbus.read(path, dataframe="polars")
-    assert bear["delta_xy[1]"].is_null().to_list() == [False, True]
-    assert bear["eph"].to_list() == [1.0, None]
+    in_polars = nedbus.read(path, dataframe="polars")
+    assert in_polars["delta_xy[1]"].is_null().to_list() == [False, True]
+    assert in_polars["eph"].to_list() == [1.0, None]
 
 
 def test_names_and_scripts_in_the_docs_work(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -331,11 +331,11 @@ def test_reading_several_topics_reads_the_file_once(tmp_path: Path, monkeypatch:
     passes: list[object] = []
     read = recording.RecordingReader.messages
 
-    def note(*arguments: Any) -> Iterator[Any]:
+    def read_and_count(*arguments: Any) -> Iterator[Any]:
         passes.append(arguments)
         return read(*arguments)
 
-    monkeypatch.setattr(recording.RecordingReader, "messages", note)
+    monkeypatch.setattr(recording.RecordingReader, "messages", read_and_count)
     assert len(nedbus.read(path, ["*"], dataframe="pandas")) > 10
     assert len(passes) == 1
 

@@ -136,9 +136,9 @@ def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tm
 
 
 def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the start on, any reader finds all flushed messages and a valid end of file.
+    """After each flush, any reader finds a valid file with all messages, and fsync was called.
 
-    A test cannot cut the power; it checks that fsync was called.
+    Before the first message the file is valid, too.
     """
     path = tmp_path / "a.mcap"
     synced = []
@@ -401,17 +401,17 @@ def test_recording_without_messages_warns_and_removes_the_file(
     assert not path.exists()
 
 
-NAME = "not a recording: its name must end with .mcap"
+WRONG_SUFFIX = "not a recording: its name must end with .mcap"
 
 
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "reason"),
     [
-        ("convert a.ulg x.csv", 2, f"x.csv: {NAME}\n"),
-        ("convert a.ulg b.png", 2, f"b.png: {NAME}\n"),
-        ("convert a.ulg b", 2, f"b: {NAME}\n"),
-        ("record -o a.txt", 2, f"a.txt: {NAME}\n"),
-        ("record -o a.csv", 2, f"a.csv: {NAME}\n"),
+        ("convert a.ulg x.csv", 2, f"x.csv: {WRONG_SUFFIX}\n"),
+        ("convert a.ulg b.png", 2, f"b.png: {WRONG_SUFFIX}\n"),
+        ("convert a.ulg b", 2, f"b: {WRONG_SUFFIX}\n"),
+        ("record -o a.txt", 2, f"a.txt: {WRONG_SUFFIX}\n"),
+        ("record -o a.csv", 2, f"a.csv: {WRONG_SUFFIX}\n"),
         ("convert flight.txt a.mcap", 2, "its name must end with .ulg or .mcap"),
         ("convert flight.ulg a.mcap", 1, "no such file"),
     ],
@@ -481,7 +481,7 @@ def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
 
 
 def test_private_and_unknown_records_are_skipped(tmp_path: Path) -> None:
-    """Application-specific records, and those of later MCAP versions, are not reported as damage."""
+    """Application-specific records and records of later MCAP versions are not reported as damage."""
     path, extended = tmp_path / "a.mcap", tmp_path / "b.mcap"
     convert_replay(f"ulog:{write_log(tmp_path / 'a.ulg', range(0, 10_000_000, 1000))}", path)
     content, at, parts = path.read_bytes(), 8, list[bytes]()
@@ -498,7 +498,7 @@ def test_private_and_unknown_records_are_skipped(tmp_path: Path) -> None:
         assert not [warning for warning in reader.warnings if "skipped" in warning]
 
 
-def test_px4_texts_are_recorded_as_ros2_log_too(tmp_path: Path) -> None:
+def test_px4_texts_are_also_recorded_as_ros2_log(tmp_path: Path) -> None:
     """`log_message` is recorded a second time as ROS 2's Log, which nedbus ignores when it reads the file."""
     path, texts = tmp_path / "a.mcap", ["Takeoff detected", "12 \u00b5s", ""]
     written = [LogMessage(timestamp=number, severity=2 * number, text=text) for number, text in enumerate(texts)]

@@ -120,8 +120,8 @@ def test_page_shows_several_files(swarm: list[str]) -> None:
     recording = Recording(*map(Path, swarm))
     wait_for(lambda: recording.is_read, what="the files")
     assert recording.name == "a 1.ulg, b.ulg, c.ulg"
-    assert recording.timeline.start is not None
-    assert math.isclose(recording.timeline.start, EPOCH / 1e6 + 58, abs_tol=0.01)
+    assert recording.timeline.clock_offset is not None
+    assert math.isclose(recording.timeline.clock_offset, EPOCH / 1e6 + 58, abs_tol=0.01)
     assert {address.vehicle for address, _ in recording.entries} == {"a_1", "b", "c"}
     assert math.isclose(recording.length, 11.9, abs_tol=0.01)
 

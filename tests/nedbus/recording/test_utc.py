@@ -1,4 +1,4 @@
-"""Clocks of timestamps, and vehicles of input topics, in files of three kinds."""
+"""Clocks of timestamps in a log and a recording, and the vehicle of input topics."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INPUTS: Final = DATA / "fmu_in_topics.mcap"
     [(UNIX, "2025-10-09 08:53:19.997000", "timestamp"), (BOOT, "2025-09-08 13:31:04", "boot_time_utc_us")],
 )
 def test_utc_of_align_and_events_agree(path: Path, utc: str, source: str) -> None:
-    """UTC is the same for Unix timestamps of uXRCE-DDS, and for a log with the time of its boot."""
+    """`utc_of`, `align` and events have the same UTC, for Unix timestamps and for a log with its boot time."""
     found = nedbus.utc_of(path)
     assert found is not None
     first = nedbus.read(path)["timestamp"][0]

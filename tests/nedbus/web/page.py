@@ -41,7 +41,7 @@ QUAD: Final = Address("quad", VLP)
 NOON: Final = 1_700_000_000.0
 """Seconds since the Unix epoch: 22:13:20 UTC."""
 _ROW: Final = re.compile(
-    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-selected="(?P<chosen>\w+)">'
+    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-current="(?P<chosen>\w+)">'
     r'<span class="(?P<grade>\w+)">.*?<span class="\w+">(?P<text>[^<]*)</span>'
     r'<span class="quiet">(?P<since>[^<]*)</span><span class="mode">(?P<mode>[^<]*)</span>'
     r'<span>(?P<battery>[^<]*)</span><span class="gps">(?P<gps>[^<]*)</span></div>'
@@ -175,7 +175,7 @@ class RenderedPage:
         self.viewer._search.value_input = text
         self.update()
 
-    def part(self, name: str) -> str:
+    def panel(self, name: str) -> str:
         """Return the HTML of one panel of the page."""
         return next(str(div.text) for div in models_of(self.document, Div) if name in div.css_classes)
 
@@ -195,7 +195,7 @@ class RenderedPage:
     @property
     def listed(self) -> dict[str, dict[str, str]]:
         """The rows of the list by vehicle, in the order shown."""
-        found = (match.groupdict() for match in _ROW.finditer(self.part("list")))
+        found = (match.groupdict() for match in _ROW.finditer(self.panel("list")))
         return {row["vehicle"]: {name: unescape(text) for name, text in row.items()} for row in found}
 
     @property

@@ -99,7 +99,7 @@ def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Sta
     page = tab(width=1280, height=800)
     page.open(url)
     until(lambda: list(page.states) == ["wing"], "the vehicle")
-    until(lambda: "1 ok" in page.part("head"), "the vehicle to be ok")
+    until(lambda: "1 ok" in page.panel("head"), "the vehicle to be ok")
     assert page.page.title() == "nedbus"
     until(lambda: page.chosen == ["wing"], "the vehicle")
     assert page.query == {}
@@ -111,7 +111,7 @@ def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Sta
     until(lambda: "NaN" not in page.source("speed")["error"][-3:], "the error to the ground truth")
     page.wait_for_text("messages/s")
     page.wait_for_text("origin 47.39")
-    assert "-" not in page.part("nums").split("\n")
+    assert "-" not in page.panel("nums").split("\n")
     page.page.locator("[data-do=streams]").click()
     page.wait_for_text("vehicle_local_position_groundtruth")
     canvases = page.page.locator(".bk-Figure").all()
@@ -129,7 +129,7 @@ SIZES = ((390, 844), (1280, 800), (1920, 1080))
 
 
 @pytest.fixture
-def fifty(bus: nedbus.Bus) -> Iterator[None]:
+def fifty_vehicles(bus: nedbus.Bus) -> Iterator[None]:
     """Publish 50 vehicles at 1 Hz each; three of them have faults."""
     flags: dict[int, dict[str, object]] = {7: {"xy_valid": False}, 23: {"dead_reckoning": True}, 42: {"z_valid": False}}
     publishers = [bus.publisher(VLP, vehicle=f"uav-{number}") for number in range(1, 51)]
@@ -146,7 +146,7 @@ def fifty(bus: nedbus.Bus) -> Iterator[None]:
         yield
 
 
-@pytest.mark.usefixtures("fifty")
+@pytest.mark.usefixtures("fifty_vehicles")
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: str) -> None:
     """With 50 vehicles, in both themes, no panel is empty, cut off, or covers another one.
@@ -162,7 +162,7 @@ def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: st
     others = [f"uav-{number}" for number in range(1, 51) if number not in (7, 23, 42)]
     assert names == ["uav-7", "uav-42", "uav-23", *others]
     page.page.locator(VEHICLE).first.click()
-    until(lambda: page.chosen == ["uav-7"] and "xy not valid from" in page.part("why"), "its verdict")
+    until(lambda: page.chosen == ["uav-7"] and "xy not valid from" in page.panel("why"), "its verdict")
     page.page.locator("[data-do=streams]").click()
     for width, height in SIZES:
         page.page.set_viewport_size({"width": width, "height": height})
@@ -239,8 +239,8 @@ def test_hostile_text_is_escaped(fly: Fly, tab: Open, zenoh_session: Session, en
         zenoh_session.put(key, json.dumps({"reason": HOSTILE, HOSTILE: HOSTILE}))
         page.wait_for_text("1 rejected")
         page.page.locator("[data-do=streams]").click()
-        until(lambda: HOSTILE in page.part("more"), "the reason")
-        until(lambda: HOSTILE[:10] in page.part("why"), "the event")
+        until(lambda: HOSTILE in page.panel("more"), "the reason")
+        until(lambda: HOSTILE[:10] in page.panel("why"), "the event")
         until(lambda: HOSTILE[:20] in str(page.source("row").get("words")), "its mark")
         page.page.get_by_placeholder("search").fill(HOSTILE)
         until(lambda: page.states == {}, "the list to be empty")
@@ -269,7 +269,7 @@ def test_viewers_are_independent(url: str, tab: Open, fly: Fly, zenoh_session: S
         until(lambda page=page: page.chosen == ["a"], "the first vehicle")  # type: ignore[misc]  # bound here
     first.page.locator(VEHICLE, has_text="b").click()
     until(lambda: first.chosen == ["b"], "the selection")
-    until(lambda: "30.0 m" in first.part("nums"), "the numbers of b")
+    until(lambda: "30.0 m" in first.panel("nums"), "the numbers of b")
     other["xy_valid"] = False
     until_order(second, "b", "a")
     until(lambda: second.chosen == ["b"], "the worst, selected by default")
@@ -287,9 +287,9 @@ def test_viewers_are_independent(url: str, tab: Open, fly: Fly, zenoh_session: S
     until(tap, "the selection by a tap")
     second.page.keyboard.press("j")
     until(lambda: second.chosen == ["a"], "the selection by a key")
-    until(lambda: "xy not valid from" in first.part("why"), "the verdict")
+    until(lambda: "xy not valid from" in first.panel("why"), "the verdict")
     other["xy_valid"] = True
-    until(lambda: " to " in first.part("why"), "the end of the condition")
+    until(lambda: " to " in first.panel("why"), "the end of the condition")
     first.page.keyboard.press("p")
     first.page.get_by_text("back to now").wait_for()
     until(lambda: set(first.query) == {"vehicle", "time"}, "the URL")

@@ -159,7 +159,7 @@ def test_vehicles_are_sorted_by_severity_then_name(sim: SimulatedFleet) -> None:
 
 
 def test_gone_vehicle_stays_bad(sim: SimulatedFleet) -> None:
-    """A vehicle that is gone ranks above those to watch until it is forgotten or returns."""
+    """A vehicle that is gone ranks above vehicles to watch until it is forgotten or returns."""
     sim.fly(3, WING, QUAD)
     sim.time += 2100
     sim.fly(3, WING, dead_reckoning=True)
@@ -169,7 +169,7 @@ def test_gone_vehicle_stays_bad(sim: SimulatedFleet) -> None:
 
 
 def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Streams above the limit are counted but not shown, until a shown one was silent for a minute."""
+    """Streams above the limit are counted but not shown, until a shown stream has been silent for a minute."""
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 3)
     names = [Address(f"v{number}", VLP) for number in range(5)]
     sim.fly(1, *names)
@@ -186,7 +186,7 @@ def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypat
 
 
 def test_position_replaces_other_streams_at_the_limit(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit, a new position stream replaces another stream, but no other stream replaces any."""
+    """At the limit, a new position stream replaces a stream of another topic; streams of other topics replace none."""
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
     attitude, battery = Address("wing", "vehicle_attitude"), Address("wing", "battery_status", 0)
     sim.fly(2, attitude, battery)
@@ -217,8 +217,8 @@ def test_status_values_come_from_other_messages(sim: SimulatedFleet) -> None:
     assert status() == ["200", "disarmed", "", "3D · 14"]
 
 
-def test_last_position_is_the_last_valid_one(sim: SimulatedFleet) -> None:
-    """The last position is the last valid one, with latitude and longitude if it has a global origin."""
+def test_last_position_is_the_last_valid_position(sim: SimulatedFleet) -> None:
+    """The last valid position is shown, with latitude and longitude if it has a global origin."""
     sim.fly(1, xy_valid=False, x=9.0)
     assert sim.vehicle().last_position == "none yet"
     sim.fly(1, x=3.0, y=-4.0, z=-5.0)
@@ -233,7 +233,7 @@ def test_last_position_is_the_last_valid_one(sim: SimulatedFleet) -> None:
 
 
 def test_vehicles_with_global_origins_share_one_origin(sim: SimulatedFleet) -> None:
-    """Positions of vehicles with global origins are relative to a common one, others to the vehicle's own."""
+    """Positions of vehicles with global origins are relative to a common origin, others to the vehicle's own origin."""
     north = MapProjection(ZURICH["ref_lat"], ZURICH["ref_lon"]).reproject(100.0, 50.0)
     lost = Address("lost", VLP)
     sim.fly(1, WING, **ZURICH, x=1.0, y=2.0)
@@ -275,7 +275,7 @@ def test_reset_adds_a_gap_to_the_history(sim: SimulatedFleet) -> None:
 
 
 def test_history_has_ten_points_per_second(sim: SimulatedFleet) -> None:
-    """At 100 Hz the history covers a minute and has each flag change; the longer one has about a point per second."""
+    """At 100 Hz the history covers a minute and has each flag change; the long history has about a point per second."""
     sim.fly(2, rate=100)
     minute, long = sim.stream().minute, sim.stream().long
     assert 18 <= minute.written <= 22
@@ -345,17 +345,17 @@ def test_error_needs_a_common_frame(sim: SimulatedFleet) -> None:
 def test_formatted_time_names_its_clock() -> None:
     """Live times are UTC; in a recording UTC if known, else since boot for a single vehicle, else since its start."""
     recorded = EventTimeline(EventLog(), times=Times())
-    assert recorded.clock(75.25) == "75.2 s since the start of the recording"
-    recorded.set_start("1", 70.0, 10.0)
-    assert recorded.clock(75.25) == "135.2 s since boot, 75.2 s since the start of the recording"
+    assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"
+    recorded.set_clock("1", 70.0, 10.0)
+    assert recorded.format_clock(75.25) == "135.2 s since boot, 75.2 s since the start of the recording"
     recorded.times = Times(offsets={"1": NOON})
-    recorded.set_start("1", 70.0, 10.0)
-    assert recorded.clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
+    recorded.set_clock("1", 70.0, 10.0)
+    assert recorded.format_clock(600.0) == "22:24:20.0 UTC, 600.0 s since the start of the recording"
     live = EventTimeline(EventLog())
-    assert live.clock(NOON) == "22:13:20.0 UTC"
+    assert live.format_clock(NOON) == "22:13:20.0 UTC"
     several = EventLog()
     for name in ("1", "2"):
         several.add(Address(name, VLP), message(1_000_000), 0.0)
     recorded = EventTimeline(several, times=Times())
-    recorded.set_start("1", 70.0, 10.0)
-    assert recorded.clock(75.25) == "75.2 s since the start of the recording"
+    recorded.set_clock("1", 70.0, 10.0)
+    assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"

@@ -96,7 +96,7 @@ def test_recording_plays_at_the_selected_speed(recording: Recording, clock: Simp
 
 
 @pytest.mark.parametrize("target", [5.0, 61.0, 100.0, 155.0, 179.9])
-def test_seek_shows_the_same_as_playing_there(recording: Recording, clock: SimpleNamespace, target: float) -> None:
+def test_seek_equals_playing_to_that_time(recording: Recording, clock: SimpleNamespace, target: float) -> None:
     """After a seek, back or forward, the page is the same as if the recording had been played up to that time."""
     player = Player(recording)
     run(player, clock, target)
@@ -150,12 +150,14 @@ def open_page(recording: Recording, query: str = "") -> Page:
 def test_selecting_an_event_seeks_to_it(recording: Recording) -> None:
     """A mark on the slider, an event on the timeline, and the keys n and p seek to the time of an event.
 
-    State, verdict and marker are those of that time.
+    State, verdict and marker change to that time.
     """
     page = open_page(recording)
     assert page.grades == {"wing": "ok"}
     assert page.plot_range == (0.0, 60.0)
-    marks = re.findall(r'data-with="(\d+)" title="([^"]*)" class="(\w+)"\s+style="left: ([\d.]+)%"', page.part("marks"))
+    marks = re.findall(
+        r'data-with="(\d+)" title="([^"]*)" class="(\w+)"\s+style="left: ([\d.]+)%"', page.panel("marks")
+    )
     assert [(text, grade) for _, text, grade, _ in marks] == [
         ("xy not valid", "bad"), ("reset of xy by 4.1 m (0.1 north, 4.1 east)", "watch"),
     ]  # fmt: skip
@@ -163,7 +165,7 @@ def test_selecting_an_event_seeks_to_it(recording: Recording) -> None:
     page.send("event", marks[0][0])
     assert page.player.time == pytest.approx(90, abs=0.01)
     assert (page.grades, page.document.title) == ({"wing": "bad"}, "(1 bad) flight.mcap")
-    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)' in page.part(
+    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)' in page.panel(
         "why"
     )
     assert page.marks["wing"]["north"] == pytest.approx(89.9)
@@ -193,10 +195,10 @@ def test_recording_page_lists_verdict_and_faults(recording: Recording) -> None:
     Times are on the vehicle's clock, which header and axes name.
     """
     page = open_page(recording)
-    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot' in page.part("list")
-    faults = re.findall(r'data-do="fault" data-with="(\d)">.*?<b>(.*?)</b> (.*?)</div>', page.part("list"))
+    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot' in page.panel("list")
+    faults = re.findall(r'data-do="fault" data-with="(\d)">.*?<b>(.*?)</b> (.*?)</div>', page.panel("list"))
     assert faults == [("0", "xy not valid", "from 91.000 to 121.000 s since boot (30.0 s)")]
-    assert "1.0 s since boot, 0.0 s since the start" in page.part("head")
+    assert "1.0 s since boot, 0.0 s since the start" in page.panel("head")
     assert page.viewer._clock.args == {"start": 1.0, "clock": "s since boot"}
     assert page.grades == {"wing": "ok"}
     page.send("fault", "0")
@@ -218,13 +220,13 @@ def test_url_of_a_recording_restores_the_moment(recording: Recording) -> None:
     assert other.player.time == pytest.approx(91, abs=0.06)
     assert other.url_query == page.url_query
     for part in ("tool", "nums", "why", "list"):
-        assert other.part(part) == page.part(part)
+        assert other.panel(part) == page.panel(part)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("clock")
 def test_invalid_time_in_the_url_is_ignored(recording: Recording) -> None:
-    """With an invalid time, or one outside the recording, the page opens at a moment within it."""
+    """If the time in the URL is invalid or outside the recording, the page opens at a time within it."""
     for query in ("time=nan", "time=1e300", "time=-5", "time=99:99", "time=inf", "time=x"):
         assert 0 <= open_page(recording, query=query).player.time <= recording.length
 
@@ -247,7 +249,7 @@ def test_malformed_actions_leave_the_recording_playable(recording: Recording) ->
 
 
 def test_only_timestamps_of_other_topics_are_kept(tmp_path: Path, clock: SimpleNamespace) -> None:
-    """Topics whose values are not shown have a rate and an age; only their timestamps are kept in memory."""
+    """Topics other than positions and status topics have a rate and an age; only their timestamps are in memory."""
     file = write_flight(tmp_path, {VLP: lambda _: {}, "vehicle_attitude": lambda _: {}}, seconds=20)
     opened = Recording(file)
     wait_for(lambda: opened.length > 19.8, what="the recording")

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import nedbus
 from nedbus.client import LogStreamStatus, RejectionReport
 from nedbus.transport import Session, open_router
-from nedbus.web.column_data import NAMES, Track, Tracks
+from nedbus.web.column_data import LINE_TYPES, Track, Tracks
 from nedbus.web.fleet import TRUTH
 from nedbus.web.map import MIN_SIDE
 from nedbus.web.server import LiveFleet
@@ -58,7 +58,7 @@ def line_of(tracks: Tracks, index: int, kind: str, ring: int) -> list[tuple[floa
 
 
 def write_points(history: History, count: int, *, breaks: bool) -> None:
-    """Write points to a history; five of ten are dead reckoning, and with `breaks` every seventh is a gap."""
+    """Write points to a history, five valid and five dead reckoned in turn; with `breaks` every seventh is a gap."""
     for _ in range(count):
         number = history.written
         row = [math.nan if breaks and number % 7 == 6 else float(number)] * len(COLUMNS)
@@ -83,21 +83,21 @@ def test_incremental_tracks_equal_those_of_a_new_viewer(
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"_MAX_POINTS": limit, "_MIN_TRACK_POINTS": 6}.items():
             patch.setattr(f"nedbus.web.column_data.{name}", value)
-        kept: dict[Address, Track] = {
+        histories: dict[Address, Track] = {
             Address(*name): (History(points, 0.1), number)
             for number, name in enumerate((("a", VLP), ("b", VLP), ("c", TRUTH)))
         }
         tracks, fresh = Tracks(), Tracks()
         for counts in rounds:
-            for (history, _), count in zip(kept.values(), counts, strict=True):
+            for (history, _), count in zip(histories.values(), counts, strict=True):
                 write_points(history, count, breaks=breaks)
-            tracks.update(kept)
-        tracks.update(kept)
-        fresh.update(kept)
+            tracks.update(histories)
+        tracks.update(histories)
+        fresh.update(histories)
     ring = points // step + 2
     assert len(fresh.source.data["east"]) == 3 * (ring + 2)
-    for index, (history, _) in enumerate(kept.values()):
-        for kind in NAMES:
+    for index, (history, _) in enumerate(histories.values()):
+        for kind in LINE_TYPES:
             old, new = (line_of(each, index, kind, ring) for each in (tracks, fresh))
             oldest = (max(0, history.written - points) - 1) // step % ring  # an old viewer may keep it longer
             del old[oldest], new[oldest]
@@ -121,7 +121,7 @@ def tracks_of(sim: SimulatedFleet) -> dict[Address, Track]:
 def test_tracks_send_only_new_points(sim: SimulatedFleet) -> None:
     """An update patches only the new points and the gap; without a new point it sends nothing."""
     tracks, document, plot = Tracks(), Document(), figure()
-    plot.line("east", NAMES[0], source=tracks.source)
+    plot.line("east", LINE_TYPES[0], source=tracks.source)
     document.add_root(plot)
     sim.fly(30, WING, QUAD)
     tracks.update(tracks_of(sim))
@@ -187,33 +187,33 @@ def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
 
 
 def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:
-    """Counts, title, rows, badges and markers agree; before the first message the header says that it waits."""
+    """Counts, title, rows, badges and markers agree; before the first message the header shows that it waits."""
     page = Page(sim)
-    assert "waiting for the first message" in page.part("head")
+    assert "waiting for the first message" in page.panel("head")
     assert page.vehicles == []
     sim.fly(3, WING, GROUND_TRUTH, x=5.0, z=-7.0)
     sim.fly(3, QUAD, x=5.0, z=-7.0, xy_valid=False)
     page.refresh()
-    assert "■ 1 bad" in page.part("head")
-    assert "● 1 ok" in page.part("head")
+    assert "■ 1 bad" in page.panel("head")
+    assert "● 1 ok" in page.panel("head")
     assert page.document.title == "(1 bad) nedbus"
     assert page.listed["quad"]["title"] == page.states["quad"] == "xy not valid"
     assert page.grades == {"quad": "bad", "wing": "ok"}
     assert page.chosen == "quad"
-    assert "■ xy not valid" in page.part("why")
-    assert "last valid position: none yet" in page.part("why")
-    assert "no valid position yet: quad" in page.part("tool")
+    assert "■ xy not valid" in page.panel("why")
+    assert "last valid position: none yet" in page.panel("why")
+    assert "no valid position yet: quad" in page.panel("tool")
     assert set(page.marks) == {"wing"}
     sim.fly(3, WING, QUAD, x=5.0, z=-7.0)
     page.refresh(alive=[WING, QUAD])
     assert page.grades == {"quad": "ok", "wing": "ok"}
-    assert "● 2 ok" in page.part("head")
+    assert "● 2 ok" in page.panel("head")
     assert page.document.title == "nedbus"
     assert page.marks["quad"]["north"] == 5.0
-    assert "<span>height</span><b>7.0 m</b>" in page.part("nums")
+    assert "<span>height</span><b>7.0 m</b>" in page.panel("nums")
     sim.time += 5
     page.refresh(alive=[])
-    assert "■ 2 bad" in page.part("head")
+    assert "■ 2 bad" in page.panel("head")
     assert page.states == {"quad": "gone", "wing": "gone"}
     assert {mark["shape"] for mark in page.marks.values()} == {"square"}
 
@@ -227,23 +227,23 @@ def test_bad_secondary_estimates_do_not_mark_the_vehicle_bad(sim: SimulatedFleet
             sim.add(other, xy_valid=False, dead_reckoning=True)
     page = Page(sim)
     assert (page.grades, page.document.title) == ({"wing": "ok"}, "nedbus")
-    assert "no recent faults" in page.part("why")
+    assert "no recent faults" in page.panel("why")
     assert page.marks["wing"]["shape"] == "circle"
-    assert "1 bad" not in page.part("head")
+    assert "1 bad" not in page.panel("head")
     page.send("streams")
-    assert page.part("more").count("xy invalid, dead reckoning") == 2
+    assert page.panel("more").count("xy invalid, dead reckoning") == 2
 
 
-def test_overloaded_page_reports_itself(sim: SimulatedFleet) -> None:
-    """If this reader falls behind, the header says so, and no vehicle changes its state."""
+def test_overloaded_page_is_reported_in_the_header(sim: SimulatedFleet) -> None:
+    """If the page falls behind, the header reports it, and no vehicle changes its state."""
     sim.fly(3, WING, QUAD)
     page = Page(sim)
-    assert "page up to date" in page.part("head")
+    assert "page up to date" in page.panel("head")
     sim.time += 20
     own = "this page falls behind: 7000 messages queued, 12 dropped"
     page.refresh(alive=[WING, QUAD], is_behind=True, behind=own)
-    assert f'<span class="alarm">{own}</span>' in page.part("head")
-    assert "page up to date" not in page.part("head")
+    assert f'<span class="alarm">{own}</span>' in page.panel("head")
+    assert "page up to date" not in page.panel("head")
     assert page.grades == {"quad": "ok", "wing": "ok"}
     assert page.document.title == "nedbus"
 
@@ -257,13 +257,13 @@ def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet)
     assert set(page.marks) == {"wing"}
     page.send("vehicle", "far")
     assert page.chosen == "far"
-    assert page.part("nums").count("<b>-</b>") == 9
+    assert page.panel("nums").count("<b>-</b>") == 9
     assert len(page.plotted["speed"]) == 0
     page.send("vehicle", "wing")
-    assert "▸ 2 streams of wing" in page.part("more")
-    assert "vehicle_attitude" not in page.part("more")
+    assert "▸ 2 streams of wing" in page.panel("more")
+    assert "vehicle_attitude" not in page.panel("more")
     page.send("streams")
-    rows = re.findall("<tr>(.*?)</tr>", page.part("more"))
+    rows = re.findall("<tr>(.*?)</tr>", page.panel("more"))
     cells = {row[0]: row[1:] for each in rows[1:] if (row := re.findall("<td>(.*?)</td>", each))}
     row = ["10", "0", "0", "-", "ok"]
     assert cells == {"vehicle_attitude": row, VLP: row}
@@ -280,7 +280,7 @@ def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
     row = page.listed["wing"]
     assert (row["mode"], row["battery"], row["gps"]) == ("Hold", "50 %", "3D · 14")
     for name, text in (("armed", "armed"), ("mode", "Hold"), ("north", "0.0 m"), ("heading", "0°")):
-        assert f"<span>{name}</span><b>{text}</b>" in page.part("nums")
+        assert f"<span>{name}</span><b>{text}</b>" in page.panel("nums")
 
 
 def test_values_of_silent_streams_have_their_age(sim: SimulatedFleet) -> None:
@@ -291,20 +291,20 @@ def test_values_of_silent_streams_have_their_age(sim: SimulatedFleet) -> None:
         sim.add(status, nav_state=4, arming_state=2)
         sim.add(battery, remaining=0.5)
     page = Page(sim)
-    assert "ago" not in page.part("nums")
+    assert "ago" not in page.panel("nums")
     for _ in range(50):
         sim.fly(0.2, z=-7.0)
         sim.add(status, nav_state=4, arming_state=2)
     page.refresh()
     assert (page.listed["wing"]["mode"], page.listed["wing"]["battery"]) == ("Hold", "-")
-    assert '<b class="quiet">50 %</b> <small>10.0 s ago</small>' in page.part("nums")
-    assert "<span>armed</span><b>armed</b>" in page.part("nums")
+    assert '<b class="quiet">50 %</b> <small>10.0 s ago</small>' in page.panel("nums")
+    assert "<span>armed</span><b>armed</b>" in page.panel("nums")
     sim.time += 2100
     page.refresh(alive=[])
     row = page.listed["wing"]
     assert (row["text"], row["mode"], row["battery"], row["gps"]) == ("gone", "-", "-", "-")
     for name, text in (("armed", "armed"), ("battery", "50 %"), ("height", "7.0 m"), ("heading", "0°")):
-        assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.part("nums")
+        assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.panel("nums")
 
 
 def test_slow_stream_is_named_below_the_numbers(sim: SimulatedFleet) -> None:
@@ -312,21 +312,21 @@ def test_slow_stream_is_named_below_the_numbers(sim: SimulatedFleet) -> None:
     sim.fly(20, rate=20)
     sim.fly(3, rate=5)
     page = Page(sim)
-    assert re.search(r'<div class="watch">slow: 5.0 Hz, usually \d+</div>', page.part("nums"))
+    assert re.search(r'<div class="watch">slow: 5.0 Hz, usually \d+</div>', page.panel("nums"))
     assert page.grades == {"wing": "ok"}
 
 
 def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
-    """Of several conditions, the story is about the one in badge and list, whichever began first."""
+    """With several active conditions, the story explains the one in badge and list, whichever began first."""
     gps = Address("wing", "sensor_gps", 0)
     for seconds, state, fields in ((5, 1, {}), (5, 3, {}), (5, 3, {"dead_reckoning": True})):
         for _ in range(seconds):
             sim.fly(1, **fields)
             sim.add(gps, fix_type=3, satellites_used=14, jamming_state=state)
     page = Page(sim)
-    (badge,) = re.findall(r'<span class="badge \w+">. (.*?)</span>', page.part("why"))
+    (badge,) = re.findall(r'<span class="badge \w+">. (.*?)</span>', page.panel("why"))
     assert badge == page.states["wing"] == "dead reckoning"
-    assert f'<div class="verdict">{badge} from' in page.part("why").replace("position valid throughout, but ", "")
+    assert f'<div class="verdict">{badge} from' in page.panel("why").replace("position valid throughout, but ", "")
 
 
 def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> None:
@@ -380,7 +380,7 @@ def test_search_filters_by_name_and_state(sim: SimulatedFleet) -> None:
     for text, found in ((" WIN ", ["wind", "wing"]), ("not VALID", ["quad", "wind"]), (HOSTILE, []), ("", 3)):
         page.search(text)
         assert page.vehicles == found if isinstance(found, list) else len(page.vehicles) == found
-        assert "2 bad" in page.part("head")
+        assert "2 bad" in page.panel("head")
         assert len(page.marks) == 3
     assert HOSTILE not in page.text
 
@@ -398,10 +398,10 @@ def test_text_from_peers_is_escaped(sim: SimulatedFleet) -> None:
     page = Page(sim, title=HOSTILE, query="?view=%3Cimg&theme=%3Cimg&time=%3Cimg")
     page.send("streams")
     page.refresh(link=HOSTILE, behind=HOSTILE)
-    assert "2 rejected" in page.part("head")
+    assert "2 rejected" in page.panel("head")
     assert "<img" not in page.text
-    assert page.part("head").count("&lt;img") == 3
-    reasons = re.findall(r"wing/vehicle_local_position</td><td>(.*?)</td>", page.part("more"))
+    assert page.panel("head").count("&lt;img") == 3
+    reasons = re.findall(r"wing/vehicle_local_position</td><td>(.*?)</td>", page.panel("more"))
     assert reasons == ["&lt;img src=x onerror=alert(1)&gt;", "the first"]
     for name in ("wing<img", "<img", 'a"b', "a b", "²"):
         with pytest.raises(ValueError, match="is not valid"):
@@ -436,7 +436,7 @@ def test_px4_texts_are_quoted_and_escaped(sim: SimulatedFleet) -> None:
     assert timeline == [
         (f'PX4: "{HOSTILE}"', "square"), ("xy not valid", "square"), ('PX4: "Landing detected"', "circle"),
     ]  # fmt: skip
-    assert "PX4: &#34;&lt;img src=x onerror=alert(1)&gt;&#34;" in page.part("why")
+    assert "PX4: &#34;&lt;img src=x onerror=alert(1)&gt;&#34;" in page.panel("why")
     assert "<img" not in page.text
 
 
@@ -466,8 +466,8 @@ def frame_of(page: Page) -> tuple[list[float], list[float]]:
     return list(frame.data["east"]), list(frame.data["north"])
 
 
-def test_map_fits_all_or_follows_one(sim: SimulatedFleet) -> None:
-    """The map fits all vehicles with their trails, at least 20 m, or follows one, or fits the trail of one."""
+def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
+    """The map shows at least 20 m: all vehicles with trails, the selected one in the centre, or only its trail."""
     sim.fly(3, WING)
     page = Page(sim)
     east, north = frame_of(page)
@@ -493,7 +493,7 @@ def test_map_fits_all_or_follows_one(sim: SimulatedFleet) -> None:
 
 @pytest.mark.parametrize("size", ["340x330", "560x430", "1100x700"])
 def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
-    """Of 50 vehicles close together only labels that fit are shown, the selected and bad ones first."""
+    """Of 50 vehicles close together only labels that fit are shown, those of the selected and bad vehicles first."""
     places = {f"uav-{number}": (7.0 * (number // 10), 11.0 * (number % 10)) for number in range(1, 51)}
     for _ in range(5):
         sim.time += 0.1
@@ -529,14 +529,14 @@ def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFlee
     assert page.plot_range == pytest.approx((sim.time - 60, sim.time), abs=0.01)
     minute = len(page.plotted["speed"])
     page.send("trail")
-    assert "trail 15 min" in page.part("tool")
+    assert "trail 15 min" in page.panel("tool")
     assert page.plot_range == pytest.approx((sim.time - 600, sim.time), abs=0.01)
     assert page.plotted["time"][0] < (sim.time - 190) * 1e3
     page.send("trail")
     assert len(page.plotted["speed"]) == minute
-    assert 'data-do="truth" aria-pressed="true"' in page.part("tool")
+    assert 'data-do="truth" aria-pressed="true"' in page.panel("tool")
     page.send("truth")
-    assert 'data-do="truth" aria-pressed="false"' in page.part("tool")
+    assert 'data-do="truth" aria-pressed="false"' in page.panel("tool")
 
 
 # Timeline
@@ -560,7 +560,7 @@ def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
 def test_timeline_has_a_legend(sim: SimulatedFleet) -> None:
     """The title of the timeline explains each symbol."""
     figure = cast("Any", Page(sim).viewer._timeline_plot.figure)
-    for words in ("■ bad", "▲ watch", "● phase of flight", "▬ duration", "┊ now"):
+    for words in ("■ bad", "▲ watch", "● flight phase", "▬ duration", "┊ now"):
         assert words in figure.title.text
 
 
@@ -588,8 +588,8 @@ def test_timeline_begins_with_the_first_event(sim: SimulatedFleet) -> None:
 
 
 @pytest.fixture
-def flown(sim: SimulatedFleet) -> SimulatedFleet:
-    """Return two vehicles: "wing" was invalid 200 s ago, for 4 s, and reset 50 s ago; "quad" was dead reckoning."""
+def faulty_fleet(sim: SimulatedFleet) -> SimulatedFleet:
+    """Return two vehicles: xy of "wing" was invalid for 4 s, 200 s ago, and reset 50 s ago; "quad" dead reckoned."""
     sim.fly(30.04, WING, QUAD)
     for seconds, wing, quad in (
         (4, {"xy_valid": False}, {}), (96, {}, {}), (4, {}, {"dead_reckoning": True}), (46, {}, {}),
@@ -610,47 +610,47 @@ def event_of(sim: SimulatedFleet, text: str) -> float:
     return next(event.time for event in sim.timeline.events if event.text.startswith(text))
 
 
-def test_tapped_event_shows_its_moment(flown: SimulatedFleet) -> None:
-    """A tap on an event shows its moment in plots and story, until "now"; list and map stay current."""
-    page = Page(flown, query="?vehicle=quad")
+def test_tapped_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
+    """A tapped event pins plots and story to its time until "back to now"; list and map stay current."""
+    page = Page(faulty_fleet, query="?vehicle=quad")
     assert (page.pinned, page.url_query) == (None, "?vehicle=quad")
     page.tap("row", "xy not valid")
-    then = event_of(flown, "xy not valid")
+    then = event_of(faulty_fleet, "xy not valid")
     assert (page.chosen, page.pinned) == ("wing", then)
     assert page.plot_range == pytest.approx((then - 30, then + 30), abs=0.01)
-    assert "xy not valid from 22:13:50.1 to 22:13:54.1 UTC (4.0 s)" in page.part("why")
+    assert "xy not valid from 22:13:50.1 to 22:13:54.1 UTC (4.0 s)" in page.panel("why")
     assert page.grades["wing"] in ("ok", "watch")
-    assert "back to now" in page.part("tool")
+    assert "back to now" in page.panel("tool")
     assert f"time={then:.1f}" in page.url_query
     times = page.plotted["time"]
     assert times[0] / 1e3 < then < times[-1] / 1e3
-    flown.fly(5, WING, QUAD, x=30.0, xy_reset_counter=1)
+    faulty_fleet.fly(5, WING, QUAD, x=30.0, xy_reset_counter=1)
     page.refresh()
     assert page.pinned == then
     page.send("now")
     assert page.pinned is None
-    assert "back to now" not in page.part("tool")
+    assert "back to now" not in page.panel("tool")
     assert "time=" not in page.url_query
-    assert page.plot_range == pytest.approx((flown.time - 60, flown.time), abs=0.01)
+    assert page.plot_range == pytest.approx((faulty_fleet.time - 60, faulty_fleet.time), abs=0.01)
 
 
-def test_tapped_map_event_shows_its_moment(flown: SimulatedFleet) -> None:
-    """An event has a mark on the map at the vehicle's position at that time, which can be tapped repeatedly."""
-    page = Page(flown, query="?vehicle=wing")
+def test_tapped_map_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
+    """An event is marked on the map at the vehicle's position at that time; the mark can be tapped repeatedly."""
+    page = Page(faulty_fleet, query="?vehicle=wing")
     source = next(each for each in sources(page) if "marker" in each.data and "row" not in each.data)
     assert source.data["words"] == ["reset of xy by 30.0 m (30.0 north, 0.0 east)"]
     for _ in range(2):
         source.selected.indices = [0]
         page.update()
-        assert page.pinned == event_of(flown, "reset")
-        assert "reset of xy by 30.0 m" in page.part("why")
+        assert page.pinned == event_of(faulty_fleet, "reset")
+        assert "reset of xy by 30.0 m" in page.panel("why")
         page.send("now")
 
 
-def test_keys_step_through_events(flown: SimulatedFleet) -> None:
+def test_keys_step_through_events(faulty_fleet: SimulatedFleet) -> None:
     """The key p shows the previous event of the selected vehicle, n the next one, and Escape the current time."""
-    page = Page(flown, query="?vehicle=wing")
-    reset, begin = event_of(flown, "reset"), event_of(flown, "xy not valid")
+    page = Page(faulty_fleet, query="?vehicle=wing")
+    reset, begin = event_of(faulty_fleet, "reset"), event_of(faulty_fleet, "xy not valid")
     page.send("next")
     assert page.pinned is None
     for action, moment in (
@@ -664,23 +664,23 @@ def test_keys_step_through_events(flown: SimulatedFleet) -> None:
 
 
 @pytest.mark.parametrize("event", ["xy not valid", "reset", None])
-def test_url_restores_the_page(flown: SimulatedFleet, event: str | None) -> None:
+def test_url_restores_the_page(faulty_fleet: SimulatedFleet, event: str | None) -> None:
     """A page opened with the URL of another has the same vehicle, view, theme, moment and verdict."""
-    page = Page(flown, query="?theme=light")
+    page = Page(faulty_fleet, query="?theme=light")
     page.send("vehicle", "wing")
     page.send("focus:follow")
     if event is not None:
         page.send("previous")
         if event != "reset":
             page.send("previous")
-    other = Page(flown, query=page.url_query)
+    other = Page(faulty_fleet, query=page.url_query)
     other.update()
     assert other.url_query == page.url_query
     assert other.chosen == "wing"
     assert other.pinned == (None if event is None else pytest.approx(page.pinned, abs=0.06))
-    assert other.part("tool") == page.part("tool")
-    assert re.search('<div class="verdict">(.*?)</div>', other.part("why")) or event is None
-    assert re.sub(r"\([^)]*\)", "", other.part("why")) == re.sub(r"\([^)]*\)", "", page.part("why"))
+    assert other.panel("tool") == page.panel("tool")
+    assert re.search('<div class="verdict">(.*?)</div>', other.panel("why")) or event is None
+    assert re.sub(r"\([^)]*\)", "", other.panel("why")) == re.sub(r"\([^)]*\)", "", page.panel("why"))
     assert other.marks["wing"]["colour"] in LIGHT.vehicles
 
 
@@ -695,9 +695,9 @@ QUERIES = (
     "query",
     [each if index % 4 == 1 else pytest.param(each, marks=pytest.mark.slow) for index, each in enumerate(QUERIES)],
 )
-def test_invalid_url_arguments_are_ignored(flown: SimulatedFleet, query: str) -> None:
+def test_invalid_url_arguments_are_ignored(faulty_fleet: SimulatedFleet, query: str) -> None:
     """Invalid URL arguments are ignored; if the vehicle is unknown, another can be selected."""
-    page = Page(flown, query=query)
+    page = Page(faulty_fleet, query=query)
     page.update()
     assert page.vehicles == ["wing", "quad"]
     page.send("vehicle", "quad")
@@ -718,9 +718,9 @@ MALFORMED = (
 )  # fmt: skip
 
 
-def test_malformed_input_from_the_browser_is_ignored(flown: SimulatedFleet) -> None:
+def test_malformed_input_from_the_browser_is_ignored(faulty_fleet: SimulatedFleet) -> None:
     """No action, index, size, update number, selection or range from a browser stops the updates of its page."""
-    page = Page(flown)
+    page = Page(faulty_fleet)
     for message in MALFORMED:
         page.send_raw(message)
     for source in sources(page):
@@ -752,7 +752,7 @@ def test_malformed_input_from_the_browser_is_ignored(flown: SimulatedFleet) -> N
     page.refresh()
     assert page.vehicles == ["wing", "quad"]
     assert page.chosen == "wing"
-    assert page.part("list").count("<div") == 4
+    assert page.panel("list").count("<div") == 4
 
 
 def test_updates_pause_while_the_browser_does_not_draw(sim: SimulatedFleet) -> None:
@@ -841,7 +841,7 @@ def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_s
         assert page.marks["quad"]["shape"] == "square"
         zenoh_session.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
         page.send("streams")
-        until(lambda: "<td>a rule</td>" in page.part("more"), "the report")
+        until(lambda: "<td>a rule</td>" in page.panel("more"), "the report")
         until(lambda: any("rejected: a rule" in event.text for event in page.viewer._timeline.events), "its event")
 
 
@@ -857,12 +857,12 @@ def test_page_survives_a_router_restart() -> None:
     ):
         until(lambda: page.grades == {"wing": "ok"}, "the vehicle")
         router.close()
-        until(lambda: f"no link to {where}" in page.part("head"), "the alarm")
+        until(lambda: f"no link to {where}" in page.panel("head"), "the alarm")
         assert page.grades == {"wing": "ok"}
         assert page.marks["wing"]["fill"] == DARK.ground
         router = open_router(listen=(where,))
         until(lambda: page.marks["wing"]["fill"] != DARK.ground, "the vehicle again")
-        until(lambda: "no link to" not in page.part("head"), "the alarm to end")
+        until(lambda: "no link to" not in page.panel("head"), "the alarm to end")
         texts = [
             event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"
         ]

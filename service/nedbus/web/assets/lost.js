@@ -4,4 +4,4 @@ const bar = window.nedbusLost = document.createElement("div")
 bar.textContent = `nedbus web has not responded since ${new Date().toLocaleTimeString()}: reconnecting`
 bar.style = "position:fixed;top:0;width:100%;padding:9px;background:#b3261e;color:#fff;font:15px sans"
 document.body.append(bar)
-setInterval(() => fetch("/healthz").then(answer => answer.ok && location.reload()).catch(() => {}), 1000)
+setInterval(() => fetch("/healthz").then(response => response.ok && location.reload()).catch(() => {}), 1000)
