@@ -18,6 +18,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from nedbus.errors import OutputError
+from nedbus.whole_file import sync_folder
 from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.messages import LogMessage
@@ -70,6 +71,8 @@ class RecordingWriter:
         self._writer.start(profile="ros2", library="nedbus")
         try:
             self.flush()
+            with _writing(self.path):
+                sync_folder(self.path)
         except OutputError:
             self._file.close()
             self.path.unlink(missing_ok=True)
