@@ -8,7 +8,9 @@ DEV := $(VENV)/.dev
 ARGS = --source sim: --http 127.0.0.1:9464
 unexport PYTHONDONTWRITEBYTECODE  # of some images: each worker of pytest would compile all tests again, for eight seconds
 
-.PHONY: run check generated docs quick test behaviour slow test-all measured compose-test wheel bench clean
+SECONDS = 600
+
+.PHONY: run check generated docs quick test behaviour slow test-all measured fuzz compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
@@ -44,13 +46,18 @@ behaviour: $(DEV)
 slow: $(DEV)  ## the slow tests, and the properties of `make test` with four times as many examples
 	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not compose" --hypothesis-profile=all --junitxml=build/slow-tests.xml
 
-test-all: check measured compose-test  ## the same with branch coverage and more examples, the slow tests, and containers
+test-all: SECONDS = 60
+test-all: check measured fuzz compose-test  ## the same with branch coverage and more examples, the slow tests, a minute of fuzzing, and containers
 
 measured: $(DEV)  ## the tests of `make test` and `make slow`, under coverage
 	$(BIN)/coverage erase
 	$(BIN)/coverage run -m pytest -q -n 4 --dist worksteal -m "not compose" --hypothesis-profile=all
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
+
+fuzz: $(DEV)  ## fuzz the parsers of foreign bytes: ten minutes of processor time, or SECONDS, divided among them
+	$(BIN)/pip install -q --group fuzz
+	$(BIN)/python -m fuzz --seconds $(SECONDS)
 
 compose-test: $(DEV)  ## the tests in containers; they need Docker with compose, and some minutes
 	$(BIN)/pytest -q -n 3 --dist loadfile -o timeout_method=signal -o faulthandler_timeout=590 -m compose --junitxml=build/compose-tests.xml
