@@ -9,8 +9,11 @@ ARGS = --source sim: --http 127.0.0.1:9464
 unexport PYTHONDONTWRITEBYTECODE  # of some images: each worker of pytest would compile all tests again, for eight seconds
 
 SECONDS = 600
+IMAGE_EXTRAS = mavlink mcap metrics pki web
+# For both processors and every Python that pyproject.toml allows; without the address of an index.
+LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 
-.PHONY: run check generated docs quick test behaviour slow test-all measured fuzz compose-test wheel bench clean
+.PHONY: run check generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
 
 run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
@@ -62,14 +65,21 @@ fuzz: $(DEV)  ## fuzz the parsers of foreign bytes: ten minutes of processor tim
 compose-test: $(DEV)  ## the tests in containers; they need Docker with compose, and some minutes
 	$(BIN)/pytest -q -n 3 --dist loadfile -o timeout_method=signal -o faulthandler_timeout=590 -m compose --junitxml=build/compose-tests.xml
 
-wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and use it
+wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, use it, and write its SBOM
+	$(BIN)/pip install -q --group sbom
 	rm -rf dist build/wheel-venv
 	$(BIN)/python -m build --wheel
-	$(PYTHON) -m venv build/wheel-venv
-	build/wheel-venv/bin/pip install -q "$$(echo dist/nedbus-*.whl)[pki]"
+	$(PYTHON) -m venv --without-pip build/wheel-venv
+	$(BIN)/pip --python build/wheel-venv install -q "$$(echo dist/nedbus-*.whl)[all]"
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
 	rm -rf build/pki build/vehicle-1
 	cd build && wheel-venv/bin/nedbus pki ca pki && wheel-venv/bin/nedbus pki enroll pki 1 -r tls/127.0.0.1:7447
+	PATH=$(abspath $(BIN)):$$PATH packaging/sbom build/wheel-venv "$$(echo dist/nedbus-*.whl | sed 's/-py3.*/.cdx.json/')"
+
+lock: $(DEV)  ## renew the locked dependencies of the image: the newest versions that pyproject.toml allows, with hashes
+	$(BIN)/pip install -q --group lock
+	$(BIN)/uv pip compile $(LOCK) $(IMAGE_EXTRAS:%=--extra %) pyproject.toml -o packaging/requirements-image.txt
+	$(BIN)/uv pip compile $(LOCK) --group sbom -o packaging/requirements-build.txt
 
 bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck readers, pacing of a replay, an idle service
 	$(BIN)/pip install -q --group bench

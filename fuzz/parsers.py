@@ -51,7 +51,7 @@ MAVLINK_KINDS: Final = (
 """Ids of the messages that `frames` makes."""
 MAVLINK_IDS: Final = (245, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
 """System and component of the client of the log stream."""
-_MAX_PIECES: Final = 200  # of a log: single bytes would take long
+_MAX_PIECES: Final = 40  # of a log: single bytes would take long
 _RAW: Final = 255  # as the kind of a message: bytes without a frame
 _REMOTE: Final = 64  # bit of the kind: from another system
 _LOST: Final = 128  # bit of the kind: one message before this one was lost
