@@ -13,7 +13,7 @@ IMAGE_EXTRAS = mavlink mcap metrics pki web
 # For both processors and every Python that pyproject.toml allows; without the address of an index.
 LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 
-.PHONY: run check generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
+.PHONY: run check api api-baseline generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
 
 run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
@@ -27,6 +27,12 @@ check: $(DEV)  ## lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
+
+api: $(DEV)  ## compare the public API with that of the last release; `make test` does, too
+	$(BIN)/python -m tests.release.api_baseline
+
+api-baseline: $(DEV)  ## part of a release: record its public API for this comparison
+	$(BIN)/python -m tests.release.api_baseline --write
 
 generated: $(DEV)  ## a page for each message, made from its file
 	$(BIN)/python -m docs.generator

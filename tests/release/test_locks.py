@@ -12,7 +12,7 @@ from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-ROOT: Final = Path(__file__).parents[1]
+ROOT: Final = Path(__file__).parents[2]
 PROJECT: Final[dict[str, Any]] = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS: Final = re.findall(r"^IMAGE_EXTRAS = (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].split()
 ENVIRONMENTS: Final = [(python, machine) for python in ("3.11", "3.13", "3.14") for machine in ("x86_64", "aarch64")]
@@ -47,7 +47,8 @@ def required(name: str) -> list[Requirement]:
 @pytest.mark.parametrize(("python", "machine"), ENVIRONMENTS)
 def test_lock_satisfies_pyproject(name: str, python: str, machine: str) -> None:
     """Each requirement has exactly one pin in each environment, which satisfies it and has hashes: else `make lock`."""
-    environment = {**default_environment(), "python_version": python, "python_full_version": f"{python}.0"}
+    environment = {key: str(value) for key, value in default_environment().items()}
+    environment |= {"python_version": python, "python_full_version": f"{python}.0"}
     environment |= {"platform_machine": machine, "sys_platform": "linux", "extra": ""}
     pins = read_lock(name)
     for requirement in required(name):
