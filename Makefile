@@ -64,7 +64,7 @@ measured: $(DEV)  ## the tests of `make test` and `make slow`, under coverage
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
-fuzz: $(DEV)  ## fuzz the parsers of foreign bytes: ten minutes of processor time, or SECONDS, divided among them
+fuzz: $(DEV)  ## fuzz the parsers of foreign bytes: ten minutes, or SECONDS, divided among them
 	$(BIN)/pip install -q --group fuzz
 	$(BIN)/python -m fuzz --seconds $(SECONDS)
 
@@ -81,7 +81,7 @@ wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, use 
 	rm -rf build/pki build/vehicle-1
 	cd build && wheel-venv/bin/nedbus pki ca pki && wheel-venv/bin/nedbus pki enroll pki 1 -r tls/127.0.0.1:7447
 	PATH=$(abspath $(BIN)):$$PATH packaging/sbom build/wheel-venv "$$(echo dist/nedbus-*.whl | sed 's/-py3.*/.cdx.json/')"
-	@! grep -F '[SECURITY CONTACT' SECURITY.md || echo 'warning: SECURITY.md has no contact; fill it in before a release' >&2
+	@! grep -qF '[SECURITY CONTACT' SECURITY.md || echo 'warning: SECURITY.md has no contact; fill it in before a release' >&2
 
 lock: $(DEV)  ## renew the locked dependencies of the image: the newest versions that pyproject.toml allows, with hashes
 	$(BIN)/pip install -q --group lock

@@ -1,7 +1,6 @@
 """Fuzz one parser with libFuzzer: `python -m fuzz.harness ulog FOLDER`; with a file for FOLDER, that input alone."""
 
 import logging
-import os
 import sys
 
 import atheris
@@ -25,5 +24,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    os.nice(19)
     main()
