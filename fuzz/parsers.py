@@ -67,7 +67,7 @@ def parse_ulog(data: bytes) -> int:
     whole = _records(log, len(log) or 1, verify=verify)
     assert _plain(_records(log, size, verify=verify)) == _plain(whole), "the records depend on the size of the pieces"
     streams: dict[ulog.Subscription, ulog.LoggedStream] = {}
-    texts = ulog.Texts()
+    texts = ulog.LogMessageBuilder()
     count = 0
     for count, record in enumerate(texts.merge(whole), 1):  # noqa: B007 - counts
         if isinstance(record, ulog.Data):
@@ -190,11 +190,11 @@ def parse_mavlink(data: bytes) -> int:
                     continue
                 now, system = item.time, item.system
                 vehicle = vehicles.setdefault(system, Vehicle(str(system), options))
-                vehicle.track_sequence(item.sequence, now, counted=item.piece.lost if item.piece else 0)
+                vehicle.track_sequence(item.sequence, now, counted=item.chunk.lost if item.chunk else 0)
                 found = [vehicle.handle(item.message, now)]
-                if item.piece is not None:
+                if item.chunk is not None:
                     log = logs.setdefault(system, LogStream(str(system), options, receiver.vehicles[system].client))
-                    found += log.add(item.piece, now)
+                    found += log.add(item.chunk, now)
                 for each in found:
                     if isinstance(each, SourceMessage):
                         _validate(each.definition or BY_TOPIC[each.address.topic], each.fields)
