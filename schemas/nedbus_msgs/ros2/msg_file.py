@@ -77,10 +77,7 @@ def define_msg(name: str, text: str) -> Definition[Message]:
 
 
 def hash_of_msg(name: str, text: str) -> str:
-    """Return the RIHS01 hash of the px4_msgs type in a .msg file, including nested messages.
-
-    Raises MsgError for a malformed file.
-    """
+    """Return the RIHS01 hash of the type in a .msg file, with nested messages; raise MsgError if it is malformed."""
     parts = _parts(text)
     types = {part: [_describe(line, parts) for line in lines.values()] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
