@@ -1,4 +1,4 @@
-# Each target sets up .venv by itself; nothing else needs to be installed but Python 3.11 or newer and make.
+# Every target creates .venv; only Python 3.11 or newer and make have to be installed.
 
 PYTHON ?= python3
 VENV := .venv
@@ -6,65 +6,89 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
 ARGS = --source sim: --http 127.0.0.1:9464
-unexport PYTHONDONTWRITEBYTECODE  # of some images: each worker of pytest would compile all tests again, for eight seconds
+unexport PYTHONDONTWRITEBYTECODE  # set in some images: each pytest worker would compile all tests again, for 8 s
 
-.PHONY: run check generated docs quick test behaviour slow test-all measured compose-test wheel bench clean
+SECONDS = 600
+IMAGE_EXTRAS = mavlink mcap metrics pki web
+# Valid on x86-64 and ARM64 and for every supported Python; the address of the package index is left out.
+LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 
-run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
+.PHONY: run check api api-baseline generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean
+
+run: $(READY)  ## run the service with a simulated flight, or with ARGS; it prints a command for a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
 	@trap : INT; $(BIN)/nedbus serve $(ARGS); code=$$?; case $$code in \
 	130) exit 0 ;; \
 	1) echo 'for other options: make run ARGS="--source sim: --vehicle 2 --connect tcp/127.0.0.1:7447"' >&2 ;; \
 	esac; exit $$code
 
-check: $(DEV)  ## lint and types
+check: $(DEV)  ## lint, import rules and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
 
-generated: $(DEV)  ## a page for each message, made from its file
+api: $(DEV)  ## compare the public API with the last release; `make test` does so, too
+	$(BIN)/python -m tests.release.api_baseline
+
+api-baseline: $(DEV)  ## record the public API, as part of a release
+	$(BIN)/python -m tests.release.api_baseline --write
+
+generated: $(DEV)  ## generate the page of each message, and vectors of the wire format
 	$(BIN)/python -m docs.generator
 
-docs: $(DEV)  ## the site with its reference, in build/site; a link that leads nowhere is an error
+docs: $(DEV)  ## build the site with its reference in build/site; a broken link is an error
 	$(BIN)/pip install -q --group docs
 	$(BIN)/python -m docs.generator --site
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --fresh-env docs build/site
-	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # nothing is fetched
-	@echo "build/site/index.html is the site; for a server: $(BIN)/python -m http.server --directory build/site"
+	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from elsewhere
+	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## the tests of rules alone, without routers and processes: under half a minute
+quick: $(DEV)  ## run the tests without routers and processes: under half a minute
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
-test: check behaviour  ## lint, types, and all tests that prove behaviour: under three minutes on two cores
+test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two cores
 
 behaviour: $(DEV)
 	$(BIN)/pytest -q -n 6 --dist worksteal -m "not slow and not compose" --junitxml=build/tests.xml
 
-slow: $(DEV)  ## the slow tests, and the properties of `make test` with four times as many examples
+slow: $(DEV)  ## run the slow tests, and the property tests with four times as many examples
 	$(BIN)/pytest -q -n 4 --dist worksteal -m "(slow or hypothesis) and not compose" --hypothesis-profile=all --junitxml=build/slow-tests.xml
 
-test-all: check measured compose-test  ## the same with branch coverage and more examples, the slow tests, and containers
+test-all: SECONDS = 60
+test-all: check measured fuzz compose-test  ## run everything: with branch coverage, slow tests, a minute of fuzzing, and containers
 
-measured: $(DEV)  ## the tests of `make test` and `make slow`, under coverage
+measured: $(DEV)  ## run the tests of `make test` and `make slow` with branch coverage
 	$(BIN)/coverage erase
 	$(BIN)/coverage run -m pytest -q -n 4 --dist worksteal -m "not compose" --hypothesis-profile=all
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
-compose-test: $(DEV)  ## the tests in containers; they need Docker with compose, and some minutes
+fuzz: $(DEV)  ## fuzz the parsers for ten minutes, or SECONDS, in total
+	$(BIN)/pip install -q --group fuzz
+	$(BIN)/python -m fuzz --seconds $(SECONDS)
+
+compose-test: $(DEV)  ## run the container tests; they need Docker with compose
 	$(BIN)/pytest -q -n 3 --dist loadfile -o timeout_method=signal -o faulthandler_timeout=590 -m compose --junitxml=build/compose-tests.xml
 
-wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and use it
+wheel: $(DEV)  ## build the wheel, install it in a clean environment, use it, and write its SBOM
+	$(BIN)/pip install -q --group sbom
 	rm -rf dist build/wheel-venv
 	$(BIN)/python -m build --wheel
-	$(PYTHON) -m venv build/wheel-venv
-	build/wheel-venv/bin/pip install -q "$$(echo dist/nedbus-*.whl)[pki]"
+	$(PYTHON) -m venv --without-pip build/wheel-venv
+	$(BIN)/pip --python build/wheel-venv install -q "$$(echo dist/nedbus-*.whl)[all]"
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
 	rm -rf build/pki build/vehicle-1
 	cd build && wheel-venv/bin/nedbus pki ca pki && wheel-venv/bin/nedbus pki enroll pki 1 -r tls/127.0.0.1:7447
+	PATH=$(abspath $(BIN)):$$PATH packaging/sbom build/wheel-venv "$$(echo dist/nedbus-*.whl | sed 's/-py3.*/.cdx.json/')"
+	@! grep -qF '[SECURITY CONTACT' SECURITY.md || echo 'warning: SECURITY.md has no contact; fill it in before a release' >&2
 
-bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck readers, pacing of a replay, an idle service
+lock: $(DEV)  ## renew the pinned dependencies of the image: the newest versions that pyproject.toml allows
+	$(BIN)/pip install -q --group lock
+	$(BIN)/uv pip compile $(LOCK) $(IMAGE_EXTRAS:%=--extra %) pyproject.toml -o packaging/requirements-image.txt
+	$(BIN)/uv pip compile $(LOCK) --group sbom -o packaging/requirements-build.txt
+
+bench: $(DEV)  ## run the benchmarks: comparison with peers, fleets, slow readers, replay pacing, idle load
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
 	$(BIN)/python -m benchmarks.compare.picture
@@ -82,15 +106,15 @@ bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck reade
 	$(BIN)/python -m benchmarks.ulog.stream
 	$(BIN)/python -m benchmarks.metrics
 
-$(READY): pyproject.toml  # what running needs
-	@echo "making a virtual environment in $(VENV) ..."
+$(READY): pyproject.toml  # dependencies of nedbus
+	@echo "creating a virtual environment in $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)
-	@echo "installing nedbus and the packages that it needs, about 200 MB ..."
+	@echo "installing nedbus and its dependencies, about 200 MB ..."
 	@$(BIN)/pip install --disable-pip-version-check --editable ".[metrics]"
 	@touch $(READY)
 
-$(DEV): $(READY) pyproject.toml  # what tests, checks and measurements need besides
-	@echo "installing what development needs, about 600 MB ..."
+$(DEV): $(READY) pyproject.toml  # dependencies of tests, checks and benchmarks
+	@echo "installing the development dependencies, about 600 MB ..."
 	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
 	$(BIN)/pip install -q --group dev --editable .
 	touch $(DEV)

@@ -13,7 +13,9 @@ from tests.mutants import read_table
 
 ROOT = Path(__file__).parents[1]
 PRODUCT = sorted([*ROOT.glob("service/**/*.py"), *ROOT.glob("schemas/**/*.py")])
-ALL = sorted([*PRODUCT, *(path for top in ("tests", "benchmarks", "examples") for path in ROOT.glob(f"{top}/**/*.py"))])
+ALL = sorted(
+    [*PRODUCT, *(path for top in ("tests", "fuzz", "benchmarks", "examples") for path in ROOT.glob(f"{top}/**/*.py"))]
+)
 MAX_FILES = 14  # per folder: split a larger one into subpackages
 
 

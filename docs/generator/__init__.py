@@ -11,14 +11,16 @@ from .commands import commands_page
 from .messages import module_of, page
 from .metrics import metrics_page
 from .tables import events_page, keys_page, limits_page, settings_page
+from .vectors import VECTORS, vectors_text
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 
 
 def committed() -> dict[Path, str]:
-    """Return the pages of messages, which are committed to the repository."""
-    return {DOCS / "messages" / f"{module_of(each)}.md": page(each) for each in MESSAGES.values()}
+    """Return the pages of messages and the vectors of the wire format, which are committed to the repository."""
+    pages = {DOCS / "messages" / f"{module_of(each)}.md": page(each) for each in MESSAGES.values()}
+    return {**pages, VECTORS: vectors_text()}
 
 
 def reference() -> dict[str, str]:

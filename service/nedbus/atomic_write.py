@@ -3,7 +3,7 @@
 import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -29,6 +29,7 @@ def atomic_write(path: Path, *, replace: bool = False) -> Iterator[Path]:
             os.fsync(file.fileno())
         if replace:
             temporary.replace(target)
+            sync_folder(target)
             return
         try:
             target.hardlink_to(temporary)
@@ -36,5 +37,16 @@ def atomic_write(path: Path, *, replace: bool = False) -> Iterator[Path]:
             raise exists from None
         except OSError:  # a file system without hard links, such as FAT on SD cards
             temporary.rename(target)
+        sync_folder(target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sync_folder(path: Path) -> None:
+    """Sync the folder of a new or renamed file to disk: until then a power cut may undo its name."""
+    with suppress(PermissionError):  # a folder that can be written but not read
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)

@@ -20,6 +20,7 @@ _FIELD = re.compile(
 )
 """A field, with a default value or not, or a constant."""
 _LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or form feed, which may occur in a comment
+_LENGTH = re.compile(r"\[([1-9]\d{0,2})\]")  # of an array of nested messages
 _STRINGS: Final = ("string", "wstring")  # types of constants only
 # Possessive quantifiers: a comment may have 200,000 spaces or digits.
 _NUMBER: Final = r"[-+]?(?:\d++\.?\d*+(?:[eE][-+]?\d++)?|inf)"
@@ -76,7 +77,7 @@ def define_msg(name: str, text: str) -> Definition[Message]:
 
 
 def hash_of_msg(name: str, text: str) -> str:
-    """Return the RIHS01 hash of the px4_msgs type in a .msg file, including nested messages."""
+    """Return the RIHS01 hash of the type in a .msg file, with nested messages; raise MsgError if it is malformed."""
     parts = _parts(text)
     types = {part: [_describe(line, parts) for line in lines.values()] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
@@ -129,7 +130,7 @@ def _parts(text: str) -> _Parts:
 
 def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[MsgField]:
     for line in parts[message].values():
-        count = re.fullmatch(r"\[([1-9]\d{0,2})\]", line.length)
+        count = _LENGTH.fullmatch(line.length)
         if parts.get(line.base) and level < _MAX_NESTING and (count or not line.length):
             for index in range(int(count[1])) if count else [None]:
                 yield from _flatten(
@@ -140,9 +141,9 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
 
 
 def _describe(line: _Line, parts: Mapping[str, object]) -> FieldDescription:
-    if line.base in parts:
-        length = int(line.length.strip("[]") or 0)
-        return line.name, NESTED + (ARRAY if length else 0), length, f"{PACKAGE}/{line.base}"
+    count = _LENGTH.fullmatch(line.length)
+    if line.base in parts and (count or not line.length):
+        return line.name, NESTED + (ARRAY if count else 0), int(count[1]) if count else 0, f"{PACKAGE}/{line.base}"
     return describe_field(line.name, _type_of(line))
 
 

@@ -17,6 +17,7 @@ from typing import IO, Any, Final, Self, cast
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
 
+from nedbus.atomic_write import sync_folder
 from nedbus.errors import OutputError
 from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
@@ -70,6 +71,8 @@ class RecordingWriter:
         self._writer.start(profile="ros2", library="nedbus")
         try:
             self.flush()
+            with _writing(self.path):
+                sync_folder(self.path)
         except OutputError:
             self._file.close()
             self.path.unlink(missing_ok=True)

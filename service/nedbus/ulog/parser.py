@@ -226,9 +226,11 @@ class UlogParser:
         known = self._known.get(buffer[at : at + _DATA_HEADER])
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
         stop = content + int.from_bytes(buffer[at : at + 2], "little")
-        if kind and not b"!" <= kind <= b"~":  # record types are printable characters, in later versions too
+        is_partial = stop > len(buffer) or not kind
+        # Record types are printable characters, in later versions too; without `verify` the length is right anyway.
+        if kind and not b"!" <= kind <= b"~" and (self._verify or not is_partial):
             return _Inspection(_Validity.INVALID, stop)
-        if stop > len(buffer) or not kind:
+        if is_partial:
             return _Inspection(_Validity.INCOMPLETE, stop)
         if known is not None:  # a sync message inside it means that bytes are missing
             return _Inspection(_Validity.UNKNOWN if self._verify and SYNC in buffer[at:stop] else _Validity.VALID, stop)

@@ -98,6 +98,15 @@ def test_log_can_be_fed_byte_by_byte() -> None:
     assert text_of(parse(log, chunk=1)) == text_of(parse(log))
 
 
+@pytest.mark.parametrize("verify", [False, True])
+@pytest.mark.parametrize("size", [1, 16, 64])
+def test_record_of_invalid_type_in_pieces_gives_the_same_records(size: int, verify: bool) -> None:
+    """The rest of a record whose type is no letter is skipped when it arrives, not parsed as records."""
+    log = small_log()
+    log += b"\x40\0\x01" + small_log()[-0x40:] + small_log()[-200:]
+    assert text_of(parse(log, chunk=size, verify=verify)) == text_of(parse(log, verify=verify))
+
+
 @given(st.randoms(use_true_random=False), st.sampled_from(("flip", "cut", "insert")))
 def test_damage_alters_no_message(rng: random.Random, kind: str) -> None:
     """Missing and inserted bytes lose messages, but alter none; a flipped bit alters at most its own message."""

@@ -109,6 +109,14 @@ def test_value_for_unknown_survives_float32_rounding() -> None:
     assert decode(encode(message), definition.model) == message
 
 
+@pytest.mark.parametrize("length", ["[x]", "[0]", "[-1]", "[1_0]", "[", "[2000]", "[<=3]"])
+def test_invalid_length_of_an_array_of_messages_raises(length: str) -> None:
+    text = f"uint64 timestamp\nPart{length} parts\n===\nMSG: px4_msgs/Part\nbool flag\n"
+    for read in (read_msg, lambda each: hash_of_msg("Whole", each)):
+        with pytest.raises(MsgError, match="line 2, column 1"):
+            read(text)
+
+
 def test_too_many_nested_fields_raise() -> None:
     """A short text that expands to a million fields is rejected."""
     text = f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nuint8 c\n"

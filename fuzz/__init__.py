@@ -1,0 +1,1 @@
+"""Coverage-guided fuzzing of everything that parses foreign bytes, with Atheris (`make fuzz`)."""

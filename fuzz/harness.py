@@ -1,0 +1,27 @@
+"""Fuzz one parser with libFuzzer: `python -m fuzz.harness ulog FOLDER`; with a file for FOLDER, that input alone."""
+
+import logging
+import sys
+
+import atheris
+
+atheris.enabled_hooks.add("str")  # inputs are guided to what `startswith` expects; the hook of re lacks arguments
+with atheris.instrument_imports(include=["nedbus", "nedbus_msgs", "mcap"]):
+    from . import parsers
+
+
+def main() -> None:
+    """Run until a limit is reached, or until an error escapes."""
+    name, *flags = sys.argv[1:]
+    logging.disable()  # a gap of a log is no news here
+    parse = parsers.PARSERS[name]
+
+    def run(data: bytes) -> None:
+        parse(data)
+
+    atheris.Setup([name, *flags], run)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Programs in JavaScript, C++ and Rust that test themselves against the vectors of the wire format."""

@@ -1,0 +1,101 @@
+"""The vectors of the wire format: nedbus conforms to them, and so do independent programs in other languages."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from docs.generator.vectors import VECTORS, definition_of, from_json, to_json
+from nedbus_msgs import BASES, MESSAGES, DecodeError, codec_of, field_type, provenance_of, upgrade_with
+from tests.nedbus_msgs.strategies import DATA
+
+HERE: Final = Path(__file__).parent
+FILE: Final[dict[str, Any]] = json.loads(VECTORS.read_text())
+RUST: Final = """[package]
+name = "vectors"
+version = "0.0.0"
+edition = "2021"
+
+[[bin]]
+name = "vectors"
+path = "vectors.rs"
+
+[dependencies]
+rmpv = "1"
+serde_json = { version = "1", features = ["float_roundtrip"] }
+"""
+COMMANDS: Final = {
+    "node": (["npm", "install", "--no-audit", "--no-fund", "@msgpack/msgpack"], ["node", "vectors.mjs"]),
+    "g++": (["g++", "-std=c++17", "-O0", "vectors.cpp", "-o", "vectors"], ["./vectors"]),
+    "cargo": (["cargo", "build", "--quiet"], ["cargo", "run", "--quiet", "--"]),
+}
+
+
+def cases(kind: str) -> list[Any]:
+    return [pytest.param(each, id=each["name"]) for each in FILE[kind]]
+
+
+@pytest.mark.parametrize("vector", cases("exact"))
+def test_vector_is_encoded_and_decoded(vector: dict[str, Any]) -> None:
+    definition = definition_of(vector["message"], FILE["definitions"])
+    codec, fields = codec_of(definition), from_json(vector["values"], definition.types)
+    payload = bytes.fromhex(vector["payload"])
+    assert codec.encode_fields(fields) == payload
+    decoded = to_json(codec.decode(payload).__dict__, definition.types)
+    assert json.dumps(decoded) == json.dumps(vector["values"])  # -0.0 differs from 0.0
+    assert provenance_of(definition, vector["encoding"]).missing == {*vector["missing"]}
+
+
+@pytest.mark.parametrize("vector", cases("decode"))
+def test_other_form_of_a_vector_is_decoded(vector: dict[str, Any]) -> None:
+    """Payloads that nedbus does not write have the same values: other layouts and other msgpack types."""
+    definition = definition_of(vector["message"], FILE["definitions"])
+    types = {name: field_type(kind) for name, kind in FILE["definitions"][f"{vector['message']}/{vector['layout']}"]}
+    expected = upgrade_with(definition, from_json(vector["values"], types))
+    assert repr(codec_of(definition).decode(bytes.fromhex(vector["payload"]))) == repr(expected)
+
+
+@pytest.mark.parametrize("vector", cases("reject"))
+def test_invalid_vector_is_rejected(vector: dict[str, Any]) -> None:
+    with pytest.raises(DecodeError):
+        codec_of(MESSAGES[vector["message"]]).decode(bytes.fromhex(vector["payload"]))
+
+
+def test_vectors_cover_each_message_and_type() -> None:
+    types = {field_type(kind) for fields in FILE["definitions"].values() for _, kind in fields}
+    assert {kind.base for kind in types} == {*BASES}
+    assert {kind.base for kind in types if kind.is_array} >= {"bool", "float32", "uint8", "uint64"}
+    assert {each["message"] for each in FILE["exact"]} == {*MESSAGES, "WireTypes"}
+
+
+def test_vectors_have_the_golden_bytes() -> None:
+    """The bytes that the format had in the first version are vectors, unchanged."""
+    payloads = {each["payload"] for each in FILE["exact"]}
+    for name in ("golden.json", "golden_messages.json"):
+        assert {each["payload"] for each in json.loads((DATA / name).read_text()).values()} <= payloads
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.parametrize("tool", COMMANDS)
+def test_program_in_another_language_conforms(tool: str, tmp_path: Path) -> None:
+    """The program decodes and encodes all vectors; skips without its tools, or where packages cannot be installed."""
+    for path in HERE.glob("vectors.*"):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "Cargo.toml").write_text(RUST)
+    build, run = COMMANDS[tool]
+    if not all(map(shutil.which, (build[0], tool))):
+        pytest.skip(f"no {tool}")
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    if done.returncode and any(each in done.stderr for each in ("network", "registry", "No such file", "ENOTFOUND")):
+        pytest.skip(f"cannot be built here: {done.stderr[-200:]}")
+    assert done.returncode == 0, done.stderr
+    command = [*run, str(VECTORS)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    counts = [len(FILE[kind]) for kind in ("exact", "decode", "reject")]
+    assert done.stdout.strip() == "{} exact, {} decoded, {} rejected".format(*counts), done.stderr
