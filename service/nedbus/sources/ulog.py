@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Final, cast
 
@@ -26,7 +26,7 @@ def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> Repl
     run = ReplayRun(iter(()), {}, None, "", position=0)
     messages = _read(reader, run, path, options)
     ahead = list(islice(messages, _LOOKAHEAD))
-    run.messages = chain(ahead, messages)
+    run.messages = (message for part in (ahead, messages) for message in part)  # a generator, which can be closed
     run.total, run.boot_utc = path.stat().st_size, reader.boot_utc
     streams = list(reader.streams.values())
     layouts = " and ".join(sorted({_layout_name(each) for each in streams if each.definition is DEFAULT}))

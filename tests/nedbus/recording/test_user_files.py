@@ -106,5 +106,5 @@ def test_unreadable_file_raises_with_the_reason(name: str, reason: str) -> None:
 def test_msg_file_variants_are_read(name: str) -> None:
     """The .msg files that rosbags reads are read, and those with a BOM, which it refuses."""
     source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(vehicle="1")
-    ((definition,),) = (each.values() for each in source._given.values())
+    ((definition,),) = (each.values() for each in source._supplied.values())
     assert [*definition.types][:3] == ["timestamp", "angle", "mode"]

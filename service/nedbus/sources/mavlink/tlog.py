@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -95,7 +95,7 @@ def open_tlog(file: str, options: RecordedOptions, _: str) -> ReplayRun:
     messages = _read(reader, run, path, options)
     ahead = list(islice(messages, _LOOKAHEAD))
     vehicles = sorted({address.vehicle for address in reader.definitions})
-    run.messages = chain(ahead, messages)
+    run.messages = (message for part in (ahead, messages) for message in part)  # a generator, which can be closed
     run.total = path.stat().st_size
     run.summary = f"vehicle {', '.join(vehicles)}, {run.total / 1e6:.1f} MB"
     return run
