@@ -54,7 +54,7 @@ def secure(start: Start, pki: Path, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def raw(zenohd: str) -> Iterator[Session]:
+def zenoh_session(zenohd: str) -> Iterator[Session]:
     """Open a plain Zenoh session."""
     with open_client([zenohd], timeout=DEADLINE) as session:
         yield session
