@@ -299,7 +299,7 @@ def test_readme_is_short() -> None:
     assert {"run", "test"} <= set(re.findall(r"\bmake (\w+)", text))
 
 
-def test_speed_in_readme_is_the_last_measurement() -> None:
+def test_speed_in_readme_matches_last_measurement() -> None:
     """The throughput figures in the README are those of performance.json."""
     measured = json.loads((DOCS / "explanation" / "performance.json").read_text())
     full = measured["results"][measured["flight"]]["full"]

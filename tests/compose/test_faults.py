@@ -166,7 +166,7 @@ bus.close()
 """
 
 
-def test_stuck_reader_affects_no_others(make_stack: StartStack, record: Record) -> None:
+def test_stuck_reader_does_not_affect_others(make_stack: StartStack, record: Record) -> None:
     """While one subscriber does not read for 60 s, another one loses nothing and the publisher never blocks."""
     stack = make_stack("stuck")
     stack.up("router")

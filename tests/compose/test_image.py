@@ -18,7 +18,7 @@ def run_in_image(*command: str) -> str:
     return docker("run", "--rm", "--entrypoint", command[0], "nedbus", *command[1:])
 
 
-def test_sbom_lists_what_is_installed(images: None) -> None:
+def test_sbom_lists_installed_packages(images: None) -> None:
     """The SBOM in the image has exactly its packages, with their versions, and no tool of its build."""
     sbom = json.loads(run_in_image("cat", "/opt/nedbus/sbom.cdx.json"))
     root = sbom["metadata"]["component"]

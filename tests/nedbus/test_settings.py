@@ -262,7 +262,7 @@ def test_serve_help_lists_every_source() -> None:
     assert all(f" {name}:{kind.target or ''}" in help_.out for name, kind in SOURCE_KINDS.items())
 
 
-def test_listen_error_has_the_reason_of_the_system(endpoint: str) -> None:
+def test_listen_error_includes_the_system_error(endpoint: str) -> None:
     """ListenError is an OSError with the reason: the port is in use, or the address belongs to another host."""
     for where, reason in ((endpoint, "address already in use"), ("tcp/192.0.2.1:7447", "cannot assign requested")):
         with pytest.raises(ListenError, match=rf"cannot listen on {where} \({reason}") as info:

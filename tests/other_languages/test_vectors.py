@@ -52,7 +52,7 @@ def test_vector_is_encoded_and_decoded(vector: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("vector", cases("decode"))
-def test_other_form_of_a_vector_is_decoded(vector: dict[str, Any]) -> None:
+def test_other_encoding_of_a_vector_is_decoded(vector: dict[str, Any]) -> None:
     """Payloads that nedbus does not write have the same values: other layouts and other msgpack types."""
     definition = definition_of(vector["message"], FILE["definitions"])
     types = {name: field_type(kind) for name, kind in FILE["definitions"][f"{vector['message']}/{vector['layout']}"]}

@@ -71,7 +71,7 @@ def test_each_pin_has_hashes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["image", "build"])
-def test_lock_has_no_address(name: str) -> None:
+def test_lock_contains_no_urls(name: str) -> None:
     """The lock names files by their hashes, wherever they come from."""
     text = (ROOT / "packaging" / f"requirements-{name}.txt").read_text()
     assert not re.search(r"://|index-url|find-links", text)

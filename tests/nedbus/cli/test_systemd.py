@@ -162,7 +162,7 @@ def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_p
 
 
 @pytest.mark.usefixtures("frequent_status")
-def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
+def test_watchdog_is_not_sent_without_ticks(systemd: Systemd) -> None:
     """While the main thread hangs, no WATCHDOG is sent, but the status text is."""
     with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
@@ -191,7 +191,7 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
     [("sim:", "publish"), (f"mavlink:udpin:127.0.0.1:{free_port()}", "expire_stale")],
     ids=["replay", "live"],
 )
-def test_no_watchdog_while_a_source_is_stuck(
+def test_watchdog_is_not_sent_while_a_source_is_stuck(
     systemd: Systemd, monkeypatch: pytest.MonkeyPatch, timings: Timings, source: str, method: str
 ) -> None:
     """While the loop of a source is blocked, no WATCHDOG is sent, although all other threads work."""
@@ -213,7 +213,7 @@ def test_no_watchdog_while_a_source_is_stuck(
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
-def test_watchdog_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_is_sent_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     """WATCHDOG is sent while a replay at speed=max waits for slow readers: it is not stuck."""
     entered, opened = block(monkeypatch, "publish")
     with (

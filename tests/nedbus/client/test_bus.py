@@ -219,7 +219,7 @@ def test_vehicles_without_a_router_are_incomplete() -> None:
         assert not bus.vehicles().complete
 
 
-def test_bus_receives_replies_of_its_own_300_publishers(endpoint: str) -> None:
+def test_replies_beyond_channel_capacity_do_not_block(endpoint: str) -> None:
     """More replies than a Zenoh channel holds (256) block neither the bus that sends them nor another one."""
     with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:
         for number in range(300):

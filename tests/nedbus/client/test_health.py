@@ -139,7 +139,7 @@ def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, rebo
     assert health.reboots == reboots
 
 
-def test_flags_are_shares_of_messages() -> None:
+def test_flag_shares_are_fractions_of_messages() -> None:
     """`flags` has the share of messages with a flag set in the last second, and `flags_ever` since the start."""
     stream = StreamHealth(VLP)
     for index in range(400):

@@ -114,7 +114,7 @@ def test_reload_keeps_sources_given_by_flags(run_nedbus: Start) -> None:
     assert "0 started, 0 stopped, 2 unchanged" in reload(service, 1)
 
 
-def test_reload_during_startup_applies_to_the_start(tmp_path: Path) -> None:
+def test_reload_during_startup_is_applied(tmp_path: Path) -> None:
     """A service that is still waiting for its router starts with the latest settings."""
     daemon = Daemon(load_settings(connect=(free_endpoint(),), source=("sim:",)), version="test")
     assert (

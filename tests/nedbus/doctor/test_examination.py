@@ -227,7 +227,7 @@ def test_clock_offset_of_publisher_is_wrong(zenoh_session: Session, endpoint: st
     find(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
 
 
-def test_service_status_gives_findings(zenoh_session: Session, endpoint: str) -> None:
+def test_service_status_produces_findings(zenoh_session: Session, endpoint: str) -> None:
     """Failed, waiting and stale sources, rejections and another version are found; of many findings the worst ones."""
     sources = [
         source(state="failed", error="the disk is gone"),
@@ -320,7 +320,7 @@ def test_bad_vehicle_in_report_of_real_service_is_wrong(run_nedbus: Start, tmp_p
 
 
 @pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
-def test_invalid_service_status_breaks_no_check(zenoh_session: Session, endpoint: str, now: object) -> None:
+def test_invalid_service_status_does_not_break_checks(zenoh_session: Session, endpoint: str, now: object) -> None:
     """The valid parts of a peer's invalid status have findings, and no check fails."""
     states: list[object] = [[], {}, 7, None]
     strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
@@ -573,7 +573,7 @@ def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes
     return [each.pack(encoder) for each in messages]  # type: ignore[attr-defined] # pymavlink has no types
 
 
-def test_traffic_on_mavlink_link_gives_findings() -> None:
+def test_mavlink_traffic_produces_findings() -> None:
     """Packets, messages, positions, ULog stream, ignored senders and a port in use have findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)

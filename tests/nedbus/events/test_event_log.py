@@ -756,7 +756,7 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 @given(STEPS)
 @example([("send", {"xy_valid"}), ("send", set()), ("lose", 1), *[("send", set()), ("send", {"xy_valid"})] * 2])
-def test_begins_and_ends_are_consistent(steps: list[tuple[str, Any]]) -> None:
+def test_begins_and_ends_of_conditions_are_consistent(steps: list[tuple[str, Any]]) -> None:
     """For any messages, an end follows a begin or, at most once since boot, an initial condition.
 
     The last event of flapping may repeat an end, if an even number of changes was suppressed.

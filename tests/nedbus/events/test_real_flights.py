@@ -195,7 +195,7 @@ def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_conditions_of_the_whole_flight(name: str) -> None:
+def test_conditions_of_the_whole_flight_are_fix_reference_or_position(name: str) -> None:
     """Conditions active in the first message and never ended are a missing fix, reference or valid position."""
     vehicle = cached_events(name).event_log.vehicles["1"]
     held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
@@ -239,7 +239,7 @@ def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
     assert story.lacking == ()
 
 
-def test_stories_at_a_time() -> None:
+def test_stories_at_a_time_are_those_active_then() -> None:
     """At a given time, the stories are those active then, bad or not, else the last one before."""
     assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
     assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
@@ -261,7 +261,7 @@ def test_primary_ekf_changes_are_events() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_only_one_estimate_is_contradicted(name: str) -> None:
+def test_only_one_log_has_a_contradicted_estimate(name: str) -> None:
     """Only one log has a contradicted estimate: height 27 m below GNSS and barometer, and position 6 to 9 m off.
 
     In the other logs no valid estimate is off for as long: 92 m for half a second in twelve_messages, 3 m in gps_loss,

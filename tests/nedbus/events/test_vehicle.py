@@ -153,7 +153,7 @@ def test_worse_warning_ends_the_previous_one(vehicle: SimpleVehicle) -> None:
     assert vehicle.stories() == [("battery critical", 2.0)]
 
 
-def test_story_of_event_is_about_that_event(vehicle: SimpleVehicle) -> None:
+def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
     """Two faults within a minute have one story each, and an end has the story of its begin."""
     vehicle.send(0.0)
     vehicle.send(1.0, timestamp=1_000_000)

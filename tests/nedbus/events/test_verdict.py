@@ -26,7 +26,7 @@ def verdict(flight: Flight, *, times: Times | None = None, at: float | None = No
     return verdict_of("1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at)
 
 
-def test_verdict_on_active_fault() -> None:
+def test_verdict_on_active_fault_includes_evidence() -> None:
     """The verdict has the fault, its start, duration and clock, the evidence in order of time, and missing topics."""
     flight = Flight()
     lose_gps(flight)
@@ -44,7 +44,7 @@ def test_verdict_on_active_fault() -> None:
     assert "UTC, until now (1.0 s)" in verdict(flight, times=LIVE).text
 
 
-def test_verdict_on_ended_fault() -> None:
+def test_verdict_on_ended_fault_includes_start_and_end() -> None:
     """The verdict has the start and end of a fault that has ended."""
     flight = Flight()
     lose_gps(flight)
@@ -58,7 +58,7 @@ def test_verdict_on_ended_fault() -> None:
     assert (found.usable, found.begin.time, found.end.time) == (False, flight.now - 2.0, flight.now)
 
 
-def test_verdict_without_faults() -> None:
+def test_verdict_reports_absence_of_faults() -> None:
     """Without faults the verdict says so, and whether the data has position validity."""
     flight = Flight()
     flight.fly(5)
@@ -136,7 +136,7 @@ def test_verdict_quotes_px4() -> None:
     )
 
 
-def test_unrelated_events_are_evidence_if_there_is_no_other() -> None:
+def test_unrelated_events_are_evidence_without_a_known_cause() -> None:
     """Without a known cause, all events shortly before a fault are shown, except phases of the flight."""
     flight = Flight()
     flight.status(ARMED)
@@ -156,7 +156,7 @@ def held(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
     return Condition(kind, "watch", words, since, begin, initial=True)
 
 
-def test_verdict_on_conditions_of_whole_flight() -> None:
+def test_conditions_of_whole_flight_are_one_fault() -> None:
     """Conditions active for a whole flight are one fault, and evidence if the position was never valid."""
     conditions = [
         held("gps_fix_lost", "", "no GPS fix"), held("xy_not_global", "xy_global", "xy has no global reference", 0.1),

@@ -46,7 +46,7 @@ def others() -> Iterator[tuple[HttpClient, HttpClient]]:
         yield HttpClient(local.port), HttpClient(public.port)
 
 
-def test_unknown_path_is_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
+def test_unknown_path_returns_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
     """404 and / list the available pages; a page that raises is 500, is logged, and does not stop the server."""
     assert server.request("/other") == (404, "available pages: /page, /fails, /waits\n")
     assert server.request("/")[0] == 200

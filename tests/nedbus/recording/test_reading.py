@@ -236,7 +236,7 @@ def test_plot_names_missing_flags(tmp_path: Path) -> None:
     assert f"not in 1/{VLP}: dead_reckoning, heading_reset_counter" in texts
 
 
-def test_plot_without_valid_messages_has_titles_and_any_file_name(tmp_path: Path) -> None:
+def test_plot_of_invalid_messages_has_explanatory_titles(tmp_path: Path) -> None:
     """Invalid messages are plotted with explanatory titles; a file name is not interpreted as math text."""
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
@@ -245,7 +245,7 @@ def test_plot_without_valid_messages_has_titles_and_any_file_name(tmp_path: Path
     assert name.replace("\udcff", "?") in texts
 
 
-def test_missing_fields_are_named(tmp_path: Path) -> None:
+def test_missing_fields_are_listed(tmp_path: Path) -> None:
     """Fields that a log lacks are named by `missing_of`, and null in data frames."""
     writer = UlogWriter(layout="1.13")
     writer.define([VLP])

@@ -46,7 +46,7 @@ def others() -> dict[str, list[Any]]:
     return dict(by_stream)
 
 
-def test_origin_moves_the_flight() -> None:
+def test_origin_option_moves_the_flight() -> None:
     """Another origin moves only the global positions; an impossible one raises."""
     moved, standard = (
         {each.address.stream: each.fields for each in simulate(f"?duration=3{options}")}
@@ -205,7 +205,7 @@ def test_attitude_is_consistent_with_estimate(
             assert thrust * math.sin(roll) == pytest.approx(across, abs=1e-4)
 
 
-def test_global_position_fits_local_position(
+def test_global_position_matches_local_position(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
     """The global position is the projected local position, and valid whenever that is valid."""

@@ -256,7 +256,7 @@ def test_list_hints_at_access_rules_if_a_service_replies(secure: str, pki: Path,
     wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
 
 
-def test_pki_commands_never_overwrite(tmp_path: Path) -> None:
+def test_pki_commands_never_overwrite_keys(tmp_path: Path) -> None:
     """Keys are never overwritten or printed, and are readable by their owner only."""
     folder = tmp_path / "pki"
     assert run_command("pki", "cert", str(folder), "reader").exit_code == 1

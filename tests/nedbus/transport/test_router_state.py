@@ -192,7 +192,7 @@ def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None
         assert "docs/hosts.md" in finding.advice
 
 
-def test_unknown_session_limit_causes_no_warning(tmp_path: Path) -> None:
+def test_unknown_session_limit_does_not_warn(tmp_path: Path) -> None:
     """The doctor does not warn if `metadata` has no limit, or if the admin space is disabled."""
     where = free_endpoint()
     for metadata in (["a", "list"], "mine"):

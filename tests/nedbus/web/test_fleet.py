@@ -90,7 +90,7 @@ def test_slow_stream_does_not_affect_the_vehicle_state(sim: SimulatedFleet) -> N
     assert sim.vehicle().grade == "ok"
 
 
-def test_overloaded_page_reports_no_vehicle_as_silent(sim: SimulatedFleet) -> None:
+def test_overloaded_page_does_not_report_vehicles_as_silent(sim: SimulatedFleet) -> None:
     """While messages wait in the queue, vehicles keep their state: they become neither silent nor gone."""
     sim.fly(3, WING)
     sim.fly(1, QUAD, xy_valid=False)
@@ -291,7 +291,7 @@ def test_history_has_ten_points_per_second(sim: SimulatedFleet) -> None:
 
 
 @pytest.mark.parametrize("rate", [50, 250])
-def test_changing_ref_timestamp_adds_no_gaps_to_ground_truth(sim: SimulatedFleet, rate: int) -> None:
+def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(sim: SimulatedFleet, rate: int) -> None:
     """PX4's simulators change ref_timestamp of the ground truth with each message, but not its origin.
 
     The history still covers a minute without gaps.
@@ -330,7 +330,7 @@ def test_error_is_measured_at_the_time_of_the_estimate(sim: SimulatedFleet, late
     assert math.isnan(column(sim.stream(), "error")[-1])
 
 
-def test_error_needs_a_common_frame(sim: SimulatedFleet) -> None:
+def test_position_error_requires_a_common_frame(sim: SimulatedFleet) -> None:
     """The error is NaN if only the estimate has a global origin, or if the estimate is invalid."""
     sim.add(GROUND_TRUTH)
     sim.add(**ZURICH)

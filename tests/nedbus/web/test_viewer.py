@@ -283,7 +283,7 @@ def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
         assert f"<span>{name}</span><b>{text}</b>" in page.panel("nums")
 
 
-def test_values_of_silent_streams_have_their_age(sim: SimulatedFleet) -> None:
+def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
     """The tiles show the last values of a silent stream or a gone vehicle with their age; the row shows "-"."""
     status, battery = Address("wing", "vehicle_status"), Address("wing", "battery_status", 0)
     for _ in range(50):
@@ -610,7 +610,7 @@ def event_of(sim: SimulatedFleet, text: str) -> float:
     return next(event.time for event in sim.timeline.events if event.text.startswith(text))
 
 
-def test_tapped_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
+def test_tapped_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """A tapped event pins plots and story to its time until "back to now"; list and map stay current."""
     page = Page(faulty_fleet, query="?vehicle=quad")
     assert (page.pinned, page.url_query) == (None, "?vehicle=quad")
@@ -634,7 +634,7 @@ def test_tapped_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
     assert page.plot_range == pytest.approx((faulty_fleet.time - 60, faulty_fleet.time), abs=0.01)
 
 
-def test_tapped_map_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
+def test_tapped_map_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """An event is marked on the map at the vehicle's position at that time; the mark can be tapped repeatedly."""
     page = Page(faulty_fleet, query="?vehicle=wing")
     source = next(each for each in sources(page) if "marker" in each.data and "row" not in each.data)

@@ -76,7 +76,7 @@ def bits(value: object) -> object:
     return tuple(map(bits, value)) if isinstance(value, tuple) else (type(value), repr(value))
 
 
-def test_vectors_of_rosbags_are_decoded_and_encoded_bit_for_bit() -> None:
+def test_rosbags_vectors_round_trip_bit_for_bit() -> None:
     """Each layout of each message is found by its hash, decoded in field order, and encoded to the same bytes."""
     found = set()
     for vector in vectors():

@@ -155,7 +155,7 @@ def test_messages_are_compared_by_value() -> None:
 @pytest.mark.parametrize(
     "fields", [{"x": "nan"}, {"x": "1.0"}, {"timestamp": "NaN"}, {"xy_valid": "NaN"}, {"delta_xy": [1.0]}, {"x": [1.0]}]
 )
-def test_other_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
+def test_unexpected_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
     """The model accepts only the strings and lengths that its own JSON has."""
     with pytest.raises(ValidationError) as info:
         VehicleLocalPosition.model_validate({"timestamp": 1, **fields})

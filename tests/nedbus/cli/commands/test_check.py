@@ -112,7 +112,7 @@ def test_router_config_of_settings_is_checked(tmp_path: Path) -> None:
     assert len(check(file)) == 3
 
 
-def test_mistakes_in_source_tables_have_a_position(tmp_path: Path) -> None:
+def test_mistakes_in_source_tables_are_reported_with_line(tmp_path: Path) -> None:
     """An unknown option is reported at its line; a missing log at its table, but not with --offline."""
     file = tmp_path / "nedbus.toml"
     file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
@@ -133,7 +133,9 @@ def test_mistakes_in_source_tables_have_a_position(tmp_path: Path) -> None:
         ("udp/gcs:mavlink", ["is not an endpoint: write PROTOCOL/HOST:PORT"] * 2),
     ],
 )
-def test_invalid_endpoint_in_router_file_has_a_position(tmp_path: Path, endpoint: str, reasons: list[str]) -> None:
+def test_invalid_endpoint_in_router_file_is_reported_with_position(
+    tmp_path: Path, endpoint: str, reasons: list[str]
+) -> None:
     """Every invalid endpoint of a router file is reported with line and column."""
     file = tmp_path / "router.json5"
     file.write_text(

@@ -280,7 +280,7 @@ def test_http_option_is_the_same_for_all_commands(endpoint: str, arguments: list
     assert "--http: '8765' is not an address: write HOST:PORT" in wrong.err
 
 
-def test_version_and_help(run_nedbus: Start) -> None:
+def test_version_and_help_are_printed(run_nedbus: Start) -> None:
     """--version prints the package's version, with and without the fast path; --help lists every command."""
     version = run_nedbus("--version")
     assert version.wait() == 0

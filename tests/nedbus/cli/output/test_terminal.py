@@ -71,7 +71,7 @@ def test_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) ->
     assert (ROWS[0][0] in shown) == (width >= 60)
 
 
-def test_table_without_rows_is_its_header() -> None:
+def test_table_without_rows_prints_only_its_header() -> None:
     """Before the first message a table is only its header."""
     assert to_table(HEAD, [], optional=OPTIONAL).split() == list(HEAD)
 
@@ -296,7 +296,7 @@ def states(lines: str) -> list[str]:
     return [json.loads(line)["state"] for line in lines.splitlines() if line.endswith("}")]
 
 
-def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_streams_of_killed_service_are_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """`hz` reports a stream whose service was killed as "gone", once."""
     service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="data")

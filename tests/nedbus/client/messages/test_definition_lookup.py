@@ -66,7 +66,7 @@ def test_message_with_queried_definition_is_read_completely(
         {"fields": []},
     ],
 )
-def test_hostile_definition_affects_no_other_stream(
+def test_hostile_definition_does_not_affect_other_streams(
     client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session, answer: bytes | dict[str, Any]
 ) -> None:
     """If a peer replies with an invalid definition, only its own message is invalid."""

@@ -80,7 +80,7 @@ def test_mode_latest_keeps_samples_of_quiet_vehicles(
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_unread_subscription_delays_no_other_reader(
+def test_unread_subscription_does_not_delay_other_readers(
     client: nedbus.Bus, endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, mode: Mode
 ) -> None:
     """A full subscription delays neither other subscriptions of any bus, nor queries, nor its own close."""
@@ -253,7 +253,9 @@ def test_messages_of_a_malformed_layout_are_invalid(bus: nedbus.Bus, zenoh_sessi
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_peer_that_never_replies_delays_no_other_stream(bus: nedbus.Bus, zenoh_session: Session, mode: Mode) -> None:
+def test_peer_that_never_replies_does_not_delay_other_streams(
+    bus: nedbus.Bus, zenoh_session: Session, mode: Mode
+) -> None:
     """A peer that sends unknown layouts and leaves lookups unanswered delays no other stream, and is queried once."""
     held = zenoh_session.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
     publisher = bus.publisher(VLP, vehicle="1")

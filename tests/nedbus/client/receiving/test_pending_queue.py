@@ -202,7 +202,7 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
     assert set(measured.values()) == {2}
 
 
-def test_loss_of_a_long_outage_is_counted() -> None:
+def test_losses_during_a_long_outage_are_counted() -> None:
     """Messages lost in an outage of an hour are counted, even if other vehicles appeared in that time."""
     now = [0.0]
     pending_queue = make_queue("latest", clock=lambda: now[0])

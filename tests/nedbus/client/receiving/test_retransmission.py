@@ -204,7 +204,7 @@ def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, 
     assert not lossy.queue.counters.requesting
 
 
-def test_unanswered_requests_delay_no_others(lossy: Lossy, zenoh_session: Session) -> None:
+def test_unanswered_requests_do_not_delay_others(lossy: Lossy, zenoh_session: Session) -> None:
     """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"
