@@ -95,7 +95,7 @@ def msgpack_seeds() -> Iterator[bytes]:
 
 
 def mavlink_seeds() -> Iterator[bytes]:
-    """Yield telemetry of a real PX4, the begin of its log stream, and a short log as a stream."""
+    """Yield telemetry of a real PX4, the beginning of its log stream, and a short log as a stream."""
     sent = [frame for _, is_sent, frame in datagrams(SHORT) if is_sent]
     telemetry = [unpack(frame) for frame in sent if stream_message(frame) is None]
     stream = [unpack(frame) for frame in sent if stream_message(frame) is not None]
@@ -163,7 +163,7 @@ def _streamed_log() -> bytes:
 
 
 def _log_of_each_record() -> bytes:
-    """Return a log with each kind of record, and an event that its metadata word."""
+    """Return a log with each kind of record, and an event whose text its metadata defines."""
     event = {"message": "{1}: {2:.1m/s}", "arguments": [{"type": "e"}, {"type": "float"}]}
     component = {
         "namespace": "px4",

@@ -110,7 +110,7 @@ def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Rec
 
 
 def test_frozen_service_disappears_and_returns(make_stack: StartStack, record: Record) -> None:
-    """A paused service: its data gets old, its vehicle disappears after the lease, and returns when it continues."""
+    """The data of a paused service becomes stale; its vehicle disappears with the lease, and returns on resume."""
     stack = make_stack("frozen")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:

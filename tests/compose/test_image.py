@@ -1,4 +1,4 @@
-"""The image: what is in it, by its own account."""
+"""The container image and the SBOM that it contains."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def test_vectors_cover_each_message_and_type() -> None:
 
 
 def test_vectors_have_the_golden_bytes() -> None:
-    """The bytes that the format had in the first version are vectors, unchanged."""
+    """The golden bytes of the first version are still vectors."""
     payloads = {each["payload"] for each in FILE["exact"]}
     for name in ("golden.json", "golden_messages.json"):
         assert {each["payload"] for each in json.loads((DATA / name).read_text()).values()} <= payloads

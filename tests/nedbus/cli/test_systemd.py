@@ -94,7 +94,7 @@ def frequent_status(timings: Timings) -> None:
 
 @pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
 def test_ready_is_sent_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
-    """READY is sent once, when the router accepts connections; then WATCHDOG repeatedly; after SIGTERM STOPPING."""
+    """READY is sent once, when the router accepts connections, then WATCHDOG periodically; SIGTERM sends STOPPING."""
     endpoint = free_endpoint()
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "200000"}
     process = run_nedbus("serve", "--source", "sim:", "--listen", endpoint, **environment)

@@ -414,7 +414,7 @@ def test_prefixes_separate_fleets(endpoint: str) -> None:
 
 
 def test_receive_raises_no_data_error_on_timeout(client: nedbus.Bus) -> None:
-    """NoDataError is a TimeoutError; its text has the key and a remedy."""
+    """NoDataError is a TimeoutError; its text names the key and a remedy."""
     subscription = client.subscribe(VLP, vehicle="9")
     with pytest.raises(TimeoutError, match=rf"nedbus/9/{VLP} within 0\.05 s.*nedbus list") as info:
         subscription.receive(0.05)

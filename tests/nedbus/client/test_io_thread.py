@@ -81,7 +81,7 @@ def test_end_waits_for_a_running_job() -> None:
 
 
 def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
-    """A job that raises is logged once and called again, and delays no other job."""
+    """A job that raises is logged once and called again, and does not delay other jobs."""
     calls: list[float] = []
 
     def fail_at_first(now: float) -> float:

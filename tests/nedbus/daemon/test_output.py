@@ -59,7 +59,7 @@ def test_home_position_stays_published_while_its_vehicle_sends() -> None:
 
 
 def test_home_position_is_republished_after_an_outage() -> None:
-    """The last home position is republished after a link outage, as PX4 does not repeat it, but not after a reboot."""
+    """The last home position is republished after a link outage (PX4 does not repeat it), but not after a reboot."""
     fake = FakeOutput()
     fake.receive(1, HOME, POSITION)
     fake.receive(4)

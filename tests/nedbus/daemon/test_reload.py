@@ -90,7 +90,7 @@ def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> N
 
 
 def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_path: Path) -> None:
-    """A removed source releases its addresses before a new source claims them, also a replay at full speed.
+    """A removed source releases its addresses before a new source claims them, even a replay at full speed.
 
     A source without a vehicle is restarted if the default vehicle changes.
     """

@@ -201,7 +201,7 @@ def test_vehicle_is_not_silent_while_link_is_down(flight: Flight) -> None:
 
 
 def test_message_before_link_update_prevents_silence(flight: Flight) -> None:
-    """A message that arrives before the restored link is polled does not make the vehicle silent."""
+    """A vehicle does not become silent if its message arrives before the restored link is polled."""
     flight.fly(1)
     flight.link = "no link"
     flight.update()
@@ -644,7 +644,7 @@ def test_number_of_vehicles_streams_and_events_is_bounded() -> None:
 
 
 def update(event_log: EventLog, now: float, *present: str, link: str = "") -> set[str]:
-    """Update an event log with these vehicles present; return the vehicles that it knows."""
+    """Update an event log with these vehicles present; return the remembered vehicles."""
     event_log.update(now, {}, link=link, present=present)
     return set(event_log.vehicles)
 
@@ -686,7 +686,7 @@ def test_gone_vehicle_is_forgotten_after_an_hour() -> None:
 
 
 def test_last_fifty_gone_vehicles_are_remembered() -> None:
-    """Of vehicles that come and go, the last fifty and those of the last minute are remembered."""
+    """The last fifty gone vehicles, and all that left within the last minute, are remembered."""
     flight = Flight()
     for number in range(3000):
         flight.wait(2.0).send(vehicle=f"v{number}")
@@ -706,7 +706,7 @@ def test_fleet_that_vanishes_at_once_is_remembered() -> None:
 
 
 def test_rejection_reasons_are_not_kept(flight: Flight) -> None:
-    """Reasons of ended rejections are not kept, as each may be different."""
+    """Reasons of ended rejections are not kept, because each may be different."""
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
         flight.wait(6.0).update()

@@ -129,7 +129,7 @@ def test_table_is_generated_by_its_script() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_event_numbers_are_finite(name: str) -> None:
-    """All numbers of events are finite, as JSON has no NaN."""
+    """All numbers in events are finite, because JSON has no NaN."""
     for event in events_in(name):
         assert all(math.isfinite(number) for number in event.numbers.values()), event
 
@@ -292,7 +292,7 @@ def test_contradicted_height_has_evidence_and_reset() -> None:
 def test_px4_texts_are_events(name: str) -> None:
     """Each text in a table made with pyulog is exactly one event with its time and words.
 
-    Of a text in two forms, one is an event. A failed check that PX4 repeats because another check has changed is an
+    A text logged in two forms is one event. A failed check that PX4 repeats because another check has changed is an
     event only the first time.
     """
     events = [(each.boot or 0.0, each.text) for each in events_in(name) if each.kind == "text"]
@@ -329,7 +329,7 @@ def verdict(path: Path) -> Verdict:
 def test_verdict_names_cause_and_times(
     name: str, begin: float, end: float, cause: list[tuple[str, float]], quoted: str
 ) -> None:
-    """The verdict has fault, start, end and the causes in order of time, as in a table made by hand."""
+    """The verdict lists fault, start, end and causes in chronological order, as in a table made by hand."""
     found = verdict(path_of(name))
     assert found.begin is not None
     assert found.end is not None
@@ -387,7 +387,7 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
 
 @pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
 def test_verdict_has_three_lines(path: Path) -> None:
-    """A verdict has at most three lines; on a healthy flight it is "no faults" only."""
+    """A verdict has at most three lines; on a healthy flight it is just "no faults"."""
     text = verdict(path).text
     assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3
     is_healthy = path.stem in ("sitl_1.15_events", "ulog_stream_flight1", "ulog_stream_lossy1")

@@ -129,7 +129,7 @@ def test_condition_without_begin_event_is_a_story() -> None:
 
 
 def test_healthy_vehicle_has_no_story() -> None:
-    """A vehicle that arms, takes off and lands has no story; neither has an unknown vehicle."""
+    """A vehicle that arms, takes off and lands has no story; nor does an unknown vehicle."""
     flight = Flight()
     flight.send()
     flight.status(ARMED)

@@ -27,7 +27,7 @@ def verdict(flight: Flight, *, times: Times | None = None, at: float | None = No
 
 
 def test_verdict_on_active_fault_includes_evidence() -> None:
-    """The verdict has the fault, its start, duration and clock, the evidence in order of time, and missing topics."""
+    """The verdict states the fault, its start, duration and clock, the evidence in order, and missing topics."""
     flight = Flight()
     lose_gps(flight)
     found = verdict(flight)
@@ -45,7 +45,7 @@ def test_verdict_on_active_fault_includes_evidence() -> None:
 
 
 def test_verdict_on_ended_fault_includes_start_and_end() -> None:
-    """The verdict has the start and end of a fault that has ended."""
+    """The verdict states the start and end of a fault that has ended."""
     flight = Flight()
     lose_gps(flight)
     flight.wait(1.0).send()
@@ -59,7 +59,7 @@ def test_verdict_on_ended_fault_includes_start_and_end() -> None:
 
 
 def test_verdict_reports_absence_of_faults() -> None:
-    """Without faults the verdict says so, and whether the data has position validity."""
+    """Without faults the verdict is "no faults", and states whether the data includes validity flags."""
     flight = Flight()
     flight.fly(5)
     found = verdict(flight)
@@ -232,7 +232,7 @@ def test_verdict_on_vehicle_that_was_never_valid_quotes_px4() -> None:
 
 
 def test_verdict_counts_equal_faults() -> None:
-    """The longest of several equal faults is the worst, and the verdict has their number."""
+    """The longest of several equal faults is the worst, and the verdict states their number."""
     flight = Flight()
     flight.send()
     for seconds in (1.0, 3.0, 2.0):

@@ -380,7 +380,7 @@ def test_blocked_source_is_not_healthy(endpoint: str, monkeypatch: pytest.Monkey
 
 
 def test_failed_reader_ends_the_exporter(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error of the reading thread is raised, as stale pages would look like silent vehicles."""
+    """An error in the reading thread is raised, because stale pages would look like silent vehicles."""
 
     def fail(_: object) -> None:
         raise ArithmeticError
@@ -458,7 +458,7 @@ def test_report_of_a_thousand_vehicles_is_complete(endpoint: str) -> None:
 
 
 def test_scrape_takes_one_snapshot_per_stream(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scrape computes the health of each stream once, as a page may have a thousand streams."""
+    """A scrape computes the health of each stream once, because a page may list a thousand streams."""
     daemon = Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0")
     running = threading.Thread(target=daemon.run)
     running.start()

@@ -102,7 +102,7 @@ def test_method_linear_interpolates_only_floats() -> None:
     ],
 )
 def test_angles_are_interpolated_along_the_shorter_arc(field: str, first: float, second: float, middle: float) -> None:
-    """An angle is interpolated the shorter way, and stays in the range of its field: from -pi, or from 0."""
+    """An angle is interpolated along the shorter arc, and stays in the range of its field: from -pi, or from 0."""
     messages = array_of("vehicle_gps_position", {"timestamp": 1, field: first}, {"timestamp": 3, field: second})
     [value] = nedbus.align({"vehicle_gps_position": messages}, on=[2], method="linear")[f"vehicle_gps_position.{field}"]
     assert math.remainder(value - middle, math.tau) == pytest.approx(0, abs=1e-6)
@@ -151,7 +151,7 @@ def test_rate_covers_the_flight() -> None:
 
 @pytest.mark.parametrize("form", ["ULG", "MCAP"])
 def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
-    """PX4 logs the last message of a slow topic with its old time: this adds no empty rows at the start."""
+    """PX4 logs the last message of a slow topic with its old time: this does not add empty rows at the start."""
     log = tmp_path / "a.ULG"
     times = range(300_000_000, 310_000_000, 20_000)
     writer = UlogWriter()

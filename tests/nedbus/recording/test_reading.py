@@ -138,7 +138,7 @@ def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
 
 
 def test_missing_package_error_has_the_pip_command(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without pandas or mcap the error has the pip command; an unknown data frame library raises."""
+    """Without pandas or mcap the error includes the pip command; an unknown data frame library raises."""
     with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
         nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
     monkeypatch.setitem(sys.modules, "pandas", None)

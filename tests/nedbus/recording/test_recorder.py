@@ -319,7 +319,7 @@ def dues(path: Path, *logged: float) -> list[float]:
     ],
 )
 def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float], due: list[float]) -> None:
-    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, also after conversion."""
+    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, even after conversion."""
     assert dues(tmp_path / "a.mcap", *logged) == due
     convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
     assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == due
@@ -373,7 +373,7 @@ def test_recording_without_messages_warns_and_removes_the_file(
 ) -> None:
     """Without messages a notice is printed after 2 s; at the end the empty file is removed, with exit code 1.
 
-    The recorder starts after the notice, as its duration might end before.
+    The recorder starts after the notice, because its duration might end before it.
     """
     path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
 
@@ -431,7 +431,7 @@ def test_invalid_argument_is_a_one_line_error(endpoint: str, arguments: str, exi
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_converted_log_is_complete(tmp_path: Path, layout: str) -> None:
-    """The recording of a log has the same messages, with the same missing fields."""
+    """A converted log contains the same messages, with the same missing fields."""
     log, path, writer = tmp_path / "a.ulg", tmp_path / "flight.mcap", UlogWriter(layout=layout)
     writer.define([VLP, "estimator_local_position"], without=["tilt_var", "eph"])
     for number in range(10):

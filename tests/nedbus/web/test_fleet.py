@@ -134,7 +134,7 @@ def test_since_is_the_start_of_the_state(sim: SimulatedFleet) -> None:
 
 
 def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:
-    """Without a link vehicles keep their last state, have no current position, and the snapshot has an alarm."""
+    """Without a link vehicles keep their last state, have no current position, and the snapshot contains an alarm."""
     sim.fly(3)
     sim.time += 60
     row = sim.vehicle(alive=[], link="no link to tcp/ground:7447")

@@ -493,7 +493,7 @@ def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
 
 @pytest.mark.parametrize("size", ["340x330", "560x430", "1100x700"])
 def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
-    """Of 50 vehicles close together only labels that fit are shown, those of the selected and bad vehicles first."""
+    """With 50 vehicles close together only labels that fit are shown, selected and bad vehicles first."""
     places = {f"uav-{number}": (7.0 * (number // 10), 11.0 * (number % 10)) for number in range(1, 51)}
     for _ in range(5):
         sim.time += 0.1
@@ -543,7 +543,7 @@ def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFlee
 
 
 def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
-    """Of 50 vehicles the selected one and those with faults come first; the last row counts the hidden ones."""
+    """The selected vehicle and those with faults come first; the last row counts the hidden vehicles of the 50."""
     addresses = [Address(f"uav-{number}", VLP) for number in range(1, 51)]
     sim.fly(1, *addresses)
     sim.fly(1, addresses[29], xy_valid=False)
@@ -846,7 +846,7 @@ def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_s
 
 
 def test_page_survives_a_router_restart() -> None:
-    """While the router is down, the header has an alarm, markers are open, and states do not change."""
+    """While the router is down, the header shows an alarm, markers are hollow, and states do not change."""
     where = free_endpoint()
     router = open_router(listen=(where,))
     with (

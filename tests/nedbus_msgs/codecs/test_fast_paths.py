@@ -62,7 +62,7 @@ def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
 
 
 def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
-    """Return the reasons for which the model or the encoder rejects these values."""
+    """Return the reasons why the model or the encoder rejects these values."""
     with pytest.raises((ValidationError, InvalidMessageError)) as info:
         encode_values(values)
     if isinstance(info.value, InvalidMessageError):

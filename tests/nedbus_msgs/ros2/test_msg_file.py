@@ -96,7 +96,7 @@ def test_annotations_become_rules() -> None:
     ],
 )
 def test_invalid_msg_file_raises(text: str, reason: str) -> None:
-    """The error has line, column and reason."""
+    """The error states the line, the column and the reason."""
     with pytest.raises(MsgError, match=reason):
         define_msg("Wrong", text)
 

@@ -64,7 +64,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
 
 
 def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
-    """Options and environment variables are still checked; settings that the file may have are not called missing."""
+    """Options and environment variables are still checked; settings possibly in the file are not reported missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
     for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
@@ -76,7 +76,7 @@ def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
 
 
 def test_two_sources_of_one_address_are_a_mistake(tmp_path: Path) -> None:
-    """Two sources must not publish the same address; found for replays and for live sources that name a vehicle."""
+    """Two sources must not publish the same address: checked for replays, and live sources that name a vehicle."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
@@ -147,7 +147,7 @@ def test_invalid_endpoint_in_router_file_is_reported_with_position(
 
 
 def test_router_files_are_parsed_like_zenohd(tmp_path: Path, endpoint: str) -> None:
-    """Syntax errors, unknown keys and missing files are found; the shipped files and a valid setup have no mistake."""
+    """Syntax errors, unknown keys and missing files are reported; the shipped files and a valid setup pass."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
     broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')
     unknown.write_text('{ mode: "router",\n  lisen: {} }\n')

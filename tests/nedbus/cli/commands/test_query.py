@@ -77,7 +77,7 @@ def test_list_shows_published_streams(simulation: str) -> None:
 
 
 def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
-    """--vehicle lists one vehicle, also one without a message yet, and fails for one that is not published."""
+    """--vehicle lists one vehicle, even before its first message, and fails if it is not published."""
     for vehicle, topic in (("1", VLP), ("1", f"{VLP}_groundtruth"), ("2", VLP)):
         bus.publisher(topic, vehicle=vehicle).publish(message(1))
     bus.publisher(VLP, vehicle="silent")
@@ -113,7 +113,7 @@ def test_late_list_is_not_reported_as_empty(
 
 
 def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
-    """`hz` prints rate, jitter, latency and loss per stream, as a table, JSON or CSV; positions have about 100 Hz."""
+    """`hz` prints rate, jitter, latency and loss per stream, as table, JSON or CSV; positions have 100 Hz."""
     table, csv_form = (run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
     measured: list[dict[str, Any]] = []
 
@@ -181,7 +181,7 @@ def test_schema_needs_no_network() -> None:
 def test_no_data_yet_is_reported(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """Without a vehicle `list` reports it and exits, `echo` reports it and waits."""
+    """Without a published vehicle, `list` reports that and exits, and `echo` reports it and waits."""
     listed = run_command("list", "-c", endpoint)
     assert (listed.exit_code, listed.out, "no vehicle is published" in listed.err) == (0, "", True)
     notice = follow.write_notice

@@ -182,7 +182,7 @@ def on_terminal(fork_server: ForkServer) -> OnTerminal:
 
 @contextmanager
 def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
-    """Publish topics of vehicles on the ground."""
+    """Publish topics of landed vehicles."""
     publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
 
     def publish() -> None:

@@ -123,7 +123,7 @@ def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.B
 def test_encoding_without_name_and_hash_is_invalid(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log has the reason."""
+    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log states why."""
     with client.subscribe("wheel_encoders") as subscription:
         wait_for_matching(zenoh_session, "nedbus/7/wheel_encoders")
         zenoh_session.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")

@@ -229,7 +229,7 @@ def test_publisher_waits_for_a_suspended_reader(
 def test_reader_suspended_while_replying_is_recognized(
     session: FakeSession, control: FlowControl, others: list[str], back: float
 ) -> None:
-    """Once a reader that was suspended while replying returns, the publisher waits for no unknown reader."""
+    """A reader suspended while replying is recognized on return: the publisher does not wait for an unknown one."""
     reader = Reader("back", stops_in_answer=True)
     session.readers += [reader, *map(Reader, others)]
     session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))

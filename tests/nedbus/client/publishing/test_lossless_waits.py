@@ -140,7 +140,7 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Se
 
 
 def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """A `with` block that ends with an exception, such as Ctrl-C, waits for no reader."""
+    """A `with` block that ends with an exception, such as Ctrl-C, does not wait for readers."""
     queries: list[zenoh.Query] = []
     silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:

@@ -1,4 +1,4 @@
-"""Slow, stuck, suspended and killed readers: they delay no other reader, and all losses are counted."""
+"""Slow, stuck, suspended and killed readers: they do not delay other readers, and all losses are counted."""
 
 from __future__ import annotations
 

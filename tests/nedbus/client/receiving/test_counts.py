@@ -256,7 +256,7 @@ def test_messages_of_a_malformed_layout_are_invalid(bus: nedbus.Bus, zenoh_sessi
 def test_peer_that_never_replies_does_not_delay_other_streams(
     bus: nedbus.Bus, zenoh_session: Session, mode: Mode
 ) -> None:
-    """A peer that sends unknown layouts and leaves lookups unanswered delays no other stream, and is queried once."""
+    """A peer that sends unknown layouts but answers no lookup is queried once, and does not delay other streams."""
     held = zenoh_session.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(VLP, mode=mode)

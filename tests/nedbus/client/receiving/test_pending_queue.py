@@ -115,7 +115,7 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogC
 
 
 def test_memory_for_invented_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader keeps the state of at most 10,000 keys, here 10; messages on further keys arrive."""
+    """A reader keeps the state of at most 10,000 keys, here 10; messages on additional keys still arrive."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_KEYS", 10)
     pending_queue = make_queue("every")
     tracemalloc.start()
@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 2,000 vehicles that appear and disappear, eight at a time, those of the last ten minutes stay in memory.
+    """2,000 vehicles appear and disappear, eight at a time; only those of the last ten minutes stay in memory.
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
@@ -318,7 +318,7 @@ def test_stream_keeps_no_receive_buffer(mode: Mode) -> None:
 
 
 def test_long_encodings_are_truncated(small: PendingQueue) -> None:
-    """Of a long encoding, waiting samples keep at most 512 characters."""
+    """Queued samples keep at most 512 characters of a long encoding."""
     for number in range(9):
         put(small, [raw(number, encoding=SOURCE + number * 10_000 * "x")])
     encodings = [arrival[2].encoding for arrival in small._every]

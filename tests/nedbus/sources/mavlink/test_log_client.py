@@ -27,7 +27,7 @@ StateAndReason = tuple[LogState, LogReason | None]
 
 
 class Session:
-    """A client, a hand-driven vehicle, the commands sent, and each state with its reason."""
+    """A client, a manually stepped vehicle, the commands sent, and each state with its reason."""
 
     def __init__(self, *log: Log, armed: bool = False, autopilot: int = PX4) -> None:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])

@@ -316,7 +316,7 @@ class TestRecordings:
     pytestmark = needs_recordings
 
     def test_stream_equals_log_of_vehicle(self, name: str, messages: int, lost: int, common: int) -> None:
-        """Each data message is in the log, in order; the log has more only at gaps."""
+        """Each data message is in the log, in order; only at gaps does the log contain more."""
         records, reassembly = deliver(recorded(name))
         compared = compare(records, name)
         assert (reassembly.counts["delivered"], reassembly.counts.total(), reassembly.lost) == (

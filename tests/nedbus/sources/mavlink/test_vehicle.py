@@ -289,7 +289,7 @@ def test_statustext_chunks_are_joined() -> None:
 
 
 def test_flood_of_statustexts_is_limited() -> None:
-    """Of 10,000 texts in a second, 100 are published, and the others rejected."""
+    """Of 10,000 texts within a second, 100 are published and the rest are rejected."""
     vehicle = new_vehicle("log_message")
     vehicle.handle(position(1000), 0.0)
     found = [vehicle.handle(chunk(b"flood", 0), 50.0 + number / 11_000) for number in range(10_000)]

@@ -106,7 +106,7 @@ def test_topics_of_one_vehicle_may_share_a_gid(streams: StreamRegistry) -> None:
 
 
 def test_reconnected_vehicle_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """A publisher silent for 3 s does not block its successor, as a router detects a dead link only after 10 s."""
+    """A publisher silent for 3 s does not block its successor: a router detects a dead link only after 10 s."""
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)

@@ -1,4 +1,4 @@
-"""A simulated Zenoh module of PX4, and other publishers on such keys."""
+"""A simulated Zenoh module of PX4, and other publishers on the same keys."""
 
 from __future__ import annotations
 
@@ -316,7 +316,7 @@ def test_message_of_another_type_is_rejected(listener: Listener, zenoh_session: 
     ],
 )
 def test_invalid_msg_file_raises(tmp_path: Path, text: str, where: str, reason: str) -> None:
-    """The error has file, line and column; in a folder such a file is skipped; a missing file raises."""
+    """The error states file, line and column; an invalid file in a folder is skipped; a missing file raises."""
     file = tmp_path / "EscStatus.msg"
     file.write_text(text)
     with pytest.raises(ConfigError, match=rf"{file}: {where}: .*{reason}"):
