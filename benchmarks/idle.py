@@ -116,7 +116,7 @@ def measure(process: Process, seconds: float) -> str:
 
 
 def switches(process: Process) -> dict[int, Any]:
-    """Return the context switches of each thread so far; the voluntary ones are its wake-ups."""
+    """Return the context switches of each thread so far; voluntary switches are wake-ups."""
     return {each.id: psutil.Process(each.id).num_ctx_switches() for each in psutil.Process(process.pid).threads()}
 
 

@@ -1,4 +1,4 @@
-"""Files written whole survive a power cut: data is synced first, then the folder that holds the name."""
+"""Atomically written files survive a power cut: data is synced first, then the containing folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The locked dependencies of the image: those of pyproject.toml, with hashes, for each Python and processor."""
+"""The image's locked dependencies match pyproject.toml, with hashes, for each Python and processor."""
 
 from __future__ import annotations
 

@@ -336,7 +336,7 @@ def test_template_unit_differs_only_in_its_file() -> None:
 
 @pytest.mark.process
 def test_reader_unit_expands_options_like_a_shell(tmp_path: Path) -> None:
-    """OPTIONS may compute the name of a recording; the hardening is that of nedbus.service."""
+    """OPTIONS may compute the name of a recording; the hardening equals that of nedbus.service."""
     text = (UNITS / "nedbus-reader@.service").read_text()
     hardening = text.partition("\nUser=")[2]
     assert hardening == (UNITS / "nedbus.service").read_text().partition("\nUser=")[2]

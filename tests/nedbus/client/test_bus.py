@@ -136,7 +136,7 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
 
 
 def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Published vehicles appear by their liveliness tokens, and closed ones disappear.
+    """Vehicles appear when their liveliness tokens are declared, and disappear when closed.
 
     No query for all tokens is sent: it would load all clients of the router.
     """

@@ -124,7 +124,7 @@ def test_sessions_share_threads(endpoint: str) -> None:
 
 @pytest.mark.parametrize("closed", ["publishers", "bus"])
 def test_closed_publishers_and_sessions_leave_no_jobs(endpoint: str, closed: str) -> None:
-    """Closed publishers and sessions leave no jobs; a session keeps that of its schemas, for messages in transit."""
+    """Closed publishers and sessions leave no jobs; a session keeps its schema job for messages in transit."""
     before = len(io_thread._jobs)
     with nedbus.connect(endpoint) as bus:
         for number in range(30):

@@ -99,7 +99,7 @@ def test_stalest_address_is_replaced_at_the_limit() -> None:
 
 
 def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
-    """While 1,000 addresses are published, messages of further ones are rejected, counted, and logged once."""
+    """While 1,000 addresses are published, messages on any other address are rejected, counted, and logged once."""
     fake = FakeOutput()
     present = [Address(f"v{number}", VLP) for number in range(1000)]
     fake.receive(1, *present, OTHER)

@@ -297,7 +297,7 @@ def test_live_source_is_always_retried() -> None:
 
 
 def test_source_claims_all_its_addresses_or_none() -> None:
-    """If one address of a source is in use, the source claims none of the others, not even briefly."""
+    """If one address of a source is in use, the source claims no other address, not even briefly."""
     harness = Harness(FakeReplay([at(0.0), at(0.0, TWO)]), FakeClock(stop_at=1.0))
     harness.registry.publisher(TWO, lossless=False, source="other")
     harness.worker.run()

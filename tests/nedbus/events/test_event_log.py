@@ -224,7 +224,7 @@ def test_vehicle_missing_after_link_is_restored_is_silent(flight: Flight) -> Non
 
 
 def test_flapping_link_is_suppressed(flight: Flight) -> None:
-    """After four changes of the link in 10 s, only the last is reported, with the number of suppressed ones."""
+    """After four changes of the link in 10 s, only the last is reported, with the number of suppressed changes."""
     reported = []
     for index in range(9):
         flight.link = "no link" if index % 2 == 0 else ""

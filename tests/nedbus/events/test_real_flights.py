@@ -50,7 +50,7 @@ def events_in(name: str) -> list[Event]:
 
 
 def time_of(event: Event) -> float:
-    """Return the time since boot; for a jump, which is reported when it ends, that of the message before it."""
+    """Return the time since boot; for a jump, which is reported when it ends, use the message before it."""
     time = event.numbers["begin"] if event.kind == "jump" else event.boot
     assert time is not None
     return time

@@ -79,7 +79,7 @@ def test_report_json_round_trip() -> None:
 
 
 def test_story_from_report_equals_that_of_service() -> None:
-    """A story from a report equals that of the service, even for conditions older than all events."""
+    """A story from a report equals the service's own story, even for conditions older than all events."""
     flight = flying(xy_valid=False)
     for within in (1e9, 0.0):
         read = through_json(report(flight, within=within))

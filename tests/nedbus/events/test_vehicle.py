@@ -199,7 +199,7 @@ def test_logging_dropout_is_not_silence(vehicle: SimpleVehicle) -> None:
 
 
 def test_only_primary_ekf_has_conditions(vehicle: SimpleVehicle) -> None:
-    """Faults of an EKF that is not primary are not conditions, and those of a former primary end."""
+    """Faults of an EKF that is not primary are not conditions; faults of a former primary EKF end."""
     for primary, faulty in ((1, 0), (0, 0), (1, 1)):
         for time in (0.0, 1.0):
             vehicle.send(time, "estimator_selector_status", primary_instance=primary)

@@ -59,7 +59,7 @@ def test_verdict_on_ended_fault_includes_start_and_end() -> None:
 
 
 def test_verdict_reports_absence_of_faults() -> None:
-    """Without faults the verdict is "no faults", and states whether the data includes validity flags."""
+    """A verdict without faults states the period, and whether the data lacks position validity."""
     flight = Flight()
     flight.fly(5)
     found = verdict(flight)
@@ -150,7 +150,7 @@ def test_unrelated_events_are_evidence_without_a_known_cause() -> None:
     assert [each.kind for each in found.cause] == ["heading_not_good"]
 
 
-def held(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
+def condition_of(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
     """Return a condition that was active in the first message."""
     begin = Event("1", kind, "begin", "watch", words, since, 10.0, names=(flag,))
     return Condition(kind, "watch", words, since, begin, initial=True)
@@ -159,7 +159,8 @@ def held(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
 def test_conditions_of_whole_flight_are_one_fault() -> None:
     """Conditions active for a whole flight are one fault, and evidence if the position was never valid."""
     conditions = [
-        held("gps_fix_lost", "", "no GPS fix"), held("xy_not_global", "xy_global", "xy has no global reference", 0.1),
+        condition_of("gps_fix_lost", "", "no GPS fix"),
+        condition_of("xy_not_global", "xy_global", "xy has no global reference", 0.1),
     ]  # fmt: skip
     topics = ["vehicle_local_position", "vehicle_gps_position"]
     found = verdict_of("1", [], conditions, topics=topics, times=Times(), end=62.0)
@@ -168,7 +169,7 @@ def test_conditions_of_whole_flight_are_one_fault() -> None:
         "until the end (62.0 s)."
     )
     assert (found.usable, len(found.stories)) == (True, 1)
-    invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
+    invalid = replace(condition_of("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
     assert found.text.startswith("not usable: xy not valid from the first message until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]

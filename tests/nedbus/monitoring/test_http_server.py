@@ -129,7 +129,7 @@ def test_malformed_requests_are_rejected(
     ids=["no request", "half a request", "byte by byte", "response not read"],
 )
 def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes) -> None:
-    """While 16 clients stall in sending or reading, further clients are served once the stalled ones time out."""
+    """While 16 clients stall in sending or reading, a new client is served once a stalled one times out."""
     timings.http_client = 0.5
     large = Page.text("x" * 20_000_000)  # exceeds the socket buffers
     server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})

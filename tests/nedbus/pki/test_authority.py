@@ -394,7 +394,7 @@ def remove_key_identifiers(path: Path, authority: Path) -> None:
 
 @pytest.mark.parametrize("earlier", [False, True], ids=["this version", "earlier version"])
 def test_certificates_pass_strict_verification(pki: Path, *, earlier: bool) -> None:
-    """Certificates pass the strict verification of Python 3.13; earlier ones stay valid, and pass it once renewed."""
+    """Certificates pass Python 3.13's strict verification; older certificates stay valid, and pass once renewed."""
     router, reader = client_tls(pki, "router"), client_tls(pki, "reader")
     for name in ("ca", "router", "reader") if earlier else ():
         remove_key_identifiers(pki / f"{name}.crt", pki / "ca.key")

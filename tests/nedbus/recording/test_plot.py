@@ -103,7 +103,7 @@ def test_invalid_estimate_is_thin_and_does_not_affect_axis_limits(others: list[t
 
 
 def test_never_valid_estimate_sets_axis_limits() -> None:
-    """If no message is valid, the invalid ones determine the axis limits."""
+    """If no message is valid, the invalid messages determine the axis limits."""
     address, array = flight_of()
     array["xy_valid"] = array["z_valid"] = array["v_xy_valid"] = False
     array["x"] *= 100

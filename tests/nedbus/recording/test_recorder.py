@@ -138,7 +138,7 @@ def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tm
 def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After each flush, any reader finds a valid file with all messages, and fsync was called.
 
-    Before the first message the file is valid, too.
+    The file is also valid before the first message.
     """
     path = tmp_path / "a.mcap"
     synced = []
@@ -297,7 +297,7 @@ def test_full_disk_leaves_no_partial_file(size: int, arguments: list[str], reaso
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
 
 
-def dues(path: Path, *logged: float) -> list[float]:
+def due_times(path: Path, *logged: float) -> list[float]:
     """Return the replay times of messages recorded at these times [s], with unrelated publish times."""
     with RecordingWriter(path) as writer:
         for number, time in enumerate(logged):
@@ -320,7 +320,7 @@ def dues(path: Path, *logged: float) -> list[float]:
 )
 def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float], due: list[float]) -> None:
     """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, even after conversion."""
-    assert dues(tmp_path / "a.mcap", *logged) == due
+    assert due_times(tmp_path / "a.mcap", *logged) == due
     convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
     assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == due
 

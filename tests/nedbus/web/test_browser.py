@@ -204,12 +204,12 @@ def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
     """Wait until there are no problems; fail with those that remain."""
     last: list[str] = []
 
-    def are_none() -> bool:
+    def are_gone() -> bool:
         last[:] = problems()
         return not last
 
     try:
-        wait_for(are_none, what=what, seconds=PAGE_TIMEOUT)
+        wait_for(are_gone, what=what, seconds=PAGE_TIMEOUT)
     except AssertionError:
         pytest.fail(f"{what}: {'; '.join(last)}")
 

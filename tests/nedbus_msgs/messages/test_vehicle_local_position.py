@@ -27,7 +27,7 @@ def rejection(**fields: object) -> str:
 
 
 def test_omitted_field_is_nan_false_or_zero() -> None:
-    """An omitted field holds NaN, false or 0, and is absent from model_fields_set."""
+    """An omitted field is NaN, false or 0, and is absent from model_fields_set."""
     message = VehicleLocalPosition(timestamp=1)
     assert math.isnan(message.x)
     assert all(map(math.isnan, message.delta_xy))

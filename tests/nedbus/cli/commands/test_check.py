@@ -163,7 +163,7 @@ def test_router_files_are_parsed_like_zenohd(tmp_path: Path, endpoint: str) -> N
 
 
 def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
-    """Certificates of clients and router files that expire within 30 days are reported, later ones are not."""
+    """Certificates of clients and routers are reported only if they expire within 30 days."""
     make_authority(tmp_path / "pki")
     for name, days in (("soon", 20), ("late", 200)):
         make_certificate(tmp_path / "pki", name, days=days)

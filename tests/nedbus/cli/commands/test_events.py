@@ -96,7 +96,7 @@ def test_events_of_a_file_have_evidence(log: Path) -> None:
 
 @pytest.mark.parametrize(("severity", "count"), [("bad", 2), ("watch", 3), ("info", 6)])
 def test_severity_selects_events(log: Path, severity: str, count: int) -> None:
-    """--severity selects events of this severity and worse ones."""
+    """--severity selects events of this severity or worse."""
     assert len(run_command("events", str(log), "--severity", severity).out.splitlines()) == count
 
 

@@ -117,7 +117,7 @@ def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health:
 
 
 def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
-    """--expect requires vehicles by id and --vehicles by number, on any host, including those of scripts."""
+    """--expect requires vehicles by id and --vehicles by number, on any host, even if scripts publish them."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
         wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
         result = health("--expect", "1,7, 8", "--vehicles", "3")

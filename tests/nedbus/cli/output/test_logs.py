@@ -39,7 +39,7 @@ VEHICLES = 2 * BURST + 10
 
 
 def record(text: str = "%s is stale", *args: object, event: str | None = "stale", **more: object) -> logging.LogRecord:
-    """Return a record like that of a log call in a service."""
+    """Return a log record as a log call in a service creates it."""
     warning = {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": args}
     return logging.makeLogRecord(warning | (about(event) if event else {}) | more)
 

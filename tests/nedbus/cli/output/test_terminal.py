@@ -369,7 +369,7 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
 
 
 def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
-    """For 100 vehicles `hz` prints 50 rows a second and the number of the others."""
+    """For 100 vehicles `hz` prints 50 rows per second, and the number of omitted vehicles."""
     with publishing(bus, *(f"flood-{number}" for number in range(100))):
         hz = run_command("hz", "-c", endpoint, "-n", "1000")  # each vehicle has sent by then
     assert hz.exit_code == 0

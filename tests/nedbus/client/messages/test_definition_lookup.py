@@ -27,7 +27,7 @@ COUNT = 500
 def test_message_with_queried_definition_is_read_completely(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
-    """No message is lost during the lookup of its definition, in any form; the values are those of the log."""
+    """No message is lost during the lookup of its definition, in any form; the values equal the log's."""
     log = write_wheels(tmp_path / "rover.ulg", COUNT)
     with bus.subscribe("wheel_encoders", mode="every") as subscription:
         run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")

@@ -129,7 +129,7 @@ def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
 @pytest.mark.slow
 @each_flight
 def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
-    """A replay delivers all messages that the arrays have, and rejects the known invalid ones."""
+    """A replay delivers all messages in the arrays, and rejects those known to be invalid."""
     run = open_replay(f"ulog:{flight}?topics=*")
     arrays = nedbus.read(flight, ["*"])
     messages: dict[str, list[Any]] = {}

@@ -124,7 +124,7 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
 
 
 def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """The fields of all definitions are bounded; further ones are rejected, and logged once.
+    """The fields of all definitions are bounded; additional ones are rejected, and logged once.
 
     Definitions no longer in use are evicted, least recently used first.
     """

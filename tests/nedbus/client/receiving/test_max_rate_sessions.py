@@ -167,7 +167,7 @@ def test_closed_publishers_leave_no_listeners(bus: nedbus.Bus, clock: Clock) -> 
 
 
 def test_last_messages_of_a_storage_are_ignored(bus: nedbus.Bus, zenoh_session: Session, clock: Clock) -> None:
-    """A subscription with a maximum rate starts with the last messages of publishers, not with those of a storage."""
+    """A subscription with a maximum rate starts with the last messages of publishers, not of a storage."""
     stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=zenoh_session.new_timestamp())
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
@@ -255,7 +255,7 @@ def test_lossless_publisher_does_not_wait_for_downsampling_reader(endpoint: str,
 
 @pytest.mark.parametrize(("mode", "slow_end"), [("latest", "reader"), ("every", "vehicle")])
 def test_slow_link_carries_the_requested_rate_only(endpoint: str, clock: Clock, mode: Mode, slow_end: str) -> None:
-    """At 5 Hz, a 100 Hz stream needs less than 5 kB/s on the link of the reader, and on that of the vehicle."""
+    """At 5 Hz, a 100 Hz stream needs less than 5 kB/s on each link, the reader's and the vehicle's."""
     with closing(Link(endpoint)) as link:
         near, far = (link.endpoint, endpoint) if slow_end == "reader" else (endpoint, link.endpoint)
         with nedbus.connect(far) as vehicle, nedbus.connect(near) as reader:

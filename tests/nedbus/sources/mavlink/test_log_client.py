@@ -640,7 +640,7 @@ class TestRecordedSessions:
     STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("streaming", None)]
 
     def test_acknowledgements_match_recorded_client(self) -> None:
-        """The acknowledgements are the recorded ones in the same order, including late topics and those after STOP."""
+        """The acknowledgements equal the recording's, in order, including late topics and messages after STOP."""
         replay = Replay("flight1", 0, 90, (245, 190))
         assert replay.acknowledged == replay.recorded
         assert len(replay.acknowledged) == 320

@@ -65,7 +65,7 @@ class Px4:
     def put(
         self, each: VehicleLocalPosition | int, *, topic: str = VLP, attachment: bytes | None = None, skip: int = 0
     ) -> None:
-        """Send a message, or one with this timestamp; the default attachment is like that of PX4."""
+        """Send a message, or one with this timestamp; the default attachment equals PX4's."""
         sent = message(each) if isinstance(each, int) else each
         fields = downgrade(sent, self._layout)
         self._sequences[topic] = self._sequences.get(topic, 0) + 1 + skip
@@ -197,7 +197,7 @@ def test_vehicles_are_named_by_domain_and_namespace(
 def test_loss_and_reboot_are_counted(
     listener: Listener, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Losses before the service are counted by PX4's sequence; a sequence that goes back is a reboot."""
+    """PX4's sequence numbers reveal losses before the service; a backward step is a reboot."""
     caplog.set_level("WARNING")
     px4 = Px4(zenoh_session)
     px4.put(1)
