@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 
 def run_in_image(*command: str) -> str:
-    """Run a command in the image in place of nedbus, and return what it printed."""
+    """Run a command in the image instead of nedbus, and return its output."""
     return docker("run", "--rm", "--entrypoint", command[0], "nedbus", *command[1:])
 
 

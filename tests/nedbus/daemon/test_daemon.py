@@ -122,7 +122,7 @@ def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
 
 
 def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serve: Serve) -> None:
-    """A replay at speed=max waits for its readers, and the service exits only after a slow reader has everything."""
+    """A replay at speed=max waits for readers; the service exits only once a slow reader has received everything."""
     total = 12_000
     path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
     service, bus = serve("--until-done", "-s", f"ulog:{path}?speed=max&wait=1")

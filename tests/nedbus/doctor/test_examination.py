@@ -162,7 +162,7 @@ def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, zenoh_ses
         assert any(each.check == check and each.state == "ok" for each in findings), check
 
 
-def test_silent_and_missing_vehicles_are_found(bus: nedbus.Bus, endpoint: str) -> None:
+def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str) -> None:
     """A silent publisher is reported with the age of its last message; a requested vehicle must exist."""
     bus.publisher(VLP, vehicle="mute")
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
@@ -452,7 +452,7 @@ def test_invalid_certificate_is_wrong(
     assert any("the router presents" in each.seen for each in findings)
 
 
-def test_wrong_protocol_and_wrong_tls_files_are_found(
+def test_wrong_protocol_and_wrong_tls_files_are_reported(
     run_router: Run, pki: Path, endpoint: str, timings: Timings
 ) -> None:
     """TLS to a TCP port, TCP to a TLS port, a missing CA, and a key of another certificate are wrong."""
@@ -614,7 +614,7 @@ def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch
     find(findings, "settings", "wrong", "there is no option 'nonsense'")
 
 
-def test_missing_extra_is_found(start: Start) -> None:
+def test_missing_extra_is_reported(start: Start) -> None:
     """A package missing for a source or for --mavlink is reported with the extra to install."""
     program = """
 import sys

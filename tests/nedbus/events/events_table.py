@@ -302,7 +302,7 @@ def add_landed(table: Table, detector: Topic) -> None:
 
 
 def rows_of(path: Path) -> list[Row]:
-    """Return the rows of a log in order of time."""
+    """Return the rows of a log in chronological order."""
     found = ULog(str(path), list(TOPICS)).data_list
     topics = {each.name: Topic(each) for each in found if each.multi_id == 0}
     table = Table()

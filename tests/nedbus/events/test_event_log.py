@@ -43,7 +43,7 @@ def brief(events: Iterable[Event]) -> list[tuple[str, str, str]]:
 
 
 def test_conditions_in_first_message_are_not_events() -> None:
-    """Conditions active in the first message are state without an event, until they end."""
+    """Conditions active in the first message set the state without an event; only their end is an event."""
     flight = Flight()
     assert flight.send(xy_valid=False, dead_reckoning=True) == []
     assert (flight.severity, flight.kinds) == ("bad", ["xy_invalid", "dead_reckoning"])
@@ -370,7 +370,7 @@ def test_fix_acquired_before_arming_leaves_no_condition() -> None:
     assert flight.kinds == []
 
 
-def test_flag_labels_are_words() -> None:
+def test_flag_labels_are_words_not_field_names() -> None:
     """Labels of flags are words, not field names."""
     for kind in KINDS.values():
         for name, label in kind.flags.items():

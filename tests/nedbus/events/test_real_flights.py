@@ -89,7 +89,7 @@ def is_same(row: Row, event: Event) -> bool:
 
 
 def sizes_of(event: Event) -> Mapping[str, float]:
-    """Return the numbers with the table's sign: down in place of up."""
+    """Return the numbers with the table's sign: down is positive."""
     down = {f"{name.removesuffix('up')}down": -value for name, value in event.numbers.items() if name[-2:] == "up"}
     return {**event.numbers, **(down if event.kind == "reset" else {})}
 

@@ -117,7 +117,7 @@ def test_evidence_of_end_is_later_than_begin() -> None:
 
 
 def test_verdict_quotes_px4() -> None:
-    """PX4's texts are evidence in order of time, except texts that already appeared before the fault."""
+    """PX4's texts are evidence in chronological order, except texts that already appeared before the fault."""
     flight = Flight()
     flight.send()
     for _ in range(3):
@@ -219,7 +219,7 @@ def test_verdict_is_limited_to_vehicle_and_time() -> None:
     )
 
 
-def test_verdict_on_vehicle_that_was_never_valid_quotes_px4() -> None:
+def test_verdict_on_never_valid_vehicle_quotes_px4() -> None:
     """The most severe text during a fault since the first message is evidence, however late it appears."""
     flight = Flight()
     flight.send(xy_valid=False)

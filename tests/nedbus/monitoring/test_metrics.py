@@ -214,7 +214,7 @@ def test_flapping_flag_stays_a_condition(every: int) -> None:
     assert event_log.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
-def test_metrics_pass_promtool(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
+def test_metrics_pass_promtool_check(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
     """`promtool check metrics` accepts all names, units, types and help texts."""
     serve("sim:", f"mavlink:udpin:127.0.0.1:{free_port()}")
     text = tmp_path / "metrics"

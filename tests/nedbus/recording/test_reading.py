@@ -384,7 +384,9 @@ def test_ground_truth_recipe_measures_the_error(
         ("invalid.mcap", 1, "the selected streams have no valid message"),
     ],
 )
-def test_impossible_plot_exits_with_an_error(flight: Path, arguments: str, exit_code: int, reason: str) -> None:
+def test_plot_that_cannot_be_drawn_exits_with_an_error(
+    flight: Path, arguments: str, exit_code: int, reason: str
+) -> None:
     """An unknown stream or suffix exits with 2, a missing folder or a stream without valid messages with 1."""
     array = to_array([message(1), message(2)])
     array["xy_valid"] = True

@@ -468,7 +468,7 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".mcap", ".ulg"])
 def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
-    """A FIFO, which would block forever, raises, and so does a folder."""
+    """A folder raises, and so does a FIFO, which would otherwise block forever."""
     pipe = tmp_path / f"pipe{suffix}"
     os.mkfifo(pipe)
     plot = run_command("plot", str(pipe))

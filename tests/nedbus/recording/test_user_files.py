@@ -78,7 +78,7 @@ def test_log_without_release_is_converted_without_warning(tmp_path: Path) -> Non
     assert account("17_old_log_without_release.ulg").warnings == ()
 
 
-def test_end_of_fake_position_is_the_cause() -> None:
+def test_end_of_fake_position_fusion_is_the_cause() -> None:
     """Fake position fusion ends at 154.1 s, no other begins before 160.4 s: the position is invalid from 154.3 s."""
     lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in lines if "BAD    xy not valid" in line)

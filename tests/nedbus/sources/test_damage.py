@@ -373,7 +373,7 @@ def test_damaged_chunk_of_converted_flight_is_small(tmp_path: Path) -> None:
 
 
 def test_truncated_log_is_converted_with_warning(tmp_path: Path) -> None:
-    """A log that ends inside a message, as after a power loss, is converted up to there with exit code 0."""
+    """A log that ends inside a message, as after a power loss, is converted up to that point with exit code 0."""
     path = write_log(tmp_path / "a.ulg")
     path.write_bytes(path.read_bytes()[:-50])
     convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))

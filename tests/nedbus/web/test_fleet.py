@@ -46,7 +46,7 @@ def column(stream: PageStream, name: str) -> list[float]:
 def test_state_follows_the_validity_flags(
     sim: SimulatedFleet, fields: dict[str, Any], grade: str, text: str, description: str
 ) -> None:
-    """A vehicle has the worst state that the flags of its position imply, from the first message on or later."""
+    """A vehicle has the worst state that the flags of its position imply, even in the first message."""
     sim.fly(3, **fields)
     assert (sim.vehicle().grade, sim.vehicle().state.text, sim.view().description) == (grade, text, description)
     sim.fly(3)

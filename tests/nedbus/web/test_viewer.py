@@ -105,7 +105,7 @@ def test_incremental_tracks_equal_those_of_a_new_viewer(
 
 
 def data_sent(document: Document) -> list[Any]:
-    """Return a list that collects the data source events a document sends from now on."""
+    """Return a list that collects the data source events that a document sends after this call."""
     sent: list[Any] = []
     document.on_change(
         lambda event: sent.append(event) if isinstance(getattr(event, "model", None), ColumnDataSource) else None

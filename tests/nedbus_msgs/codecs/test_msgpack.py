@@ -28,7 +28,7 @@ GOLDEN = json.loads((DATA / "golden.json").read_text())
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_golden_bytes(name: str) -> None:
+def test_payload_equals_golden_bytes(name: str) -> None:
     """These bytes are the wire format; changing them breaks compatibility."""
     message = VehicleLocalPosition.model_validate_json(json.dumps(GOLDEN[name]["message"]))
     payload = bytes.fromhex(GOLDEN[name]["payload"])

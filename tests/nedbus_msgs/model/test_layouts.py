@@ -51,7 +51,7 @@ def test_layout_table_lists_px4_layouts() -> None:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_layout_is_found_from_names_in_any_order(name: str) -> None:
+def test_layout_is_identified_by_names_in_any_order(name: str) -> None:
     """A ULog sorts fields by size, so field names alone identify the layout."""
     assert find_layout(reversed(LAYOUTS[name].fields)) is LAYOUTS[name]
     assert find_layout(LAYOUTS[name].fields[1:]) is None

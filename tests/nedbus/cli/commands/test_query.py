@@ -113,7 +113,7 @@ def test_late_list_is_not_reported_as_empty(
 
 
 def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
-    """`hz` prints rate, jitter, latency and loss per stream, as table, JSON or CSV; positions have 100 Hz."""
+    """`hz` prints rate, jitter, latency and loss per stream, as table, JSON or CSV; positions arrive at 100 Hz."""
     table, csv_form = (run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
     measured: list[dict[str, Any]] = []
 
@@ -221,7 +221,7 @@ def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.Mo
     assert len(ended.err.splitlines()) == 1
 
 
-def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
+def test_wait_option_waits_for_a_router(run_nedbus: Start) -> None:
     """--wait makes a command wait until a router is started."""
     where = free_endpoint()
     echo = run_nedbus("echo", "-c", where, "--wait", "-n", "3")
@@ -272,7 +272,7 @@ def test_invalid_option_exits_with_2(endpoint: str, arguments: list[str], text: 
     [["web", "--listen", "127.0.0.1:0"], ["export", "--listen", "127.0.0.1:0"], ["foxglove", "--port", "0"]],
     ids=" ".join,
 )
-def test_http_option_is_the_same_for_all_commands(endpoint: str, arguments: list[str]) -> None:
+def test_http_option_is_identical_in_all_commands(endpoint: str, arguments: list[str]) -> None:
     """Every command that serves HTTP or a WebSocket has --http, and validates it before it connects."""
     assert run_command(*arguments, NEDBUS_CONNECT=endpoint).exit_code == 2
     wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=free_endpoint())

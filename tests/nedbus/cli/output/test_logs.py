@@ -82,7 +82,7 @@ def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
 
 
 def test_log_calls_use_exactly_the_documented_events() -> None:
-    """Every log call above DEBUG has an event of the table EVENTS, and every event of the table is used."""
+    """Every log call above DEBUG uses an event from the table EVENTS, and every event in the table is used."""
     used: set[str] = set()
     for path, text in ((path, path.read_text()) for path in sorted(SERVICE.rglob("*.py"))):
         tree = ast.parse(text if "_log." in text else "")

@@ -192,7 +192,7 @@ def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None
 
 
 @each_flight
-def test_utc_is_found_in_a_log(flight: Path) -> None:
+def test_utc_is_derived_from_a_log(flight: Path) -> None:
     """UTC comes from GNSS, a companion computer's clock or the log's information messages; otherwise it is None."""
     found = nedbus.utc_of(flight)
     source_and_time = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")

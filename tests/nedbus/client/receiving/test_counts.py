@@ -203,7 +203,7 @@ def test_long_invalid_keys_are_not_kept(
     assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [True]
 
 
-def test_newer_layout_is_looked_up(
+def test_newer_layout_is_looked_up_once(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An unknown layout is looked up once; its messages are invalid until then, and unknown fields are logged once."""

@@ -233,7 +233,7 @@ class TestOwnership:
         assert set(session.commands) == {"start"}
         assert session.client.status.state == "stopped"
 
-    def test_owner_of_stream_is_named(self, session: Session) -> None:
+    def test_owner_of_stream_is_reported(self, session: Session) -> None:
         """Data on the same link reveals the ids of the client that owns the stream."""
         session.wait(0.1)
         session.answer(START, REJECTED)
@@ -672,7 +672,7 @@ class TestRecordedSessions:
         assert replay.states[1:] == [*self.STARTED, ("ended", "silent")]
 
     def test_restarted_vehicle_begins_new_stream(self) -> None:
-        """After a kill and restart time_boot_ms is near 0 again, and a new header follows START."""
+        """After a kill and a restart, time_boot_ms is near 0 again, and a new header follows START."""
         replay = Replay("session", 95.0, 110.5, (247, 190))
         assert replay.states[1:] == [*self.STARTED, ("idle", None), *self.STARTED]
 

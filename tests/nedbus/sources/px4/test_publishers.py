@@ -139,7 +139,7 @@ def test_restarted_ros_2_publisher_is_accepted_at_once(streams: StreamRegistry) 
 
 
 def test_reboot_is_counted_once_per_vehicle(streams: StreamRegistry) -> None:
-    """A reboot counts once, whichever topic shows it first, and so does the next one."""
+    """Each reboot counts once, whichever topic reveals it first."""
     topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
     vehicle = [streams.on_message(str(key(topic)), 0.0) for topic in topics]
     other = streams.on_message(str(key(domain=1)), 0.0)
