@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def _encode(messages: Any, tick: int, random: np.random.Generator | None) -> list[bytes]:
-    """Return the payloads of a tick; without noise one for all vehicles."""
+    """Return the payloads of a tick; without noise all vehicles share one."""
     messages["timestamp"] = 10_000_000 + tick * 10_000
     messages["timestamp_sample"] = messages["timestamp"] - 5_000
     if random is not None:

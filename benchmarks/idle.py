@@ -88,7 +88,7 @@ def measure_at_rest(checkout: Checkout, seconds: float) -> None:
             begin = time.perf_counter()
             assert bus.latest(vehicle=f"v{number}"), "latest() found nothing"
             times.append(1e3 * (time.perf_counter() - begin))
-            time.sleep(0.37)  # no multiple of a period of the threads
+            time.sleep(0.37)  # not a multiple of any thread's period
         processes.end(process)
         print(f"    latest(): {statistics.median(times):.1f} ms, at most {max(times):.1f} ms", flush=True)
 
@@ -116,7 +116,7 @@ def measure(process: Process, seconds: float) -> str:
 
 
 def switches(process: Process) -> dict[int, Any]:
-    """Return the context switches of each thread so far; the voluntary ones are its wake-ups."""
+    """Return the context switches of each thread so far; voluntary switches are wake-ups."""
     return {each.id: psutil.Process(each.id).num_ctx_switches() for each in psutil.Process(process.pid).threads()}
 
 

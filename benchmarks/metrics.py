@@ -26,8 +26,8 @@ REQUESTS: Final = 20
 _PUBLISHED: Final = "nedbus_messages_published_total{"
 
 
-class Turn(NamedTuple):
-    """Figures of an interval: messages a second, and CPU time of the publishing threads [us/message]."""
+class Interval(NamedTuple):
+    """Measurements of an interval: messages per second, and CPU time of the publishing threads [us/message]."""
 
     rate: float
     cpu: float
@@ -60,7 +60,7 @@ class Service:
             time.sleep(1.0)
         raise RuntimeError(f"the service does not publish {STREAMS} streams")
 
-    def measure(self, seconds: int, *, scraped: bool) -> Turn:
+    def measure(self, seconds: int, *, scraped: bool) -> Interval:
         """Measure for `seconds`, with or without one scrape a second."""
         before, published, begin = self._cpu(), self._published(), time.monotonic()
         for second in range(1, seconds + 1):
@@ -71,7 +71,7 @@ class Service:
         messages = self._published() - published
         # Threads that answer requests do not exist at both times.
         used = sum(after[thread] - before[thread] for thread in before.keys() & after.keys())
-        return Turn(messages / passed, used / messages * 1e6)
+        return Interval(messages / passed, used / messages * 1e6)
 
     def _cpu(self) -> dict[int, float]:
         return {each.id: each.user_time + each.system_time for each in psutil.Process(self.process.pid).threads()}
@@ -83,8 +83,8 @@ class Service:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--turns", type=int, default=6, help="pairs of turns, without and with scrapes")
-    parser.add_argument("--seconds", type=int, default=6, help="duration of a turn")
+    parser.add_argument("--pairs", type=int, default=6, help="pairs of intervals, without and with scrapes")
+    parser.add_argument("--seconds", type=int, default=6, help="duration of an interval [s]")
     arguments = parser.parse_args()
     service = Service()
     try:
@@ -97,14 +97,14 @@ def main() -> None:
             flush=True,
         )
         rates, costs = [], []
-        for pair in range(arguments.turns):
+        for pair in range(arguments.pairs):
             order = (False, True) if pair % 2 else (True, False)  # drift affects both
-            turns = {scraped: service.measure(arguments.seconds, scraped=scraped) for scraped in order}
-            rates.append(1 - turns[True].rate / turns[False].rate)
-            costs.append(turns[True].cpu / turns[False].cpu - 1)
+            intervals = {scraped: service.measure(arguments.seconds, scraped=scraped) for scraped in order}
+            rates.append(1 - intervals[True].rate / intervals[False].rate)
+            costs.append(intervals[True].cpu / intervals[False].cpu - 1)
             print(
-                f"{turns[False].rate:7.1f} messages/s, {turns[False].cpu:6.1f} us of CPU each;"
-                f" with a scrape every second {turns[True].rate:7.1f} messages/s, {turns[True].cpu:6.1f} us",
+                f"{intervals[False].rate:7.1f} messages/s, {intervals[False].cpu:6.1f} us of CPU each;"
+                f" with a scrape every second {intervals[True].rate:7.1f} messages/s, {intervals[True].cpu:6.1f} us",
                 flush=True,
             )
         print(

@@ -1,1 +1,1 @@
-"""Coverage-guided fuzzing of everything that parses foreign bytes, with Atheris (`make fuzz`)."""
+"""Coverage-guided fuzzing of all parsers of untrusted bytes, with Atheris (`make fuzz`)."""

@@ -1,4 +1,4 @@
-"""Fuzz the parsers for some time, divided among them: `python -m fuzz --seconds 600 [ulog mcap ...]`.
+"""Fuzz all parsers, which share the given time: `python -m fuzz --seconds 600 [ulog mcap ...]`.
 
 The corpus is kept in build/fuzz/corpus, from run to run; inputs with findings are in build/fuzz/findings.
 Exits with 1 for a finding: an undocumented error, more than ten seconds, or more than 512 MB of memory for one input.

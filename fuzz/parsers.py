@@ -215,13 +215,13 @@ PARSERS: Final[Mapping[str, Callable[[bytes], int]]] = {
     "msgpack": parse_msgpack,
     "mavlink": parse_mavlink,
 }
-"""Target of each harness; its result is greater than 0 for an input that it could use."""
+"""Fuzz target of each parser; its result is greater than 0 if the input contained something valid."""
 
 
 def frames(data: bytes) -> Iterator[bytes]:
-    """Yield MAVLink 2 frames with valid checksums: a kind, a length and a payload each.
+    """Yield MAVLink 2 frames with valid checksums; each input item has a kind, a length and a payload.
 
-    A kind is an index of MAVLINK_KINDS with the bits of another system and of a loss before it, or 255 for raw bytes.
+    A kind is an index into MAVLINK_KINDS, plus bits for another system and for a preceding loss; 255 is raw bytes.
     """
     sequences, offset = [0, 0], 0
     while offset + 2 <= len(data):

@@ -48,7 +48,7 @@ def ulog_seeds() -> Iterator[bytes]:
 
 
 def mcap_seeds() -> Iterator[bytes]:
-    """Yield recordings without checksums, so that a changed byte reaches the parser, and real ones with them."""
+    """Yield recordings without checksums, so that a changed byte reaches the parser, and real recordings."""
     for compression in CompressionType:
         for index in (IndexType.ALL, IndexType.NONE):
             yield _recording(compression, index)
@@ -66,7 +66,7 @@ def mcap_seeds() -> Iterator[bytes]:
 
 
 def msg_seeds() -> Iterator[bytes]:
-    """Yield .msg files of PX4, with nested messages, and those of the messages that nedbus has."""
+    """Yield PX4's .msg files, with nested messages, and the .msg files of the built-in messages."""
     parts = {path.stem: path.read_bytes() for path in sorted((DATA / "msg").glob("*.msg"))}
     yield from parts.values()
     nested = parts["PositionSetpoint"]
@@ -86,7 +86,7 @@ def cdr_seeds() -> Iterator[bytes]:
 
 
 def msgpack_seeds() -> Iterator[bytes]:
-    """Yield the golden payload of each message, and those of the first message with unusual values."""
+    """Yield the golden payload of each message, and payloads of the first message with unusual values."""
     for number, (definition, fields) in enumerate(_golden()):
         yield bytes([number]) + codec_of(definition).encode(definition.model.model_validate(fields))
     first = [*MESSAGES].index("VehicleLocalPosition")
@@ -95,7 +95,7 @@ def msgpack_seeds() -> Iterator[bytes]:
 
 
 def mavlink_seeds() -> Iterator[bytes]:
-    """Yield telemetry of a real PX4, the begin of its log stream, and a short log as a stream."""
+    """Yield telemetry of a real PX4, the beginning of its log stream, and a short log as a stream."""
     sent = [frame for _, is_sent, frame in datagrams(SHORT) if is_sent]
     telemetry = [unpack(frame) for frame in sent if stream_message(frame) is None]
     stream = [unpack(frame) for frame in sent if stream_message(frame) is not None]
@@ -163,7 +163,7 @@ def _streamed_log() -> bytes:
 
 
 def _log_of_each_record() -> bytes:
-    """Return a log with each kind of record, and an event that its metadata word."""
+    """Return a log with each kind of record, and an event whose text its metadata defines."""
     event = {"message": "{1}: {2:.1m/s}", "arguments": [{"type": "e"}, {"type": "float"}]}
     component = {
         "namespace": "px4",

@@ -30,7 +30,7 @@ hypothesis.settings.load_profile("nedbus")
 
 
 def pytest_configure() -> None:
-    """Restore SIGINT and SIGHUP: test processes would inherit that a shell's background job or nohup ignores them."""
+    """Restore SIGINT and SIGHUP: test processes would inherit them as ignored from a background job or nohup."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 

@@ -81,8 +81,8 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def here(flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Change to a folder with copies of these files, as in a clone."""
+def snippet_folder(flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Change to a folder with copies of these files, like a clone."""
     folder = tmp_path / "clone"
     shutil.copytree(flights, folder)
     for name in ("config", "examples"):
@@ -95,7 +95,7 @@ def here(flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     return folder
 
 
-def unprinted(shown: Iterable[str], printed: str) -> list[str]:
+def missing_lines(shown: Iterable[str], printed: str) -> list[str]:
     """Return the shown lines without a printed line of the same shape."""
     lines = [line.strip() for line in printed.splitlines()]
     return [line for line in shown if line != "..." and not any(map(shape_of(line).fullmatch, lines))]
@@ -161,7 +161,7 @@ class Runner:
         return bool(process.out or " router on " in process.err or re.search("client of|http|ws:|->", process.err))
 
     def _run_python(self, block: Block, shown: Iterable[str]) -> str:
-        """Run a script until it ends, or has printed three lines and the shown ones."""
+        """Run a script until it ends, or has printed three lines and all shown lines."""
         blocks = [each for each in PYTHON if each.page == block.page]
         texts: list[str] = []
         for each in reversed(blocks[: blocks.index(block) + 1]):
@@ -173,7 +173,7 @@ class Runner:
         process = self._start(str(script), coverage=False, **self._environment)
 
         def is_done() -> bool:
-            has_printed = process.out.count("\n") >= 3 and not unprinted(shown, process.out)
+            has_printed = process.out.count("\n") >= 3 and not missing_lines(shown, process.out)
             return has_printed or process.popen.poll() is not None
 
         wait_for(is_done, what=f"{block}: {process.err}")
@@ -187,9 +187,9 @@ class Runner:
 
 
 @pytest.fixture
-def runner(start: Start, vehicles: str, here: Path) -> Runner:
+def runner(start: Start, vehicles: str, snippet_folder: Path) -> Runner:
     """Return a runner of snippets in the folder of the files, with the vehicles."""
-    return Runner(start, vehicles, here)
+    return Runner(start, vehicles, snippet_folder)
 
 
 @pytest.mark.parametrize("block", [each for each in (*SHELLS, *PYTHON) if each.is_run], ids=str)
@@ -202,12 +202,12 @@ def test_snippet_runs(runner: Runner, block: Block) -> None:
 def test_shown_output_is_printed(runner: Runner, block: Block) -> None:
     """The snippet above prints each shown line, possibly with other numbers."""
     shown = block.text.splitlines()
-    assert unprinted(shown, runner.run(BLOCKS[BLOCKS.index(block) - 1], shown=shown)) == []
+    assert missing_lines(shown, runner.run(BLOCKS[BLOCKS.index(block) - 1], shown=shown)) == []
 
 
 @pytest.mark.parametrize("block", [each for each in BLOCKS if not each.is_run], ids=str)
 def test_snippet_that_is_not_run_has_a_reason(block: Block) -> None:
-    """A snippet that is not run here has a reason, or names the test that runs it."""
+    """A snippet that test_documents does not run has a reason, or names the test that runs it."""
     assert len(block.reason) > 10
     for file in re.findall(r"tests/\S+\.py", block.reason):
         assert (ROOT / file).is_file()
@@ -245,7 +245,7 @@ def test_payload_indices_are_correct_in_each_language() -> None:
 
 @pytest.mark.process
 @pytest.mark.parametrize("block", SHELLS, ids=str)
-def test_shell_snippet_is_valid(here: Path, block: Block) -> None:
+def test_shell_snippet_is_valid(snippet_folder: Path, block: Block) -> None:
     """Every shell snippet parses, its nedbus commands have these options, and its sources and files exist."""
     subprocess.run(["bash", "-n", "-c", block.text], check=True, timeout=30)
     for command in nedbus_commands(block):
@@ -299,8 +299,8 @@ def test_readme_is_short() -> None:
     assert {"run", "test"} <= set(re.findall(r"\bmake (\w+)", text))
 
 
-def test_speed_in_readme_is_the_last_measurement() -> None:
-    """The throughput figures in the README are those of performance.json."""
+def test_speed_in_readme_matches_last_measurement() -> None:
+    """The throughput figures in the README equal those in performance.json."""
     measured = json.loads((DOCS / "explanation" / "performance.json").read_text())
     full = measured["results"][measured["flight"]]["full"]
     rows = re.search(r"<!-- speed -->\n(.*?)<!-- /speed -->", (ROOT / "README.md").read_text(), re.DOTALL)

@@ -27,7 +27,7 @@ class Target:
         sign = ">=" if self.at_least else "<="
         return f"{self.load.name}: {KEYS[self.key]} of {self.form} {sign} {self.bound} x {self.other}"
 
-    def concerns(self, flight: str) -> bool:
+    def applies_to(self, flight: str) -> bool:
         """Return whether the form can send this flight: tuples cannot mark fields as missing."""
         return self.form != "rows" or flight in COMPLETE
 
@@ -59,7 +59,7 @@ def evaluate(results: Results) -> Iterator[dict[str, object]]:
         measured = {
             flight: results.ratio(flight, target.load, target.form, target.other, target.key)
             for flight in results.flights(target.load)
-            if results.has(flight, target.load, target.form, target.other) and target.concerns(flight)
+            if results.has(flight, target.load, target.form, target.other) and target.applies_to(flight)
         }
         if measured:
             worst = min(measured.values()) if target.at_least else max(measured.values())

@@ -17,7 +17,7 @@ RATE: Final = 2000  # Hz
 MAX_AGE: Final = 50.0  # ms
 TIMEOUT: Final = 60.0  # s beyond the measurement
 CASES: Final = [
-    *((form, script) for script in ("idle", "computes beside") for form in ("raw fifo", "raw ring", "every", "latest")),
+    *((form, script) for script in ("idle", "computes always") for form in ("raw fifo", "raw ring", "every", "latest")),
     *((form, "computes between") for form in ("raw fifo", "raw ring", "latest")),
 ]
 

@@ -66,7 +66,7 @@ def main() -> None:
     ages = Ages()
     print("ready", flush=True)
     threading.Thread(target=watch, args=(ages, counts), daemon=True).start()
-    if script == "computes beside":
+    if script == "computes always":
         threading.Thread(target=read, args=(stamps, ages), daemon=True).start()
         ages.compute(float("inf"))
     read(stamps, ages, PAUSE if script == "computes between" else 0.0)

@@ -5,7 +5,7 @@ Vehicle 1 is live at --rate Hz, and the healthy reader always subscribes to it; 
 --messages messages at the speed of its readers.
 
     live    the stuck reader subscribes to vehicle 1; there is no vehicle 2
-    beside  the stuck reader subscribes to vehicle 1, the healthy one to both: the replay continues
+    both    the stuck reader subscribes to vehicle 1, the healthy one to both: the replay continues
     replay  the stuck reader subscribes to vehicle 2, the healthy one to both: the replay waits, vehicle 1 continues
 
 Targets: the healthy reader is without a message of vehicle 1, or of a replay without a stuck reader, for at most 0.2 s;
@@ -27,7 +27,7 @@ AFTER: Final = 10  # s of vehicle 1 after the stuck reader continues
 TIMEOUT: Final = 120.0  # s for the rest of the replay
 MAX_GAP: Final = 0.2  # s
 LIVE, REPLAYED = "1", "2"
-CASES: Final = {"live": (LIVE, [LIVE]), "beside": (LIVE, [LIVE, REPLAYED]), "replay": (REPLAYED, [LIVE, REPLAYED])}
+CASES: Final = {"live": (LIVE, [LIVE]), "both": (LIVE, [LIVE, REPLAYED]), "replay": (REPLAYED, [LIVE, REPLAYED])}
 HABITS: Final = ("never", "slowly", "stopped")
 
 

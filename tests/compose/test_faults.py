@@ -110,7 +110,7 @@ def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Rec
 
 
 def test_frozen_service_disappears_and_returns(make_stack: StartStack, record: Record) -> None:
-    """A paused service: its data gets old, its vehicle disappears after the lease, and returns when it continues."""
+    """The data of a paused service becomes stale; its vehicle disappears with the lease, and returns on resume."""
     stack = make_stack("frozen")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
@@ -166,7 +166,7 @@ bus.close()
 """
 
 
-def test_stuck_reader_affects_no_others(make_stack: StartStack, record: Record) -> None:
+def test_stuck_reader_does_not_affect_others(make_stack: StartStack, record: Record) -> None:
     """While one subscriber does not read for 60 s, another one loses nothing and the publisher never blocks."""
     stack = make_stack("stuck")
     stack.up("router")

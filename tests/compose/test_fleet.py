@@ -1,4 +1,4 @@
-"""Failures in a fleet of two ground stations and a cloud, each with a router, and a narrow link to the cloud."""
+"""Failures in a fleet of two ground stations and a cloud, each with a router, and a low-bandwidth link to the cloud."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def fleet(make_stack: StartStack) -> Iterator[Fleet]:
         yield Fleet(stack, {"cloud": stack.endpoint, **ports}, closing)
 
 
-def test_router_and_radio_failures_lose_nothing(fleet: Fleet) -> None:
+def test_router_and_radio_failures_lose_no_messages(fleet: Fleet) -> None:
     """Vehicles reconnect to the other ground station; ground stations work without the cloud; no message is lost.
 
     The downsampled subscriber at the cloud receives 5 of 100 messages a second, and counts none as lost.

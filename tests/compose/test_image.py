@@ -1,4 +1,4 @@
-"""The image: what is in it, by its own account."""
+"""The container image and the SBOM that it contains."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 
 def run_in_image(*command: str) -> str:
-    """Run a command in the image in place of nedbus, and return what it printed."""
+    """Run a command in the image instead of nedbus, and return its output."""
     return docker("run", "--rm", "--entrypoint", command[0], "nedbus", *command[1:])
 
 
-def test_sbom_lists_what_is_installed(images: None) -> None:
+def test_sbom_lists_installed_packages(images: None) -> None:
     """The SBOM in the image has exactly its packages, with their versions, and no tool of its build."""
     sbom = json.loads(run_in_image("cat", "/opt/nedbus/sbom.cdx.json"))
     root = sbom["metadata"]["component"]

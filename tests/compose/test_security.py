@@ -1,4 +1,4 @@
-"""The stack with certificates: permissions, tested by the messages that arrive, as Zenoh denies silently."""
+"""The stack with certificates: permissions, tested by the messages that arrive, because Zenoh denies silently."""
 
 from __future__ import annotations
 

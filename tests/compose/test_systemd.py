@@ -109,7 +109,7 @@ def wait_for_restart(machine: Machine, process: str) -> None:
 
 
 def test_start_returns_when_ready(machine: Machine) -> None:
-    """When `systemctl start` returns, the router accepts connections; the status text has counts."""
+    """When `systemctl start` returns, the router accepts connections; the status text includes counts."""
     for _ in range(3):
         machine.run(f"systemctl stop nedbus && systemctl start nedbus && {DIAL}")
     assert_receives(machine)

@@ -1,4 +1,4 @@
-"""Files written whole survive a power cut: data is synced first, then the folder that holds the name."""
+"""Atomically written files survive a power cut: data is synced first, then the containing folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> Synced:
 
 
 @pytest.mark.parametrize("replace", [False, True])
-def test_folder_is_synced_after_its_file_has_its_name(tmp_path: Path, synced: Synced, replace: bool) -> None:
+def test_folder_is_synced_after_its_file_is_renamed(tmp_path: Path, synced: Synced, replace: bool) -> None:
     with atomic_write(tmp_path / "a.crt", replace=replace) as part:
         part.write_text("a")
     assert [name for name, _ in synced] == [part.name, tmp_path.name]

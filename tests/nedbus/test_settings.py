@@ -1,4 +1,4 @@
-"""Settings from nedbus.toml, the environment and flags; errors have file, line and column, also for router files."""
+"""Settings from nedbus.toml, the environment and flags; errors name file, line and column, even in router files."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_settings_file_is_found_by_flag_variable_or_default(tmp_path: Path, monk
     ],
 )
 def test_error_in_a_file_has_line_and_column(tmp_path: Path, text: str, position: str, reason: str) -> None:
-    """The error has file, line, column and remedy; for a router file, without Zenoh's source paths."""
+    """The error states file, line, column and remedy; for a router file it omits Zenoh's source paths."""
     file = tmp_path / ("router.json5" if text.startswith("{") else "nedbus.toml")
     file.write_text(text)
     with pytest.raises(ConfigError) as info:
@@ -241,7 +241,7 @@ def test_missing_router_file_or_unknown_suffix_raises(tmp_path: Path) -> None:
 
 
 def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Ignored plugins are logged, as Zenoh's Python library ignores them silently; a required plugin raises."""
+    """Ignored plugins are logged, because Zenoh's Python library ignores them silently; a required one raises."""
     file = tmp_path / "router.json5"
     file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
     open_router(listen=(free_endpoint(),), config_file=file).close()
@@ -262,7 +262,7 @@ def test_serve_help_lists_every_source() -> None:
     assert all(f" {name}:{kind.target or ''}" in help_.out for name, kind in SOURCE_KINDS.items())
 
 
-def test_listen_error_has_the_reason_of_the_system(endpoint: str) -> None:
+def test_listen_error_includes_the_system_error(endpoint: str) -> None:
     """ListenError is an OSError with the reason: the port is in use, or the address belongs to another host."""
     for where, reason in ((endpoint, "address already in use"), ("tcp/192.0.2.1:7447", "cannot assign requested")):
         with pytest.raises(ListenError, match=rf"cannot listen on {where} \({reason}") as info:
@@ -272,7 +272,7 @@ def test_listen_error_has_the_reason_of_the_system(endpoint: str) -> None:
 
 @pytest.mark.parametrize("endpoint", ["7447", "localhost:7447", "foo/localhost:7447", "tcp/", ""])
 def test_malformed_endpoint_raises(endpoint: str) -> None:
-    """The error has the syntax of Zenoh endpoints."""
+    """The error explains the syntax of Zenoh endpoints."""
     with pytest.raises(ConfigError, match=r"write PROTOCOL/HOST:PORT, as in tcp/127\.0\.0\.1:7447"):
         open_client((endpoint,), timeout=0)
     with pytest.raises(ConfigError, match="is not an endpoint"):

@@ -90,7 +90,7 @@ def test_property_is_none_unless_all_flags_are_true(definition: Definition[Any],
 
 
 @EACH_PROPERTY
-def test_property_name_is_not_a_field(definition: Definition[Any], name: str, flags: list[str]) -> None:
+def test_property_names_differ_from_field_names(definition: Definition[Any], name: str, flags: list[str]) -> None:
     """No PX4 layout has a current or renamed field with the name of a property."""
     assert name not in definition.known_types.keys() | definition.older.keys()
     assert name not in definition.row._fields

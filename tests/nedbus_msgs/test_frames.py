@@ -46,7 +46,7 @@ def with_origin(**fields: object) -> VehicleLocalPosition:
     return VehicleLocalPosition.model_validate({"timestamp": 1, **origin, **fields})
 
 
-def test_one_degree_of_latitude_has_px4_length() -> None:
+def test_length_of_a_degree_of_latitude_matches_px4() -> None:
     """One degree of latitude is 111,194.93 m on PX4's sphere."""
     north, east = MapProjection(0.0, 0.0).project(1.0, 0.0)
     assert north == pytest.approx(111194.9266, abs=0.01)

@@ -78,7 +78,7 @@ def test_counter_wrap_counts_as_one_reset() -> None:
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """After two resets between two messages, the delta is that of the last one, so the track is discontinued."""
+    """After two resets between two messages, the delta covers only the last one: the track is discontinued."""
     _, second, third = track(
         at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
     )

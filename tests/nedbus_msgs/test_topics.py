@@ -44,7 +44,7 @@ def test_vehicle_local_position_has_four_topics() -> None:
     assert list(TOPICS)[:4] == list(instances)
 
 
-def test_keys_are_as_documented() -> None:
+def test_keys_match_the_documentation() -> None:
     """Clients in other languages depend on these strings."""
     assert Address("7", "vehicle_local_position").key() == "nedbus/7/vehicle_local_position"
     estimator = Address("7", "estimator_local_position", 2)

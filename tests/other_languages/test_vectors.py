@@ -52,7 +52,7 @@ def test_vector_is_encoded_and_decoded(vector: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("vector", cases("decode"))
-def test_other_form_of_a_vector_is_decoded(vector: dict[str, Any]) -> None:
+def test_other_encoding_of_a_vector_is_decoded(vector: dict[str, Any]) -> None:
     """Payloads that nedbus does not write have the same values: other layouts and other msgpack types."""
     definition = definition_of(vector["message"], FILE["definitions"])
     types = {name: field_type(kind) for name, kind in FILE["definitions"][f"{vector['message']}/{vector['layout']}"]}
@@ -74,7 +74,7 @@ def test_vectors_cover_each_message_and_type() -> None:
 
 
 def test_vectors_have_the_golden_bytes() -> None:
-    """The bytes that the format had in the first version are vectors, unchanged."""
+    """The golden bytes of the first version are still vectors."""
     payloads = {each["payload"] for each in FILE["exact"]}
     for name in ("golden.json", "golden_messages.json"):
         assert {each["payload"] for each in json.loads((DATA / name).read_text()).values()} <= payloads

@@ -1,1 +1,1 @@
-"""The other side of a test: processes, routers, HTTP clients, a browser, certificates and simulated vehicles."""
+"""Peers of the tests: processes, routers, HTTP clients, a browser, certificates and simulated vehicles."""

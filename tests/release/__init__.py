@@ -1,1 +1,1 @@
-"""What a release is: its public API, its locked dependencies, and who answers for its security."""
+"""Tests of a release: its public API and its locked dependencies."""

@@ -25,15 +25,15 @@ API = "class nedbus:\n    class Bus:\n        def get(self, topic: str, *, timeo
         ("class Bus", "class Buses", "nedbus.Bus: Public object was removed"),
     ],
 )
-def test_breaking_change_is_found(old: str, new: str, found: str) -> None:
+def test_breaking_api_change_is_detected(old: str, new: str, found: str) -> None:
     changes = [*find_breakages(API, API.replace(old, new))]
     assert len(changes) == bool(found)
     assert not found or changes[0].startswith(found)
 
 
 @pytest.mark.process  # Griffe calls git
-def test_api_has_not_lost_what_the_last_release_had() -> None:
-    """No public name, parameter or default of the last release is gone: `make api`; a release renews the baseline."""
+def test_public_api_is_compatible_with_last_release() -> None:
+    """Every public name, parameter and default of the last release still exists; a release renews the baseline."""
     old = BASELINE.read_text()
     version = old.split(maxsplit=3)[2].rstrip(",")
     if compatible_range(version) == compatible_range(nedbus.__version__):
@@ -43,5 +43,5 @@ def test_api_has_not_lost_what_the_last_release_had() -> None:
 @pytest.mark.parametrize(
     ("one", "other", "same"), [("0.1.0", "0.1.9", True), ("0.1.0", "0.2.0", False), ("1.0.0", "1.9.0", True)]
 )
-def test_range_of_compatible_versions(one: str, other: str, same: bool) -> None:
+def test_compatible_versions_share_a_range(one: str, other: str, same: bool) -> None:
     assert (compatible_range(one) == compatible_range(other)) is same

@@ -1,4 +1,4 @@
-"""The locked dependencies of the image: those of pyproject.toml, with hashes, for each Python and processor."""
+"""The image's locked dependencies match pyproject.toml, with hashes, for each Python and processor."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def required(name: str) -> list[Requirement]:
 @pytest.mark.parametrize("name", ["image", "build"])
 @pytest.mark.parametrize(("python", "machine"), ENVIRONMENTS)
 def test_lock_satisfies_pyproject(name: str, python: str, machine: str) -> None:
-    """Each requirement has exactly one pin in each environment, which satisfies it and has hashes: else `make lock`."""
+    """Each requirement has exactly one pin per environment, which satisfies it and has hashes (`make lock`)."""
     environment = {key: str(value) for key, value in default_environment().items()}
     environment |= {"python_version": python, "python_full_version": f"{python}.0"}
     environment |= {"platform_machine": machine, "sys_platform": "linux", "extra": ""}
@@ -71,8 +71,8 @@ def test_each_pin_has_hashes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["image", "build"])
-def test_lock_has_no_address(name: str) -> None:
-    """The lock names files by their hashes, wherever they come from."""
+def test_lock_contains_no_urls(name: str) -> None:
+    """The lock identifies files by their hashes, not by their origin."""
     text = (ROOT / "packaging" / f"requirements-{name}.txt").read_text()
     assert not re.search(r"://|index-url|find-links", text)
 

@@ -115,7 +115,9 @@ def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpo
         client.until(lambda: topic not in client.topics)
 
 
-def test_message_without_rate_reaches_the_first_subscriber(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_message_without_nominal_rate_reaches_the_first_subscriber(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
     """A home position is sent once and creates its channel, so it is kept for the first subscriber."""
     url = f"ws://127.0.0.1:{free_port()}"
     process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
@@ -167,7 +169,7 @@ def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
         ((math.nan,) * 4, 0, math.pi / 2, (1, 0, 0), (0, 1, 0)),
     ],
 )
-def test_orientation_is_a_recent_attitude_else_the_heading(
+def test_orientation_falls_back_to_heading_without_recent_attitude(
     q: tuple[float, ...], age: int, heading: float, forward: tuple[int, ...], left: tuple[int, ...]
 ) -> None:
     """The attitude q, which rotates FRD to NED, is used within 0.5 s of the position, else the heading."""

@@ -53,7 +53,7 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
 
 
 def test_slowly_recovered_samples_are_held_back() -> None:
-    """Over a slow link the backlog shrinks slowly; its samples are held back, too."""
+    """Over a slow link the backlog shrinks slowly; its samples are also held back."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))

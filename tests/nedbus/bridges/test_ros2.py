@@ -177,7 +177,7 @@ def test_messages_have_the_layout_of_the_release(
 ) -> None:
     """Key, type hash and CDR fields of every topic in a real log match the selected release.
 
-    Messages that the release lacks are logged once. Of streams without a rate, the last message is published.
+    Messages that the release lacks are logged once. Streams without a nominal rate have their last message published.
     """
     last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE_MESSAGES}").messages}
     messages = {each: upgrade_with(BY_TOPIC[each.topic], fields) for each, fields in last.items()}

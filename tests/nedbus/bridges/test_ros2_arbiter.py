@@ -27,7 +27,7 @@ def actions(
     return [(each.action, each.topic) for each in arbiter.update(addresses, nodes or {}, now=now)]
 
 
-def test_topic_has_a_namespace_by_vehicle() -> None:
+def test_topic_namespace_is_derived_from_vehicle() -> None:
     """Vehicle 1 has no namespace; others have the configured one, else one made from the vehicle's name."""
     arbiter = make({"named": "/fleet/a/", "bare": ""})
     estimator = Address("wing-2", "estimator_local_position", 1)

@@ -94,7 +94,7 @@ def frequent_status(timings: Timings) -> None:
 
 @pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
 def test_ready_is_sent_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
-    """READY is sent once, when the router accepts connections; then WATCHDOG repeatedly; after SIGTERM STOPPING."""
+    """READY is sent once, when the router accepts connections, then WATCHDOG periodically; SIGTERM sends STOPPING."""
     endpoint = free_endpoint()
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "200000"}
     process = run_nedbus("serve", "--source", "sim:", "--listen", endpoint, **environment)
@@ -162,7 +162,7 @@ def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_p
 
 
 @pytest.mark.usefixtures("frequent_status")
-def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
+def test_watchdog_is_not_sent_without_ticks(systemd: Systemd) -> None:
     """While the main thread hangs, no WATCHDOG is sent, but the status text is."""
     with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
@@ -191,7 +191,7 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
     [("sim:", "publish"), (f"mavlink:udpin:127.0.0.1:{free_port()}", "expire_stale")],
     ids=["replay", "live"],
 )
-def test_no_watchdog_while_a_source_is_stuck(
+def test_watchdog_is_not_sent_while_a_source_is_stuck(
     systemd: Systemd, monkeypatch: pytest.MonkeyPatch, timings: Timings, source: str, method: str
 ) -> None:
     """While the loop of a source is blocked, no WATCHDOG is sent, although all other threads work."""
@@ -213,7 +213,7 @@ def test_no_watchdog_while_a_source_is_stuck(
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
-def test_watchdog_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watchdog_is_sent_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     """WATCHDOG is sent while a replay at speed=max waits for slow readers: it is not stuck."""
     entered, opened = block(monkeypatch, "publish")
     with (
@@ -336,7 +336,7 @@ def test_template_unit_differs_only_in_its_file() -> None:
 
 @pytest.mark.process
 def test_reader_unit_expands_options_like_a_shell(tmp_path: Path) -> None:
-    """OPTIONS may compute the name of a recording; the hardening is that of nedbus.service."""
+    """OPTIONS may compute the name of a recording; the hardening equals that of nedbus.service."""
     text = (UNITS / "nedbus-reader@.service").read_text()
     hardening = text.partition("\nUser=")[2]
     assert hardening == (UNITS / "nedbus.service").read_text().partition("\nUser=")[2]

@@ -80,7 +80,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Make the publishers of this process downsample by a fake clock."""
+    """Make the publishers of this process downsample according to a fake clock."""
     clock = Clock()
     monkeypatch.setattr(downsampler, "time", clock)
     return clock

@@ -136,7 +136,7 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
 
 
 def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Published vehicles appear by their liveliness tokens, and closed ones disappear.
+    """Vehicles appear when their liveliness tokens are declared, and disappear when closed.
 
     No query for all tokens is sent: it would load all clients of the router.
     """
@@ -219,7 +219,7 @@ def test_vehicles_without_a_router_are_incomplete() -> None:
         assert not bus.vehicles().complete
 
 
-def test_bus_receives_replies_of_its_own_300_publishers(endpoint: str) -> None:
+def test_replies_beyond_channel_capacity_do_not_block(endpoint: str) -> None:
     """More replies than a Zenoh channel holds (256) block neither the bus that sends them nor another one."""
     with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:
         for number in range(300):
@@ -414,7 +414,7 @@ def test_prefixes_separate_fleets(endpoint: str) -> None:
 
 
 def test_receive_raises_no_data_error_on_timeout(client: nedbus.Bus) -> None:
-    """NoDataError is a TimeoutError; its text has the key and a remedy."""
+    """NoDataError is a TimeoutError; its text names the key and a remedy."""
     subscription = client.subscribe(VLP, vehicle="9")
     with pytest.raises(TimeoutError, match=rf"nedbus/9/{VLP} within 0\.05 s.*nedbus list") as info:
         subscription.receive(0.05)

@@ -43,7 +43,7 @@ def test_connect_without_a_router_raises() -> None:
 
 @pytest.mark.parametrize("is_async", [False, True])
 def test_connect_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
-    """`timeout=None` waits for a router without a limit."""
+    """`timeout=None` waits for a router indefinitely."""
     where = free_endpoint()
 
     async def connect_async() -> bool:

@@ -11,7 +11,7 @@ from tests.peers.processes import Start
 
 
 @pytest.mark.slow
-def test_opening_and_closing_publishers_causes_no_deadlock(start: Start) -> None:
+def test_opening_and_closing_publishers_does_not_deadlock(start: Start) -> None:
     """No Python code runs on Zenoh's threads, and none holds the GIL while waiting for Zenoh.
 
     A deadlock lasts 10 s or forever; the limit of 5 s tolerates a busy machine.

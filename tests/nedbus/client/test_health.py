@@ -41,7 +41,7 @@ def health_at_px4_times(*clock: float) -> Health:
 
 
 def test_rate_and_jitter_cover_the_last_second() -> None:
-    """Rate and jitter are those of the last full second, here 50 Hz in steps of 15 and 25 ms."""
+    """Rate and jitter cover the last full second: 50 Hz in steps of 15 and 25 ms."""
     times = [0.0]
     for index in range(200):
         times.append(times[-1] + (0.1 if index < 10 else 0.015 if index % 2 else 0.025))
@@ -58,14 +58,14 @@ def test_concurrent_add_does_not_break_a_snapshot(monkeypatch: pytest.MonkeyPatc
     stream = stream_at(0.0, 0.01, 0.02)
     mean = vars(_Window)["mean"].fget
 
-    class Late(float):
+    class LateMean(float):
         """A mean that adds a message when it is used."""
 
         def __rsub__(self, other: float) -> float:
             stream.add(message(30_000), received=SECOND // 50)
             return other - float(self)
 
-    monkeypatch.setattr(_Window, "mean", property(lambda window: Late(mean(window))))
+    monkeypatch.setattr(_Window, "mean", property(lambda window: LateMean(mean(window))))
     assert stream.snapshot(SECOND // 50).jitter == pytest.approx(0.0)
 
 
@@ -139,7 +139,7 @@ def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, rebo
     assert health.reboots == reboots
 
 
-def test_flags_are_shares_of_messages() -> None:
+def test_flag_shares_are_fractions_of_messages() -> None:
     """`flags` has the share of messages with a flag set in the last second, and `flags_ever` since the start."""
     stream = StreamHealth(VLP)
     for index in range(400):

@@ -81,7 +81,7 @@ def test_end_waits_for_a_running_job() -> None:
 
 
 def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
-    """A job that raises is logged once and called again, and delays no other job."""
+    """A job that raises is logged once and called again, and does not delay other jobs."""
     calls: list[float] = []
 
     def fail_at_first(now: float) -> float:
@@ -124,7 +124,7 @@ def test_sessions_share_threads(endpoint: str) -> None:
 
 @pytest.mark.parametrize("closed", ["publishers", "bus"])
 def test_closed_publishers_and_sessions_leave_no_jobs(endpoint: str, closed: str) -> None:
-    """Closed publishers and sessions leave no jobs; a session keeps that of its schemas, for messages in transit."""
+    """Closed publishers and sessions leave no jobs; a session keeps its schema job for messages in transit."""
     before = len(io_thread._jobs)
     with nedbus.connect(endpoint) as bus:
         for number in range(30):

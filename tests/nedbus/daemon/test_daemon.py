@@ -70,7 +70,7 @@ def expected_rows(path: Path) -> dict[str, list[list[str]]]:
 
 
 def row_of(message: VehicleLocalPosition) -> list[str]:
-    """Return the values of a message as texts, as NaN does not equal NaN."""
+    """Return the values of a message as text, in which NaN equals NaN."""
     return [repr(value) for value in message.__dict__.values()]
 
 
@@ -122,7 +122,7 @@ def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
 
 
 def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serve: Serve) -> None:
-    """A replay at speed=max waits for its readers, and the service exits only after a slow reader has everything."""
+    """A replay at speed=max waits for readers; the service exits only once a slow reader has received everything."""
     total = 12_000
     path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
     service, bus = serve("--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
@@ -153,7 +153,7 @@ def test_replay_keeps_order_and_speed(tmp_path: Path, serve: Serve) -> None:
 
 @pytest.mark.parametrize("locale", ["C.UTF-8", "C"])
 def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: str) -> None:
-    """File names with ?, % or invalid UTF-8 are replayed and appear in the status, also in the C locale."""
+    """File names with ?, % or invalid UTF-8 are replayed and appear in the status, even in the C locale."""
     written = {
         "what%3F.ulg?": b"what?.ulg",
         "what?.ulg?": b"what?.ulg",
@@ -353,7 +353,7 @@ def test_uplink_state_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) ->
 
 
 def test_unreachable_router_on_a_shared_port_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    """Of two routers on the same port number, the one that does not answer is reported, also with host names."""
+    """If two routers share a port number, the one that does not answer is reported, even with host names."""
     port, now = free_endpoint().rpartition(":")[2], 0.0
     live, dead, named = (f"tcp/{host}:{port}" for host in ("127.0.0.1", "127.0.0.2", "localhost"))
     router = open_router(listen=(live,))
@@ -374,7 +374,7 @@ def test_unreachable_router_on_a_shared_port_is_reported(caplog: pytest.LogCaptu
 
 
 def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -> None:
-    """The error has the endpoint, the reason and two remedies."""
+    """The error states the endpoint, the reason and two remedies."""
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:")
     assert service.wait() == 1
     remedy = "choose another endpoint with --listen, or join the router that runs there with --connect"

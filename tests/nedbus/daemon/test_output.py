@@ -59,7 +59,7 @@ def test_home_position_stays_published_while_its_vehicle_sends() -> None:
 
 
 def test_home_position_is_republished_after_an_outage() -> None:
-    """The last home position is republished after a link outage, as PX4 does not repeat it, but not after a reboot."""
+    """The last home position is republished after a link outage (PX4 does not repeat it), but not after a reboot."""
     fake = FakeOutput()
     fake.receive(1, HOME, POSITION)
     fake.receive(4)
@@ -99,7 +99,7 @@ def test_stalest_address_is_replaced_at_the_limit() -> None:
 
 
 def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
-    """While 1,000 addresses are published, messages of further ones are rejected, counted, and logged once."""
+    """While 1,000 addresses are published, messages on any other address are rejected, counted, and logged once."""
     fake = FakeOutput()
     present = [Address(f"v{number}", VLP) for number in range(1000)]
     fake.receive(1, *present, OTHER)

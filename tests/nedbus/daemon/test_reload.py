@@ -90,7 +90,7 @@ def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> N
 
 
 def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_path: Path) -> None:
-    """A removed source releases its addresses before a new source claims them, also a replay at full speed.
+    """A removed source releases its addresses before a new source claims them, even a replay at full speed.
 
     A source without a vehicle is restarted if the default vehicle changes.
     """
@@ -114,7 +114,7 @@ def test_reload_keeps_sources_given_by_flags(run_nedbus: Start) -> None:
     assert "0 started, 0 stopped, 2 unchanged" in reload(service, 1)
 
 
-def test_reload_during_startup_applies_to_the_start(tmp_path: Path) -> None:
+def test_reload_during_startup_is_applied(tmp_path: Path) -> None:
     """A service that is still waiting for its router starts with the latest settings."""
     daemon = Daemon(load_settings(connect=(free_endpoint(),), source=("sim:",)), version="test")
     assert (

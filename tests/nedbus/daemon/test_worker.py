@@ -248,7 +248,7 @@ class PanicException(BaseException):
         (PanicException("clock before 1970"), "unexpected PanicException: clock before 1970"),
     ],
 )
-def test_any_exception_is_retried_or_final(failure: BaseException, reason: str, retry: bool) -> None:
+def test_source_retries_or_fails_after_any_exception(failure: BaseException, reason: str, retry: bool) -> None:
     """After any exception, even a BaseException, the state is "retrying" or "failed", never "running"."""
     harness = run(FakeReplay([at(0.0)], [failure] * 9), FakeClock(stop_at=100.0), retry=retry)
     assert (harness.status.state, harness.status.ended) == (("retrying", False) if retry else ("failed", True))
@@ -297,7 +297,7 @@ def test_live_source_is_always_retried() -> None:
 
 
 def test_source_claims_all_its_addresses_or_none() -> None:
-    """If one address of a source is in use, the source claims none of the others, not even briefly."""
+    """If one address of a source is in use, the source claims no other address, not even briefly."""
     harness = Harness(FakeReplay([at(0.0), at(0.0, TWO)]), FakeClock(stop_at=1.0))
     harness.registry.publisher(TWO, lossless=False, source="other")
     harness.worker.run()

@@ -59,7 +59,7 @@ def diagnose(
 
 
 def find(findings: list[Finding], check: str, state: State, text: str) -> Finding:
-    """Return the finding of a check in this state that matches; fail with all findings if there is none."""
+    """Return the matching finding of a check in this state; if there is none, fail and list all findings."""
     for each in findings:
         if (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen}"):
             return each
@@ -67,7 +67,7 @@ def find(findings: list[Finding], check: str, state: State, text: str) -> Findin
 
 
 def diagnose_until(endpoint: str, *texts: str) -> list[Finding]:
-    """Run the doctor with doubled duration until all of these are found: on a busy machine messages arrive late."""
+    """Run the doctor, doubling the duration until it reports all of these: a busy machine delays messages."""
     findings, listen = list[Finding](), 0.5
     while not all(any(re.search(text, f"{each.subject}: {each.seen}") for each in findings) for text in texts):
         assert listen < DEADLINE, findings
@@ -162,7 +162,7 @@ def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, zenoh_ses
         assert any(each.check == check and each.state == "ok" for each in findings), check
 
 
-def test_silent_and_missing_vehicles_are_found(bus: nedbus.Bus, endpoint: str) -> None:
+def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str) -> None:
     """A silent publisher is reported with the age of its last message; a requested vehicle must exist."""
     bus.publisher(VLP, vehicle="mute")
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
@@ -227,8 +227,8 @@ def test_clock_offset_of_publisher_is_wrong(zenoh_session: Session, endpoint: st
     find(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
 
 
-def test_service_status_gives_findings(zenoh_session: Session, endpoint: str) -> None:
-    """Failed, waiting and stale sources, rejections and another version are found; of many findings the worst ones."""
+def test_service_status_produces_findings(zenoh_session: Session, endpoint: str) -> None:
+    """Failed, waiting and stale sources, rejections and other versions are reported, the worst first if many."""
     sources = [
         source(state="failed", error="the disk is gone"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
@@ -299,7 +299,7 @@ def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, 
     ids=["name", "nan", "inf", "now", "severity", "list"],
 )
 def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, invalid: Mapping[str, object]) -> None:
-    """An invalid event report from a peer has no findings and breaks no check."""
+    """An invalid event report from a peer produces no finding and does not break a check."""
     server = QueryServer(zenoh_session)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **invalid}
     server.answer_json(status_key("x"), lambda get: [json.dumps(report if get("events") else {}).encode()])
@@ -310,7 +310,7 @@ def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, 
 
 
 def test_bad_vehicle_in_report_of_real_service_is_wrong(run_nedbus: Start, tmp_path: Path) -> None:
-    """A bad vehicle is found in the event report of a service in another process that replays a log."""
+    """The doctor reports a bad vehicle from the event report of a service that replays a log in another process."""
     endpoint = free_endpoint()
     log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
     run_nedbus("serve", "--listen", endpoint, "-s", f"ulog:{log}?vehicle=sick")
@@ -320,8 +320,8 @@ def test_bad_vehicle_in_report_of_real_service_is_wrong(run_nedbus: Start, tmp_p
 
 
 @pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
-def test_invalid_service_status_breaks_no_check(zenoh_session: Session, endpoint: str, now: object) -> None:
-    """The valid parts of a peer's invalid status have findings, and no check fails."""
+def test_invalid_service_status_does_not_break_checks(zenoh_session: Session, endpoint: str, now: object) -> None:
+    """The valid parts of a peer's invalid status produce findings, and no check fails."""
     states: list[object] = [[], {}, 7, None]
     strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
     with service_status(
@@ -333,7 +333,7 @@ def test_invalid_service_status_breaks_no_check(zenoh_session: Session, endpoint
 
 
 def test_other_prefixes_and_ros2_topics_are_warnings(zenoh_session: Session, endpoint: str) -> None:
-    """Other prefixes are found by tokens or messages, topics of ROS 2 or PX4 by their tokens unless bridged."""
+    """Tokens or messages reveal other prefixes; tokens reveal ROS 2 or PX4 topics unless they are bridged."""
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), NO_HASH)
     token = zenoh_session.liveliness().declare_token(key.token("MP", "abc", "px4", 1))
     with nedbus.connect(endpoint, prefix="other/fleet") as other, publishing(other):
@@ -442,7 +442,7 @@ def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
 def test_invalid_certificate_is_wrong(
     run_router: Run, pki: Path, timings: Timings, case: tuple[str, str | None, str], expected: dict[str, str]
 ) -> None:
-    """A finding has the reason, which Zenoh does not report, and the router's certificate although no session opens."""
+    """A finding states the reason, which Zenoh omits, and the router's certificate even if no session opens."""
     router, name, ca = case
     if name != "reader":  # the alert that rejects it may be slow
         timings.tls_alert = DEADLINE
@@ -452,7 +452,7 @@ def test_invalid_certificate_is_wrong(
     assert any("the router presents" in each.seen for each in findings)
 
 
-def test_wrong_protocol_and_wrong_tls_files_are_found(
+def test_wrong_protocol_and_wrong_tls_files_are_reported(
     run_router: Run, pki: Path, endpoint: str, timings: Timings
 ) -> None:
     """TLS to a TCP port, TCP to a TLS port, a missing CA, and a key of another certificate are wrong."""
@@ -513,7 +513,7 @@ def test_read_and_write_permissions_are_reported(
 
 
 def test_without_cryptography_certificates_are_verified_but_not_read(run_router: Run, pki: Path, start: Start) -> None:
-    """Without the package names and dates are unknown, and the advice names the extra; trust is still verified."""
+    """Without the package, names and dates are unknown and the advice names the extra; trust is still verified."""
     endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
     settings = {name: str(path) for name, path in tls_settings(pki, "reader").items()}
     program = f"""
@@ -573,8 +573,8 @@ def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes
     return [each.pack(encoder) for each in messages]  # type: ignore[attr-defined] # pymavlink has no types
 
 
-def test_traffic_on_mavlink_link_gives_findings() -> None:
-    """Packets, messages, positions, ULog stream, ignored senders and a port in use have findings by system id."""
+def test_mavlink_traffic_produces_findings() -> None:
+    """Packets, messages, positions, ULog stream, ignored senders and a port in use produce findings by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
     find(check_link(), "mavlink", "wrong", "no packet within")
@@ -614,7 +614,7 @@ def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch
     find(findings, "settings", "wrong", "there is no option 'nonsense'")
 
 
-def test_missing_extra_is_found(start: Start) -> None:
+def test_missing_extra_is_reported(start: Start) -> None:
     """A package missing for a source or for --mavlink is reported with the extra to install."""
     program = """
 import sys

@@ -128,7 +128,7 @@ def rounded(value: float, digits: int = 4) -> float:
     return round(float(value), digits)
 
 
-def excess_of(position: Topic, index: int) -> tuple[float, float]:
+def unexplained_step(position: Topic, index: int) -> tuple[float, float]:
     """Return the step north and east of a message minus mean velocity times interval."""
     north, east = (
         position[axis][index]
@@ -179,13 +179,13 @@ def add_position(table: Table, position: Topic) -> None:
         is_reset = position["xy_reset_counter"][index] != position["xy_reset_counter"][index - 1]
         if not 0 < step <= JUMP_DT or not position["xy_valid"][index] or is_reset or moved is not None:
             continue
-        if math.hypot(*excess_of(position, index)) > JUMP_STEP:
+        if math.hypot(*unexplained_step(position, index)) > JUMP_STEP:
             if slides and (position.us[index] - position.us[slides[-1][1]]) / 1e6 <= JUMP_DT:
                 slides[-1][1] = index
             else:
                 slides.append([index, index])
     for first, last in slides:
-        north, east = np.array([excess_of(position, index) for index in range(first, last + 1)]).sum(axis=0)
+        north, east = np.array([unexplained_step(position, index) for index in range(first, last + 1)]).sum(axis=0)
         table.add(position.time(first), "jump", "once", distance=rounded(math.hypot(north, east), 3))
 
 
@@ -302,7 +302,7 @@ def add_landed(table: Table, detector: Topic) -> None:
 
 
 def rows_of(path: Path) -> list[Row]:
-    """Return the rows of a log in order of time."""
+    """Return the rows of a log in chronological order."""
     found = ULog(str(path), list(TOPICS)).data_list
     topics = {each.name: Topic(each) for each in found if each.multi_id == 0}
     table = Table()

@@ -129,6 +129,6 @@ def test_service_and_reader_detect_the_expected_events() -> None:
 
 
 @given(step=st.sampled_from([-3600.0, -1.0, 10.0, 3600.0]), at=st.floats(0.0, LENGTH))
-def test_clock_step_changes_no_event(step: float, at: float) -> None:
-    """A step of the host's clock at any time changes no event or duration; it only shifts times in reports."""
+def test_clock_step_does_not_change_events(step: float, at: float) -> None:
+    """A step of the host's clock does not change events or durations, at any time; it only shifts times in reports."""
     assert fly(step, at)[1] == EXPECTED

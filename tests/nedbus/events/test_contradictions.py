@@ -121,7 +121,7 @@ def test_ground_truth_contradicts_height_and_position(flight: Flight) -> None:
 
 
 def test_contradiction_while_disarmed_is_info() -> None:
-    """While disarmed a contradiction is info, as a receiver indoors is inaccurate."""
+    """A contradiction while disarmed is info, because GNSS receivers are inaccurate indoors."""
     flight = Flight()
     flight.status(DISARMED)
     reported = fly(flight, 10.0, north=50.0)
@@ -130,7 +130,7 @@ def test_contradiction_while_disarmed_is_info() -> None:
 
 
 def test_malformed_air_data_is_ignored(flight: Flight) -> None:
-    """Air data with missing fields or other types is ignored, as its publisher defines it."""
+    """Air data with missing fields or unexpected types is ignored: any publisher can define the message."""
     for odd in ({}, {"baro_alt_meter": "high"}, {"baro_alt_meter": None, "baro_device_id": (1, 2)}):
         for _ in range(20):
             assert flight.wait(0.5).send("vehicle_air_data", **odd) == []

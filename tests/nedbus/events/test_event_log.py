@@ -43,7 +43,7 @@ def brief(events: Iterable[Event]) -> list[tuple[str, str, str]]:
 
 
 def test_conditions_in_first_message_are_not_events() -> None:
-    """Conditions active in the first message are state without an event, until they end."""
+    """Conditions active in the first message set the state without an event; only their end is an event."""
     flight = Flight()
     assert flight.send(xy_valid=False, dead_reckoning=True) == []
     assert (flight.severity, flight.kinds) == ("bad", ["xy_invalid", "dead_reckoning"])
@@ -201,7 +201,7 @@ def test_vehicle_is_not_silent_while_link_is_down(flight: Flight) -> None:
 
 
 def test_message_before_link_update_prevents_silence(flight: Flight) -> None:
-    """A message that arrives before the restored link is polled does not make the vehicle silent."""
+    """A vehicle does not become silent if its message arrives before the restored link is polled."""
     flight.fly(1)
     flight.link = "no link"
     flight.update()
@@ -224,7 +224,7 @@ def test_vehicle_missing_after_link_is_restored_is_silent(flight: Flight) -> Non
 
 
 def test_flapping_link_is_suppressed(flight: Flight) -> None:
-    """After four changes of the link in 10 s, only the last is reported, with the number of suppressed ones."""
+    """After four changes of the link in 10 s, only the last is reported, with the number of suppressed changes."""
     reported = []
     for index in range(9):
         flight.link = "no link" if index % 2 == 0 else ""
@@ -370,7 +370,7 @@ def test_fix_acquired_before_arming_leaves_no_condition() -> None:
     assert flight.kinds == []
 
 
-def test_flag_labels_are_words() -> None:
+def test_flag_labels_are_words_not_field_names() -> None:
     """Labels of flags are words, not field names."""
     for kind in KINDS.values():
         for name, label in kind.flags.items():
@@ -644,7 +644,7 @@ def test_number_of_vehicles_streams_and_events_is_bounded() -> None:
 
 
 def update(event_log: EventLog, now: float, *present: str, link: str = "") -> set[str]:
-    """Update an event log with these vehicles present; return the vehicles that it knows."""
+    """Update an event log with these vehicles present; return the remembered vehicles."""
     event_log.update(now, {}, link=link, present=present)
     return set(event_log.vehicles)
 
@@ -686,7 +686,7 @@ def test_gone_vehicle_is_forgotten_after_an_hour() -> None:
 
 
 def test_last_fifty_gone_vehicles_are_remembered() -> None:
-    """Of vehicles that come and go, the last fifty and those of the last minute are remembered."""
+    """The last fifty gone vehicles, and all that left within the last minute, are remembered."""
     flight = Flight()
     for number in range(3000):
         flight.wait(2.0).send(vehicle=f"v{number}")
@@ -706,7 +706,7 @@ def test_fleet_that_vanishes_at_once_is_remembered() -> None:
 
 
 def test_rejection_reasons_are_not_kept(flight: Flight) -> None:
-    """Reasons of ended rejections are not kept, as each may be different."""
+    """Reasons of ended rejections are not kept, because each may be different."""
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
         flight.wait(6.0).update()
@@ -756,7 +756,7 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 @given(STEPS)
 @example([("send", {"xy_valid"}), ("send", set()), ("lose", 1), *[("send", set()), ("send", {"xy_valid"})] * 2])
-def test_begins_and_ends_are_consistent(steps: list[tuple[str, Any]]) -> None:
+def test_begins_and_ends_of_conditions_are_consistent(steps: list[tuple[str, Any]]) -> None:
     """For any messages, an end follows a begin or, at most once since boot, an initial condition.
 
     The last event of flapping may repeat an end, if an even number of changes was suppressed.

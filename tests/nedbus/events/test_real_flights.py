@@ -50,7 +50,7 @@ def events_in(name: str) -> list[Event]:
 
 
 def time_of(event: Event) -> float:
-    """Return the time since boot; for a jump, which is reported when it ends, that of the message before it."""
+    """Return the time since boot; for a jump, which is reported when it ends, use the message before it."""
     time = event.numbers["begin"] if event.kind == "jump" else event.boot
     assert time is not None
     return time
@@ -89,7 +89,7 @@ def is_same(row: Row, event: Event) -> bool:
 
 
 def sizes_of(event: Event) -> Mapping[str, float]:
-    """Return the numbers with the table's sign: down in place of up."""
+    """Return the numbers with the table's sign: down is positive."""
     down = {f"{name.removesuffix('up')}down": -value for name, value in event.numbers.items() if name[-2:] == "up"}
     return {**event.numbers, **(down if event.kind == "reset" else {})}
 
@@ -129,7 +129,7 @@ def test_table_is_generated_by_its_script() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_event_numbers_are_finite(name: str) -> None:
-    """All numbers of events are finite, as JSON has no NaN."""
+    """All numbers in events are finite, because JSON has no NaN."""
     for event in events_in(name):
         assert all(math.isfinite(number) for number in event.numbers.values()), event
 
@@ -195,7 +195,7 @@ def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_conditions_of_the_whole_flight(name: str) -> None:
+def test_conditions_of_the_whole_flight_are_fix_reference_or_position(name: str) -> None:
     """Conditions active in the first message and never ended are a missing fix, reference or valid position."""
     vehicle = cached_events(name).event_log.vehicles["1"]
     held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
@@ -239,7 +239,7 @@ def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
     assert story.lacking == ()
 
 
-def test_stories_at_a_time() -> None:
+def test_stories_at_a_time_are_those_active_then() -> None:
     """At a given time, the stories are those active then, bad or not, else the last one before."""
     assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
     assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
@@ -261,7 +261,7 @@ def test_primary_ekf_changes_are_events() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_only_one_estimate_is_contradicted(name: str) -> None:
+def test_only_one_log_has_a_contradicted_estimate(name: str) -> None:
     """Only one log has a contradicted estimate: height 27 m below GNSS and barometer, and position 6 to 9 m off.
 
     In the other logs no valid estimate is off for as long: 92 m for half a second in twelve_messages, 3 m in gps_loss,
@@ -292,7 +292,7 @@ def test_contradicted_height_has_evidence_and_reset() -> None:
 def test_px4_texts_are_events(name: str) -> None:
     """Each text in a table made with pyulog is exactly one event with its time and words.
 
-    Of a text in two forms, one is an event. A failed check that PX4 repeats because another check has changed is an
+    A text logged in two forms is one event. A failed check that PX4 repeats because another check has changed is an
     event only the first time.
     """
     events = [(each.boot or 0.0, each.text) for each in events_in(name) if each.kind == "text"]
@@ -329,7 +329,7 @@ def verdict(path: Path) -> Verdict:
 def test_verdict_names_cause_and_times(
     name: str, begin: float, end: float, cause: list[tuple[str, float]], quoted: str
 ) -> None:
-    """The verdict has fault, start, end and the causes in order of time, as in a table made by hand."""
+    """The verdict lists fault, start, end and causes in chronological order, as in a table made by hand."""
     found = verdict(path_of(name))
     assert found.begin is not None
     assert found.end is not None
@@ -387,7 +387,7 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
 
 @pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
 def test_verdict_has_three_lines(path: Path) -> None:
-    """A verdict has at most three lines; on a healthy flight it is "no faults" only."""
+    """A verdict has at most three lines; on a healthy flight it is just "no faults"."""
     text = verdict(path).text
     assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3
     is_healthy = path.stem in ("sitl_1.15_events", "ulog_stream_flight1", "ulog_stream_lossy1")

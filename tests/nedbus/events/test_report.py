@@ -60,7 +60,7 @@ def through_json(given: AccountReport) -> AccountReport:
     return read
 
 
-def test_report_survives_json() -> None:
+def test_report_json_round_trip() -> None:
     """Events with evidence, states and active conditions are equal after JSON encoding and decoding."""
     flight = Flight()
     flight.send(z_valid=False)
@@ -79,7 +79,7 @@ def test_report_survives_json() -> None:
 
 
 def test_story_from_report_equals_that_of_service() -> None:
-    """A story from a report equals that of the service, even for conditions older than all events."""
+    """A story from a report equals the service's own story, even for conditions older than all events."""
     flight = flying(xy_valid=False)
     for within in (1e9, 0.0):
         read = through_json(report(flight, within=within))
@@ -143,12 +143,12 @@ def test_vehicle_with_too_large_report_is_omitted(caplog: pytest.LogCaptureFixtu
         {"service": "s", "host": "h", "now": 1.0, "vehicles": {}, "events": "x" * 1000},
     ],
 )  # fmt: skip
-def test_malformed_reply_is_none(content: object) -> None:
+def test_malformed_reply_returns_none(content: object) -> None:
     """A reply that is not a report is None."""
     assert from_json(content) is None
 
 
-def test_deeply_nested_reply_is_none() -> None:
+def test_deeply_nested_reply_returns_none() -> None:
     """A reply with deeply nested evidence is None, not an error."""
     event: dict[str, Any] = {
         "vehicle": "1", "kind": "jump", "change": "once", "severity": "info", "text": "", "time": 0.0
@@ -158,7 +158,7 @@ def test_deeply_nested_reply_is_none() -> None:
     assert from_json({"service": "s", "host": "h", "now": 1.0, "vehicles": {}, "events": [event]}) is None
 
 
-def test_reply_beyond_limits_is_none() -> None:
+def test_reply_beyond_limits_returns_none() -> None:
     """A reply with more events or vehicles than a service sends is None."""
     event = asdict(Event("1", "jump", "once", "info", "", 0.0))
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
@@ -177,7 +177,7 @@ json_values = st.recursive(
 
 
 @given(st.sampled_from(["events", "vehicles", "now", "service", "host"]), json_values)
-def test_any_reply_is_a_report_or_none(name: str, value: object) -> None:
+def test_any_reply_returns_a_report_or_none(name: str, value: object) -> None:
     """Any reply is a report or None, and stories and faults of the report can be computed."""
     content = json.loads(json.dumps(asdict(report(flying(xy_valid=False)))))
     read = from_json(content | {name: value})

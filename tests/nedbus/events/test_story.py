@@ -118,7 +118,7 @@ def test_active_watch_condition_is_a_story_after_ended_fault() -> None:
 
 
 def test_condition_without_begin_event_is_a_story() -> None:
-    """A condition whose begin is not among the events is active since its begin, or since the first message."""
+    """A condition without a begin event is active since its recorded start, or since the first message."""
     flight = Flight()
     flight.send(z_valid=False)
     flight.wait(2.0).send(z_valid=False, xy_valid=False)
@@ -129,7 +129,7 @@ def test_condition_without_begin_event_is_a_story() -> None:
 
 
 def test_healthy_vehicle_has_no_story() -> None:
-    """A vehicle that arms, takes off and lands has no story; neither has an unknown vehicle."""
+    """A vehicle that arms, takes off and lands has no story; nor does an unknown vehicle."""
     flight = Flight()
     flight.send()
     flight.status(ARMED)

@@ -133,7 +133,7 @@ def test_jamming_in_first_message_is_a_condition(vehicle: SimpleVehicle) -> None
 
 
 def test_condition_of_whole_recording_is_state_at_any_time(vehicle: SimpleVehicle) -> None:
-    """A vehicle that is never valid in a recording is bad at any time, as live."""
+    """A vehicle that is never valid in a recording is bad at any time, as in live data."""
     for second in range(5):
         vehicle.send(float(second), xy_valid=False)
     state = state_at(spans_of(list(vehicle.event_log.events), vehicle.event_log.vehicles["1"].initial), 3.0)
@@ -153,8 +153,8 @@ def test_worse_warning_ends_the_previous_one(vehicle: SimpleVehicle) -> None:
     assert vehicle.stories() == [("battery critical", 2.0)]
 
 
-def test_story_of_event_is_about_that_event(vehicle: SimpleVehicle) -> None:
-    """Two faults within a minute have one story each, and an end has the story of its begin."""
+def test_story_of_event_explains_that_event(vehicle: SimpleVehicle) -> None:
+    """Two faults within a minute have one story each; an end event belongs to the story of its begin event."""
     vehicle.send(0.0)
     vehicle.send(1.0, timestamp=1_000_000)
     vehicle.send(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)
@@ -199,7 +199,7 @@ def test_logging_dropout_is_not_silence(vehicle: SimpleVehicle) -> None:
 
 
 def test_only_primary_ekf_has_conditions(vehicle: SimpleVehicle) -> None:
-    """Faults of an EKF that is not primary are not conditions, and those of a former primary end."""
+    """Faults of an EKF that is not primary are not conditions; faults of a former primary EKF end."""
     for primary, faulty in ((1, 0), (0, 0), (1, 1)):
         for time in (0.0, 1.0):
             vehicle.send(time, "estimator_selector_status", primary_instance=primary)
@@ -275,7 +275,7 @@ def test_late_selector_overrides_comparison_of_estimates(vehicle: SimpleVehicle)
 
 
 @pytest.mark.parametrize("gnss", [False, True])
-def test_end_of_fake_position_is_evidence(vehicle: SimpleVehicle, gnss: bool) -> None:
+def test_end_of_fake_position_fusion_is_evidence(vehicle: SimpleVehicle, gnss: bool) -> None:
     """The end of fake position fusion is evidence for an invalid position unless GNSS replaces it."""
     vehicle.send(0.0, "estimator_status_flags", 0, cs_fake_pos=True, cs_valid_fake_pos=True, cs_gnss_pos=False)
     vehicle.send(0.0)

@@ -26,8 +26,8 @@ def verdict(flight: Flight, *, times: Times | None = None, at: float | None = No
     return verdict_of("1", events, held, topics=followed.topics, times=times or Times(), end=flight.now, at=at)
 
 
-def test_verdict_on_active_fault() -> None:
-    """The verdict has the fault, its start, duration and clock, the evidence in order of time, and missing topics."""
+def test_verdict_on_active_fault_includes_evidence() -> None:
+    """The verdict states the fault, its start, duration and clock, the evidence in order, and missing topics."""
     flight = Flight()
     lose_gps(flight)
     found = verdict(flight)
@@ -44,8 +44,8 @@ def test_verdict_on_active_fault() -> None:
     assert "UTC, until now (1.0 s)" in verdict(flight, times=LIVE).text
 
 
-def test_verdict_on_ended_fault() -> None:
-    """The verdict has the start and end of a fault that has ended."""
+def test_verdict_on_ended_fault_includes_start_and_end() -> None:
+    """The verdict states the start and end of a fault that has ended."""
     flight = Flight()
     lose_gps(flight)
     flight.wait(1.0).send()
@@ -58,8 +58,8 @@ def test_verdict_on_ended_fault() -> None:
     assert (found.usable, found.begin.time, found.end.time) == (False, flight.now - 2.0, flight.now)
 
 
-def test_verdict_without_faults() -> None:
-    """Without faults the verdict says so, and whether the data has position validity."""
+def test_verdict_reports_absence_of_faults() -> None:
+    """A verdict without faults states the period, and whether the data lacks position validity."""
     flight = Flight()
     flight.fly(5)
     found = verdict(flight)
@@ -117,7 +117,7 @@ def test_evidence_of_end_is_later_than_begin() -> None:
 
 
 def test_verdict_quotes_px4() -> None:
-    """PX4's texts are evidence in order of time, except texts that already appeared before the fault."""
+    """PX4's texts are evidence in chronological order, except texts that already appeared before the fault."""
     flight = Flight()
     flight.send()
     for _ in range(3):
@@ -136,7 +136,7 @@ def test_verdict_quotes_px4() -> None:
     )
 
 
-def test_unrelated_events_are_evidence_if_there_is_no_other() -> None:
+def test_unrelated_events_are_evidence_without_a_known_cause() -> None:
     """Without a known cause, all events shortly before a fault are shown, except phases of the flight."""
     flight = Flight()
     flight.status(ARMED)
@@ -150,16 +150,17 @@ def test_unrelated_events_are_evidence_if_there_is_no_other() -> None:
     assert [each.kind for each in found.cause] == ["heading_not_good"]
 
 
-def held(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
+def condition_of(kind: str, flag: str, words: str, since: float = 0.0) -> Condition:
     """Return a condition that was active in the first message."""
     begin = Event("1", kind, "begin", "watch", words, since, 10.0, names=(flag,))
     return Condition(kind, "watch", words, since, begin, initial=True)
 
 
-def test_verdict_on_conditions_of_whole_flight() -> None:
+def test_conditions_of_whole_flight_are_one_fault() -> None:
     """Conditions active for a whole flight are one fault, and evidence if the position was never valid."""
     conditions = [
-        held("gps_fix_lost", "", "no GPS fix"), held("xy_not_global", "xy_global", "xy has no global reference", 0.1),
+        condition_of("gps_fix_lost", "", "no GPS fix"),
+        condition_of("xy_not_global", "xy_global", "xy has no global reference", 0.1),
     ]  # fmt: skip
     topics = ["vehicle_local_position", "vehicle_gps_position"]
     found = verdict_of("1", [], conditions, topics=topics, times=Times(), end=62.0)
@@ -168,7 +169,7 @@ def test_verdict_on_conditions_of_whole_flight() -> None:
         "until the end (62.0 s)."
     )
     assert (found.usable, len(found.stories)) == (True, 1)
-    invalid = replace(held("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
+    invalid = replace(condition_of("xy_invalid", "xy_valid", "xy not valid"), severity="bad")
     found = verdict_of("1", [], [*conditions, invalid], topics=topics, times=Times(), end=62.0)
     assert found.text.startswith("not usable: xy not valid from the first message until the end (62.0 s). ")
     assert [each.kind for each in found.cause] == ["gps_fix_lost"]
@@ -218,7 +219,7 @@ def test_verdict_is_limited_to_vehicle_and_time() -> None:
     )
 
 
-def test_verdict_on_vehicle_that_was_never_valid_quotes_px4() -> None:
+def test_verdict_on_never_valid_vehicle_quotes_px4() -> None:
     """The most severe text during a fault since the first message is evidence, however late it appears."""
     flight = Flight()
     flight.send(xy_valid=False)
@@ -232,7 +233,7 @@ def test_verdict_on_vehicle_that_was_never_valid_quotes_px4() -> None:
 
 
 def test_verdict_counts_equal_faults() -> None:
-    """The longest of several equal faults is the worst, and the verdict has their number."""
+    """The longest of several equal faults is the worst, and the verdict states their number."""
     flight = Flight()
     flight.send()
     for seconds in (1.0, 3.0, 2.0):

@@ -46,7 +46,7 @@ def others() -> Iterator[tuple[HttpClient, HttpClient]]:
         yield HttpClient(local.port), HttpClient(public.port)
 
 
-def test_unknown_path_is_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
+def test_unknown_path_returns_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
     """404 and / list the available pages; a page that raises is 500, is logged, and does not stop the server."""
     assert server.request("/other") == (404, "available pages: /page, /fails, /waits\n")
     assert server.request("/")[0] == 200
@@ -129,7 +129,7 @@ def test_malformed_requests_are_rejected(
     ids=["no request", "half a request", "byte by byte", "response not read"],
 )
 def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes) -> None:
-    """While 16 clients stall in sending or reading, further clients are served once the stalled ones time out."""
+    """While 16 clients stall in sending or reading, a new client is served once a stalled one times out."""
     timings.http_client = 0.5
     large = Page.text("x" * 20_000_000)  # exceeds the socket buffers
     server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})

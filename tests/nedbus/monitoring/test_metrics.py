@@ -145,7 +145,7 @@ def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: HttpClient,
     assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
 
 
-def test_bad_vehicle_is_503_on_vehicles_page_only(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
+def test_bad_vehicle_returns_503_on_vehicles_page_only(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """A bad vehicle makes /vehicles 503 and is in the metrics; /healthz and /readyz of the service stay 200."""
     times = range(100_000, 300_000_000, 100_000)
     logs = {
@@ -214,7 +214,7 @@ def test_flapping_flag_stays_a_condition(every: int) -> None:
     assert event_log.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
-def test_metrics_pass_promtool(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
+def test_metrics_pass_promtool_check(serve: Serve, pages: HttpClient, start: Start, tmp_path: Path) -> None:
     """`promtool check metrics` accepts all names, units, types and help texts."""
     serve("sim:", f"mavlink:udpin:127.0.0.1:{free_port()}")
     text = tmp_path / "metrics"
@@ -282,7 +282,9 @@ def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_ned
     assert pages.values("nedbus_sessions", role="client") == exported.values("nedbus_connected") == [0]
 
 
-def test_missing_prometheus_client_is_501_with_install_hint(start: Start, pages: HttpClient, endpoint: str) -> None:
+def test_missing_prometheus_client_returns_501_with_install_hint(
+    start: Start, pages: HttpClient, endpoint: str
+) -> None:
     """Without prometheus-client, /metrics is 501 with the extra to install; the other pages work."""
     start("-c", WITHOUT_CLIENT, "serve", "-c", endpoint, "-s", "sim:", "--http", pages.where)
     wait_for(lambda: pages.request("/readyz")[0] == 200, what="the service")
@@ -295,7 +297,7 @@ def test_missing_prometheus_client_is_501_with_install_hint(start: Start, pages:
 
 
 @pytest.mark.parametrize("command", [SERVE, EXPORT])
-def test_port_in_use_is_one_line(endpoint: str, command: tuple[str, ...]) -> None:
+def test_port_in_use_is_a_one_line_error(endpoint: str, command: tuple[str, ...]) -> None:
     """A port in use by another process is a one-line error with exit code 1."""
     with socket.socket() as taken:  # not listening: a probe of the port must not wait for a reply
         taken.bind(("127.0.0.1", 0))
@@ -308,14 +310,14 @@ def test_port_in_use_is_one_line(endpoint: str, command: tuple[str, ...]) -> Non
 
 @pytest.mark.parametrize("command", [SERVE, EXPORT])
 @pytest.mark.parametrize("where", ["9464", "127.0.0.1:metrics", "127.0.0.1:65536", "::1:9464"])
-def test_malformed_http_address_is_one_line(endpoint: str, command: tuple[str, ...], where: str) -> None:
+def test_malformed_http_address_is_a_one_line_error(endpoint: str, command: tuple[str, ...], where: str) -> None:
     """A malformed address is a one-line error with the expected form and exit code 2."""
     ended = run_command(*command, "-c", endpoint, "--http", where)
     assert (ended.exit_code, ended.err.count("\n")) == (2, 1)
     assert f"'{where}' is not an address: write HOST:PORT, such as 127.0.0.1:9464" in ended.err
 
 
-def test_public_http_address_is_warned_about(caplog: pytest.LogCaptureFixture) -> None:
+def test_public_http_address_logs_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     """An address other than loopback logs a warning that anyone on the network can read the pages."""
     for where, count in ((f"[::1]:{free_port()}", 0), (f"0.0.0.0:{free_port()}", 1)):
         with serve_pages(where, {}):
@@ -377,8 +379,8 @@ def test_blocked_source_is_not_healthy(endpoint: str, monkeypatch: pytest.Monkey
     assert pages["/healthz"]() == Page.text("a source has been blocked by one message for 20 s", status=503)
 
 
-def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error of the reading thread is raised, as stale pages would look like silent vehicles."""
+def test_failed_reader_ends_the_exporter(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error in the reading thread is raised, because stale pages would look like silent vehicles."""
 
     def fail(_: object) -> None:
         raise ArithmeticError
@@ -456,7 +458,7 @@ def test_report_of_a_thousand_vehicles_is_complete(endpoint: str) -> None:
 
 
 def test_scrape_takes_one_snapshot_per_stream(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scrape computes the health of each stream once, as a page may have a thousand streams."""
+    """A scrape computes the health of each stream once, because a page may list a thousand streams."""
     daemon = Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0")
     running = threading.Thread(target=daemon.run)
     running.start()

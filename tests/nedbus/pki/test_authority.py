@@ -219,7 +219,7 @@ def test_each_suggested_source_in_a_bundle_is_valid(pki: Path, tmp_path: Path) -
 
 
 def test_bundle_is_created_completely_or_not_at_all(pki: Path, tmp_path: Path) -> None:
-    """A bundle overwrites no file, and leaves no file after an error, also in the folder of the CA."""
+    """A bundle overwrites no file, and leaves none behind after an error, even in the folder of the CA."""
     routers = ["tls/10.0.0.1:7447", "tls/10.0.0.2:7447"]
     before = sorted(pki.iterdir())
     (tmp_path / "taken").mkdir()
@@ -345,7 +345,7 @@ def test_renewed_authority_keeps_its_certificates_valid(run_router: RunRouter, t
 
 
 def test_expired_authority_is_ignored_if_a_valid_one_is_in_the_file(pki: Path, tmp_path: Path) -> None:
-    """If tls_ca has several CA certificates, one valid is enough; if all have expired, that is the reported reason."""
+    """One valid CA certificate in tls_ca is enough; if all have expired, the error states that."""
     expired, both = make_authority(tmp_path / "old", days=-1)[1], tmp_path / "both.crt"
     both.write_bytes(expired.read_bytes() + (pki / "ca.crt").read_bytes())
     assert nedbus.Tls(expired).explain() == f"{expired} has expired"
@@ -394,7 +394,7 @@ def remove_key_identifiers(path: Path, authority: Path) -> None:
 
 @pytest.mark.parametrize("earlier", [False, True], ids=["this version", "earlier version"])
 def test_certificates_pass_strict_verification(pki: Path, *, earlier: bool) -> None:
-    """Certificates pass the strict verification of Python 3.13; earlier ones stay valid, and pass it once renewed."""
+    """Certificates pass Python 3.13's strict verification; older certificates stay valid, and pass once renewed."""
     router, reader = client_tls(pki, "router"), client_tls(pki, "reader")
     for name in ("ca", "router", "reader") if earlier else ():
         remove_key_identifiers(pki / f"{name}.crt", pki / "ca.key")

@@ -55,7 +55,7 @@ POSITIONS = array_of(VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": flo
 HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0})
 
 
-def test_last_uses_no_future_message() -> None:
+def test_method_last_never_uses_future_messages() -> None:
     """With method "last" a row has the last message at or before it, and its age; before the first message NaN."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME})
     assert table["timestamp"].tolist() == POSITIONS["timestamp"].tolist()
@@ -69,14 +69,14 @@ def test_last_uses_no_future_message() -> None:
     assert np.isnan(exactly["home_position.age"][1])
 
 
-def test_nearest_may_use_a_future_message() -> None:
+def test_method_nearest_may_use_future_messages() -> None:
     """With method "nearest" a later message has a negative age; of two equally near messages the earlier is used."""
     table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
     assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
     assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
 
 
-def test_linear_interpolates_only_floats() -> None:
+def test_method_linear_interpolates_only_floats() -> None:
     """With method "linear" floats are interpolated; integers, flags, NaN and infinities keep the last value."""
     messages = array_of(
         VLP,
@@ -101,8 +101,8 @@ def test_linear_interpolates_only_floats() -> None:
         ("cog_rad", 0.2, 6.2, 6.2 + (2 * math.pi - 6.0) / 2),
     ],
 )
-def test_angles_are_interpolated_the_shorter_way(field: str, first: float, second: float, middle: float) -> None:
-    """An angle is interpolated the shorter way, and stays in the range of its field: from -pi, or from 0."""
+def test_angles_are_interpolated_along_the_shorter_arc(field: str, first: float, second: float, middle: float) -> None:
+    """An angle is interpolated along the shorter arc, and stays in the range of its field: from -pi, or from 0."""
     messages = array_of("vehicle_gps_position", {"timestamp": 1, field: first}, {"timestamp": 3, field: second})
     [value] = nedbus.align({"vehicle_gps_position": messages}, on=[2], method="linear")[f"vehicle_gps_position.{field}"]
     assert math.remainder(value - middle, math.tau) == pytest.approx(0, abs=1e-6)
@@ -151,7 +151,7 @@ def test_rate_covers_the_flight() -> None:
 
 @pytest.mark.parametrize("form", ["ULG", "MCAP"])
 def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
-    """PX4 logs the last message of a slow topic with its old time: this adds no empty rows at the start."""
+    """PX4 logs the last message of a slow topic with its old time: this does not add empty rows at the start."""
     log = tmp_path / "a.ULG"
     times = range(300_000_000, 310_000_000, 20_000)
     writer = UlogWriter()
@@ -257,7 +257,7 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
 
 
-def test_utc_source_is_gnss_then_companion_else_none() -> None:
+def test_utc_comes_from_gnss_then_companion_clock() -> None:
     """UTC comes from GNSS, else from a companion's clock after 2000; zeros and inconsistent offsets are ignored."""
     times = range(1_000_000, 11_000_000, 1_000_000)
     gnss = array_of(
@@ -284,7 +284,7 @@ def test_utc_source_is_gnss_then_companion_else_none() -> None:
     assert nedbus.utc_of({"sensor_gnss_relative": gnss[without]}) is not None
 
 
-def test_utc_of_live_samples(bus: nedbus.Bus) -> None:
+def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:
     """The last samples of a live vehicle are enough to derive its UTC; without a date it is None."""
     for vehicle, utc in (("7", 1_700_000_000_000_000), ("8", 0)):
         gps = bus.publisher("sensor_gps", vehicle=vehicle, instance=1)

@@ -68,7 +68,7 @@ def add_in_middle(payload: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("where", ["end", "middle"])
-def test_fields_unknown_to_px4_are_left_out_and_named(tmp_path: Path, where: str) -> None:
+def test_fields_unknown_to_px4_are_skipped_and_listed(tmp_path: Path, where: str) -> None:
     """Additional fields in the file's definition are skipped, wherever they are; no message is lost."""
     text, own = message_definition("1.16"), "float32 wind_north\nfloat32 wind_east\n"
     if where == "end":
@@ -166,7 +166,7 @@ def test_all_variants_of_mcap_are_read_completely(
 
 
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
-def test_bit_flip_outside_chunks_creates_no_message(tmp_path: Path, every: int) -> None:
+def test_bit_flip_outside_chunks_does_not_create_messages(tmp_path: Path, every: int) -> None:
     """Record headers and message indexes have no CRC; a bit flip there is reported or harmless."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
@@ -315,7 +315,7 @@ def test_compressed_recording_is_read(tmp_path: Path) -> None:
         "29_own_field_appended.mcap", "29b_own_field_middle.mcap",
     ],
 )  # fmt: skip
-def test_reported_files_are_read_completely(name: str) -> None:
+def test_files_from_user_reports_are_read_completely(name: str) -> None:
     """Files written by rosbags and mcap have ten messages each, x = 0 to 9."""
     assert nedbus.read(CASES / name)["x"].tolist() == list(range(10))
     assert nedbus.read(CASES / name, VLP)["timestamp"].size == 10

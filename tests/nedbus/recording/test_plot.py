@@ -82,7 +82,7 @@ def bars_of(axes: Any) -> dict[str, list[tuple[float, float]]]:
 
 
 @pytest.mark.parametrize("others", [[], [flight_of(vehicle="8")]], ids=["one", "with another"])
-def test_invalid_estimate_is_thin_and_does_not_affect_the_limits(others: list[tuple[Address, MessageArray]]) -> None:
+def test_invalid_estimate_is_thin_and_does_not_affect_axis_limits(others: list[tuple[Address, MessageArray]]) -> None:
     """Invalid positions, altitudes and speeds are drawn thin and do not affect the axis limits."""
     address, array = flight_of()
     array["xy_valid"][50:80] = array["z_valid"][50:80] = array["v_xy_valid"][50:80] = False
@@ -102,8 +102,8 @@ def test_invalid_estimate_is_thin_and_does_not_affect_the_limits(others: list[tu
         assert np.array_equal(np.isfinite(np.asarray(thick.get_ydata())), array["xy_valid"]), name
 
 
-def test_estimate_that_is_never_valid_sets_the_limits() -> None:
-    """If no message is valid, the invalid ones determine the axis limits."""
+def test_never_valid_estimate_sets_axis_limits() -> None:
+    """If no message is valid, the invalid messages determine the axis limits."""
     address, array = flight_of()
     array["xy_valid"] = array["z_valid"] = array["v_xy_valid"] = False
     array["x"] *= 100

@@ -138,7 +138,7 @@ def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
 
 
 def test_missing_package_error_has_the_pip_command(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without pandas or mcap the error has the pip command; an unknown data frame library raises."""
+    """Without pandas or mcap the error includes the pip command; an unknown data frame library raises."""
     with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
         nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
     monkeypatch.setitem(sys.modules, "pandas", None)
@@ -236,7 +236,7 @@ def test_plot_names_missing_flags(tmp_path: Path) -> None:
     assert f"not in 1/{VLP}: dead_reckoning, heading_reset_counter" in texts
 
 
-def test_plot_without_valid_messages_has_titles_and_any_file_name(tmp_path: Path) -> None:
+def test_plot_of_invalid_messages_has_explanatory_titles(tmp_path: Path) -> None:
     """Invalid messages are plotted with explanatory titles; a file name is not interpreted as math text."""
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
@@ -245,7 +245,7 @@ def test_plot_without_valid_messages_has_titles_and_any_file_name(tmp_path: Path
     assert name.replace("\udcff", "?") in texts
 
 
-def test_missing_fields_are_named(tmp_path: Path) -> None:
+def test_missing_fields_are_listed(tmp_path: Path) -> None:
     """Fields that a log lacks are named by `missing_of`, and null in data frames."""
     writer = UlogWriter(layout="1.13")
     writer.define([VLP])
@@ -384,7 +384,9 @@ def test_ground_truth_recipe_measures_the_error(
         ("invalid.mcap", 1, "the selected streams have no valid message"),
     ],
 )
-def test_impossible_plot_exits_with_an_error(flight: Path, arguments: str, exit_code: int, reason: str) -> None:
+def test_plot_that_cannot_be_drawn_exits_with_an_error(
+    flight: Path, arguments: str, exit_code: int, reason: str
+) -> None:
     """An unknown stream or suffix exits with 2, a missing folder or a stream without valid messages with 1."""
     array = to_array([message(1), message(2)])
     array["xy_valid"] = True

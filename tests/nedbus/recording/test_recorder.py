@@ -138,7 +138,7 @@ def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tm
 def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After each flush, any reader finds a valid file with all messages, and fsync was called.
 
-    Before the first message the file is valid, too.
+    The file is also valid before the first message.
     """
     path = tmp_path / "a.mcap"
     synced = []
@@ -297,7 +297,7 @@ def test_full_disk_leaves_no_partial_file(size: int, arguments: list[str], reaso
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
 
 
-def dues(path: Path, *logged: float) -> list[float]:
+def due_times(path: Path, *logged: float) -> list[float]:
     """Return the replay times of messages recorded at these times [s], with unrelated publish times."""
     with RecordingWriter(path) as writer:
         for number, time in enumerate(logged):
@@ -319,8 +319,8 @@ def dues(path: Path, *logged: float) -> list[float]:
     ],
 )
 def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float], due: list[float]) -> None:
-    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, also after conversion."""
-    assert dues(tmp_path / "a.mcap", *logged) == due
+    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, even after conversion."""
+    assert due_times(tmp_path / "a.mcap", *logged) == due
     convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
     assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == due
 
@@ -373,7 +373,7 @@ def test_recording_without_messages_warns_and_removes_the_file(
 ) -> None:
     """Without messages a notice is printed after 2 s; at the end the empty file is removed, with exit code 1.
 
-    The recorder starts after the notice, as its duration might end before.
+    The recorder starts after the notice, because its duration might end before it.
     """
     path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
 
@@ -431,7 +431,7 @@ def test_invalid_argument_is_a_one_line_error(endpoint: str, arguments: str, exi
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_converted_log_is_complete(tmp_path: Path, layout: str) -> None:
-    """The recording of a log has the same messages, with the same missing fields."""
+    """A converted log contains the same messages, with the same missing fields."""
     log, path, writer = tmp_path / "a.ulg", tmp_path / "flight.mcap", UlogWriter(layout=layout)
     writer.define([VLP, "estimator_local_position"], without=["tilt_var", "eph"])
     for number in range(10):
@@ -468,7 +468,7 @@ def test_unusual_messages_are_converted_or_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".mcap", ".ulg"])
 def test_pipe_or_folder_raises(tmp_path: Path, suffix: str) -> None:
-    """A FIFO, which would block forever, raises, and so does a folder."""
+    """A folder raises, and so does a FIFO, which would otherwise block forever."""
     pipe = tmp_path / f"pipe{suffix}"
     os.mkfifo(pipe)
     plot = run_command("plot", str(pipe))

@@ -86,7 +86,7 @@ def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
     assert math.isclose(event_log.end, 3e8 - 60 + 9.9, abs_tol=0.01)
 
 
-def test_file_without_utc_raises_among_several(tmp_path: Path, swarm: list[str]) -> None:
+def test_file_without_utc_among_several_raises(tmp_path: Path, swarm: list[str]) -> None:
     """A file without UTC is named in the error; alone it can be read."""
     path = write_flight(tmp_path / "d.ulg", boot=0, start=60, utc=False)
     ended = run_command("events", *swarm, str(path))
@@ -127,7 +127,7 @@ def test_page_shows_several_files(swarm: list[str]) -> None:
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
-def test_reported_swarm_is_aligned() -> None:
+def test_swarm_from_user_report_is_aligned() -> None:
     """Three vehicles with different boots, two with the same system id, all fly from 08:54:20 to 08:54:30 UTC."""
     paths = [CASES / f"swarm_{name}.ulg" for name in "abc"]
     streams = nedbus.read(paths, [VLP])

@@ -32,7 +32,7 @@ def count(name: str) -> dict[str, int]:
     return {stream: len(each) for stream, each in nedbus.read(CASES / name, ["*"]).items()}
 
 
-def dues(name: str) -> tuple[float, float]:
+def due_times(name: str) -> tuple[float, float]:
     """Return the replay times of the first and the last position [s]."""
     found = [each.due for each in open_replay(f"ulog:{CASES / name}").messages if each.address.topic == VLP]
     return round(found[0], 2), round(found[-1], 2)
@@ -56,8 +56,8 @@ EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
         VLP: 50, "offboard_control_mode": 50, "trajectory_setpoint": 50, "vehicle_visual_odometry": 50,
     }),
     (count, "04_replayed_zero_attitude.ulg", {"vehicle_attitude": 250, VLP: 250}),
-    (dues, "16_home_position_50s_old.ulg", (0.0, 9.98)),
-    (dues, "16b_home_position_108s_old.ulg", (0.0, 9.98)),
+    (due_times, "16_home_position_50s_old.ulg", (0.0, 9.98)),
+    (due_times, "16b_home_position_108s_old.ulg", (0.0, 9.98)),
     (events, "15_logging_dropout_5s.ulg", {("dropout", "info")}),
     (events, "16_home_position_50s_old.ulg", set()),
     (events, "17_old_log_without_release.ulg", {("mode", "info")}),
@@ -78,7 +78,7 @@ def test_log_without_release_is_converted_without_warning(tmp_path: Path) -> Non
     assert account("17_old_log_without_release.ulg").warnings == ()
 
 
-def test_end_of_fake_position_is_the_cause() -> None:
+def test_end_of_fake_position_fusion_is_the_cause() -> None:
     """Fake position fusion ends at 154.1 s, no other begins before 160.4 s: the position is invalid from 154.3 s."""
     lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in lines if "BAD    xy not valid" in line)

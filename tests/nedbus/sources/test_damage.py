@@ -326,7 +326,7 @@ def test_oversized_chunk_is_skipped(
 
 
 def test_number_of_damage_warnings_is_limited(tmp_path: Path) -> None:
-    """A file with a thousand damaged places causes a hundred warnings; a last one says that more are omitted."""
+    """A file with a thousand damaged places causes a hundred warnings; a final one states that more were omitted."""
     path = write_recording(tmp_path / "a.mcap", finish=False)
     place = struct.pack("<BQ", Opcode.MESSAGE_INDEX, 6) + bytes(6)
     path.write_bytes(path.read_bytes()[:-50] + (place + struct.pack("<BQ", 0x80, 0)) * 1000)
@@ -373,7 +373,7 @@ def test_damaged_chunk_of_converted_flight_is_small(tmp_path: Path) -> None:
 
 
 def test_truncated_log_is_converted_with_warning(tmp_path: Path) -> None:
-    """A log that ends inside a message, as after a power loss, is converted up to there with exit code 0."""
+    """A log that ends inside a message, as after a power loss, is converted up to that point with exit code 0."""
     path = write_log(tmp_path / "a.ulg")
     path.write_bytes(path.read_bytes()[:-50])
     convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))
@@ -435,7 +435,7 @@ def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
 
 
 def test_payloads_of_wrong_size_are_rejected(tmp_path: Path) -> None:
-    """55 payloads that are equally too long are 55 invalid messages, not 56 misaligned ones."""
+    """55 payloads, all too long by the same amount, are 55 invalid messages, not 56 misaligned ones."""
     path = write_payloads(tmp_path / "a.mcap", [payload(each) + bytes(60) for each in range(55)])
     assert len(nedbus.read(path)) == 0
 

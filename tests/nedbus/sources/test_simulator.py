@@ -34,7 +34,7 @@ def streams() -> dict[str, list[VehicleLocalPosition]]:
 
 @pytest.fixture(scope="module")
 def others() -> dict[str, list[Any]]:
-    """Simulate all topics but those of VehicleLocalPosition, validate all messages, and group them by stream."""
+    """Simulate all topics except those of VehicleLocalPosition, validate all messages, and group them by stream."""
     topics = ",".join(TOPICS.keys() - DEFAULT.topics)
     by_stream: dict[str, list[Any]] = defaultdict(list)
     for each in simulate(f"?duration=140&topics={topics}"):
@@ -46,7 +46,7 @@ def others() -> dict[str, list[Any]]:
     return dict(by_stream)
 
 
-def test_origin_moves_the_flight() -> None:
+def test_origin_option_moves_the_flight() -> None:
     """Another origin moves only the global positions; an impossible one raises."""
     moved, standard = (
         {each.address.stream: each.fields for each in simulate(f"?duration=3{options}")}
@@ -155,7 +155,7 @@ def test_reset_delta_equals_the_jump(
 
 
 def test_estimate_is_near_groundtruth(streams: dict[str, list[VehicleLocalPosition]]) -> None:
-    """With GPS estimates stay within a few sigma of the groundtruth, whose velocity fits its positions."""
+    """With GPS estimates stay within a few sigma of the groundtruth, whose velocity matches its positions."""
     truth = {message.timestamp: message for message in streams["vehicle_local_position_groundtruth"]}
     for message in streams[VLP]:
         if message.timestamp in truth and not message.dead_reckoning:
@@ -205,7 +205,7 @@ def test_attitude_is_consistent_with_estimate(
             assert thrust * math.sin(roll) == pytest.approx(across, abs=1e-4)
 
 
-def test_global_position_fits_local_position(
+def test_global_position_matches_local_position(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
     """The global position is the projected local position, and valid whenever that is valid."""

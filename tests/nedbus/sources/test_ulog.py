@@ -47,7 +47,7 @@ def test_real_log_is_read_completely_and_exactly(name: str) -> None:
     """Each message of a real log is valid, and each field equals what pyulog reads, bit by bit."""
     path = LOGS / name
     if not path.exists():
-        pytest.skip(f"the real log is not here: {path}")
+        pytest.skip(f"real log not found: {path}")
     total, layout, streams = REAL[name]
     run = open_log(path, "?topics=VehicleLocalPosition")
     assert f"layout {layout}," in run.summary

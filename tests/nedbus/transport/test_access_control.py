@@ -1,4 +1,4 @@
-"""Access control of config/router-secure.json5, verified by received messages, as Zenoh drops denied ones silently."""
+"""Access control of config/router-secure.json5, verified by received messages: Zenoh drops denied ones silently."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
 
 
 def test_message_without_msg_file_is_decoded(join: Join) -> None:
-    """Readers may query vehicles for definitions, also of messages without a .msg file; no topic needs its own rule."""
+    """Readers may query vehicles for any definition, even without a .msg file; no topic needs its own rule."""
     vehicle, reader = join("vehicle-1"), join("reader")
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
@@ -256,7 +256,7 @@ def test_list_hints_at_access_rules_if_a_service_replies(secure: str, pki: Path,
     wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
 
 
-def test_pki_commands_never_overwrite(tmp_path: Path) -> None:
+def test_pki_commands_never_overwrite_keys(tmp_path: Path) -> None:
     """Keys are never overwritten or printed, and are readable by their owner only."""
     folder = tmp_path / "pki"
     assert run_command("pki", "cert", str(folder), "reader").exit_code == 1
@@ -292,7 +292,7 @@ def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Pa
 def test_refused_clients_are_logged(
     run_nedbus: Start, pki: Path, configured: tuple[Path, str], *, command: tuple[str, ...], environment: dict[str, str]
 ) -> None:
-    """The client's error has a remedy, the router's log the reason; other lines of Zenoh's log stay on stdout."""
+    """The client's error names a remedy, the router's log the reason; other Zenoh log lines stay on stdout."""
     file, endpoint = configured
     router = run_nedbus(*command, str(file), **environment)
     wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")

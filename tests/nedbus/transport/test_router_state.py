@@ -108,7 +108,7 @@ def test_embedded_router_reports_its_actual_limit(limited: str) -> None:
 
 @pytest.mark.parametrize("name", ["router.json5", "router-secure.json5"])
 def test_shipped_metadata_repeats_max_sessions(name: str) -> None:
-    """Both shipped files repeat max_sessions in `metadata`, as zenohd reports only that, and have the same sections."""
+    """Both shipped files have the same sections, and repeat max_sessions in `metadata`, as zenohd reports only that."""
     config = zenoh.Config.from_file(CONFIG / name)
     limit = json.loads(config.get_json("transport/unicast/max_sessions"))
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
@@ -192,7 +192,7 @@ def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None
         assert "docs/hosts.md" in finding.advice
 
 
-def test_unknown_session_limit_causes_no_warning(tmp_path: Path) -> None:
+def test_unknown_session_limit_does_not_warn(tmp_path: Path) -> None:
     """The doctor does not warn if `metadata` has no limit, or if the admin space is disabled."""
     where = free_endpoint()
     for metadata in (["a", "list"], "mine"):
@@ -276,7 +276,7 @@ def test_exporter_retries_at_a_full_router(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_exporter_stops_during_an_unanswered_query(limited: str) -> None:
-    """Stopping does not wait for pending replies, as the time to exit after a signal is shorter."""
+    """Stopping does not wait for pending replies, because the exit timeout after a signal is shorter."""
     queries: list[zenoh.Query] = []
     with open_client([limited], timeout=5.0) as silent, nedbus.connect(limited) as bus:
         silent.declare_queryable(f"@/{ZID}/router", queries.append)

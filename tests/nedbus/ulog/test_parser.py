@@ -100,7 +100,7 @@ def test_log_can_be_fed_byte_by_byte() -> None:
 
 @pytest.mark.parametrize("verify", [False, True])
 @pytest.mark.parametrize("size", [1, 16, 64])
-def test_record_of_invalid_type_in_pieces_gives_the_same_records(size: int, verify: bool) -> None:
+def test_record_of_invalid_type_split_across_chunks_is_skipped(size: int, verify: bool) -> None:
     """The rest of a record whose type is no letter is skipped when it arrives, not parsed as records."""
     log = small_log()
     log += b"\x40\0\x01" + small_log()[-0x40:] + small_log()[-200:]
@@ -108,7 +108,7 @@ def test_record_of_invalid_type_in_pieces_gives_the_same_records(size: int, veri
 
 
 @given(st.randoms(use_true_random=False), st.sampled_from(("flip", "cut", "insert")))
-def test_damage_alters_no_message(rng: random.Random, kind: str) -> None:
+def test_damage_does_not_alter_messages(rng: random.Random, kind: str) -> None:
     """Missing and inserted bytes lose messages, but alter none; a flipped bit alters at most its own message."""
     log = small_log(60)
     whole = data_of(parse(log))

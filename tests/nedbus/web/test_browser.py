@@ -204,12 +204,12 @@ def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
     """Wait until there are no problems; fail with those that remain."""
     last: list[str] = []
 
-    def are_none() -> bool:
+    def are_gone() -> bool:
         last[:] = problems()
         return not last
 
     try:
-        wait_for(are_none, what=what, seconds=PAGE_TIMEOUT)
+        wait_for(are_gone, what=what, seconds=PAGE_TIMEOUT)
     except AssertionError:
         pytest.fail(f"{what}: {'; '.join(last)}")
 
@@ -226,7 +226,7 @@ def overlapping_labels(page: Tab) -> list[str]:
 
 
 def test_hostile_text_is_escaped(fly: Fly, tab: Open, zenoh_session: Session, endpoint: str, tmp_path: Path) -> None:
-    """HTML in a peer's rejection reason or in a GeoJSON file is shown as text and creates no element."""
+    """HTML in a peer's rejection reason or in a GeoJSON file is shown as text, not as elements."""
     field = tmp_path / f"{HOSTILE[:24].replace('/', '')}.geojson"
     line = {"type": "LineString", "coordinates": [[8.545, 47.397], [8.546, 47.398]]}
     field.write_text(json.dumps({"type": "Feature", "properties": {"name": HOSTILE}, "geometry": line, "id": HOSTILE}))

@@ -46,7 +46,7 @@ def column(stream: PageStream, name: str) -> list[float]:
 def test_state_follows_the_validity_flags(
     sim: SimulatedFleet, fields: dict[str, Any], grade: str, text: str, description: str
 ) -> None:
-    """A vehicle has the worst state that the flags of its position imply, from the first message on or later."""
+    """A vehicle has the worst state that the flags of its position imply, even in the first message."""
     sim.fly(3, **fields)
     assert (sim.vehicle().grade, sim.vehicle().state.text, sim.view().description) == (grade, text, description)
     sim.fly(3)
@@ -90,7 +90,7 @@ def test_slow_stream_does_not_affect_the_vehicle_state(sim: SimulatedFleet) -> N
     assert sim.vehicle().grade == "ok"
 
 
-def test_overloaded_page_reports_no_vehicle_as_silent(sim: SimulatedFleet) -> None:
+def test_overloaded_page_does_not_report_vehicles_as_silent(sim: SimulatedFleet) -> None:
     """While messages wait in the queue, vehicles keep their state: they become neither silent nor gone."""
     sim.fly(3, WING)
     sim.fly(1, QUAD, xy_valid=False)
@@ -134,7 +134,7 @@ def test_since_is_the_start_of_the_state(sim: SimulatedFleet) -> None:
 
 
 def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:
-    """Without a link vehicles keep their last state, have no current position, and the snapshot has an alarm."""
+    """Without a link vehicles keep their last state, have no current position, and the snapshot contains an alarm."""
     sim.fly(3)
     sim.time += 60
     row = sim.vehicle(alive=[], link="no link to tcp/ground:7447")
@@ -291,7 +291,7 @@ def test_history_has_ten_points_per_second(sim: SimulatedFleet) -> None:
 
 
 @pytest.mark.parametrize("rate", [50, 250])
-def test_changing_ref_timestamp_adds_no_gaps_to_ground_truth(sim: SimulatedFleet, rate: int) -> None:
+def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(sim: SimulatedFleet, rate: int) -> None:
     """PX4's simulators change ref_timestamp of the ground truth with each message, but not its origin.
 
     The history still covers a minute without gaps.
@@ -330,7 +330,7 @@ def test_error_is_measured_at_the_time_of_the_estimate(sim: SimulatedFleet, late
     assert math.isnan(column(sim.stream(), "error")[-1])
 
 
-def test_error_needs_a_common_frame(sim: SimulatedFleet) -> None:
+def test_position_error_requires_a_common_frame(sim: SimulatedFleet) -> None:
     """The error is NaN if only the estimate has a global origin, or if the estimate is invalid."""
     sim.add(GROUND_TRUTH)
     sim.add(**ZURICH)

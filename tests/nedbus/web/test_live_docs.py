@@ -27,7 +27,7 @@ __all__ = ["fly", "peer", "port"]  # fixtures
 PAGE = (Path(__file__).parents[3] / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [line.partition("#")[0].strip() for block in BLOCKS for line in block.splitlines()]
-COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # those need PX4's .msg files
+COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # these need PX4's .msg files
 SERVES, ROS2 = ([each for each in COMMANDS if each.startswith(f"nedbus {name}")] for name in ("serve", "ros2"))
 
 

@@ -154,7 +154,7 @@ def test_cross_site_subresources_are_refused(url: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
 def test_requests_without_websocket_do_not_count_as_viewers(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """Ten requests without a WebSocket do not use up the limit of one page; their pages are limited, too."""
+    """Ten requests without a WebSocket do not use up the limit of one page; their pages are also limited."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for _ in range(10):
         assert status_of(url) == 200
@@ -185,7 +185,7 @@ def test_incomplete_request_times_out(url: str, start: str) -> None:
 
 @pytest.mark.usefixtures("low_limits")
 def test_connections_above_the_limit_are_closed(url: str, caplog: pytest.LogCaptureFixture) -> None:
-    """Connections above the limit are closed at once and logged once; later ones are served."""
+    """Connections above the limit are closed at once and logged once; later connections are served."""
     where = ("127.0.0.1", int(url.rpartition(":")[2]))
     connections = [socket.create_connection(where, DEADLINE) for _ in range(10)]
     wait_for(lambda: "connections reached" in caplog.text, what="the warning")

@@ -105,7 +105,7 @@ def test_incremental_tracks_equal_those_of_a_new_viewer(
 
 
 def data_sent(document: Document) -> list[Any]:
-    """Return a list that collects the data source events a document sends from now on."""
+    """Return a list that collects the data source events that a document sends after this call."""
     sent: list[Any] = []
     document.on_change(
         lambda event: sent.append(event) if isinstance(getattr(event, "model", None), ColumnDataSource) else None
@@ -283,7 +283,7 @@ def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
         assert f"<span>{name}</span><b>{text}</b>" in page.panel("nums")
 
 
-def test_values_of_silent_streams_have_their_age(sim: SimulatedFleet) -> None:
+def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
     """The tiles show the last values of a silent stream or a gone vehicle with their age; the row shows "-"."""
     status, battery = Address("wing", "vehicle_status"), Address("wing", "battery_status", 0)
     for _ in range(50):
@@ -493,7 +493,7 @@ def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
 
 @pytest.mark.parametrize("size", ["340x330", "560x430", "1100x700"])
 def test_labels_do_not_overlap(sim: SimulatedFleet, size: str) -> None:
-    """Of 50 vehicles close together only labels that fit are shown, those of the selected and bad vehicles first."""
+    """With 50 vehicles close together only labels that fit are shown, selected and bad vehicles first."""
     places = {f"uav-{number}": (7.0 * (number // 10), 11.0 * (number % 10)) for number in range(1, 51)}
     for _ in range(5):
         sim.time += 0.1
@@ -543,7 +543,7 @@ def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFlee
 
 
 def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
-    """Of 50 vehicles the selected one and those with faults come first; the last row counts the hidden ones."""
+    """The selected vehicle and those with faults come first; the last row counts the hidden vehicles of the 50."""
     addresses = [Address(f"uav-{number}", VLP) for number in range(1, 51)]
     sim.fly(1, *addresses)
     sim.fly(1, addresses[29], xy_valid=False)
@@ -610,7 +610,7 @@ def event_of(sim: SimulatedFleet, text: str) -> float:
     return next(event.time for event in sim.timeline.events if event.text.startswith(text))
 
 
-def test_tapped_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
+def test_tapped_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """A tapped event pins plots and story to its time until "back to now"; list and map stay current."""
     page = Page(faulty_fleet, query="?vehicle=quad")
     assert (page.pinned, page.url_query) == (None, "?vehicle=quad")
@@ -634,7 +634,7 @@ def test_tapped_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
     assert page.plot_range == pytest.approx((faulty_fleet.time - 60, faulty_fleet.time), abs=0.01)
 
 
-def test_tapped_map_event_shows_its_moment(faulty_fleet: SimulatedFleet) -> None:
+def test_tapped_map_event_pins_plots_to_its_time(faulty_fleet: SimulatedFleet) -> None:
     """An event is marked on the map at the vehicle's position at that time; the mark can be tapped repeatedly."""
     page = Page(faulty_fleet, query="?vehicle=wing")
     source = next(each for each in sources(page) if "marker" in each.data and "row" not in each.data)
@@ -846,7 +846,7 @@ def test_page_follows_published_vehicles(endpoint: str, bus: nedbus.Bus, zenoh_s
 
 
 def test_page_survives_a_router_restart() -> None:
-    """While the router is down, the header has an alarm, markers are open, and states do not change."""
+    """While the router is down, the header shows an alarm, markers are hollow, and states do not change."""
     where = free_endpoint()
     router = open_router(listen=(where,))
     with (

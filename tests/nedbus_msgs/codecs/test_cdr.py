@@ -76,7 +76,7 @@ def as_array(value: object) -> Any:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_payload_size_is_limited_to_px4_trailer(layout: str) -> None:
+def test_payload_longer_than_px4_trailer_is_rejected(layout: str) -> None:
     """PX4's struct size plus 28 bytes is accepted; one byte more, or one less than CDR needs, is rejected."""
     payload = encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout)
     longest = {"1.13": 196, "1.14": 196, "1.15": 212, "V0": 220, "1.16": 220}[layout]

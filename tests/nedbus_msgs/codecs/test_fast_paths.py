@@ -62,7 +62,7 @@ def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
 
 
 def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
-    """Return the reasons for which the model or the encoder rejects these values."""
+    """Return the reasons why the model or the encoder rejects these values."""
     with pytest.raises((ValidationError, InvalidMessageError)) as info:
         encode_values(values)
     if isinstance(info.value, InvalidMessageError):
@@ -181,7 +181,7 @@ def test_row_of_wrong_length_raises(values: list[object]) -> None:
         encode_row(values)
 
 
-class Low(VehicleLocalPosition):
+class StricterPosition(VehicleLocalPosition):
     """A user's subclass with an additional rule."""
 
     @field_validator("z")
@@ -195,9 +195,9 @@ class Low(VehicleLocalPosition):
 def test_subclass_validators_run() -> None:
     """Only the model itself uses the fast path."""
     fields = {name: value for name, value in GOOD.model_dump().items() if name != "z"}
-    assert type(Low(z=-5.0, **fields)) is Low
+    assert type(StricterPosition(z=-5.0, **fields)) is StricterPosition
     with pytest.raises(ValidationError, match="too high"):
-        Low(z=-20.0, **fields)
+        StricterPosition(z=-20.0, **fields)
 
 
 def test_validation_of_dicts_and_json_bypasses_the_constructor() -> None:

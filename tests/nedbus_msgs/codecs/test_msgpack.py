@@ -28,7 +28,7 @@ GOLDEN = json.loads((DATA / "golden.json").read_text())
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_golden_bytes(name: str) -> None:
+def test_payload_equals_golden_bytes(name: str) -> None:
     """These bytes are the wire format; changing them breaks compatibility."""
     message = VehicleLocalPosition.model_validate_json(json.dumps(GOLDEN[name]["message"]))
     payload = bytes.fromhex(GOLDEN[name]["payload"])
@@ -68,7 +68,7 @@ def test_layout_0_is_decoded(message: VehicleLocalPosition) -> None:
 
 
 def test_newer_layout_is_decoded_by_field_names() -> None:
-    """Given the field names of an unknown layout, known fields are decoded and the others ignored."""
+    """Given the field names of an unknown layout, known fields are decoded and all others ignored."""
     names = ["timestamp", "x", "y", "brand_new"]
     payload = msgpack.packb([2, 5, 1.0, 2.0, True])
     with pytest.raises(UnknownLayoutError, match=r"unknown layout 2 with 4 fields \(known: 0, 1\)") as info:
@@ -120,7 +120,7 @@ def test_payload_that_breaks_a_rule_is_rejected() -> None:
 
 
 def test_flipped_bit_has_the_same_effect_in_model_row_and_array() -> None:
-    """A payload with one flipped bit is decoded or rejected alike as a model, as a row and in an array."""
+    """A payload with one flipped bit is decoded, or rejected, identically as a model, as a row and in an array."""
     number = int.from_bytes(REAL[0], "big")
     payloads = [(number ^ 1 << bit).to_bytes(PAYLOAD_SIZE, "big") for bit in range(8 * PAYLOAD_SIZE)]
     array, valid = decode_array(b"".join(payloads))

@@ -76,7 +76,7 @@ def bits(value: object) -> object:
     return tuple(map(bits, value)) if isinstance(value, tuple) else (type(value), repr(value))
 
 
-def test_vectors_of_rosbags_are_decoded_and_encoded_bit_for_bit() -> None:
+def test_rosbags_vectors_round_trip_bit_for_bit() -> None:
     """Each layout of each message is found by its hash, decoded in field order, and encoded to the same bytes."""
     found = set()
     for vector in vectors():
@@ -210,7 +210,7 @@ def test_non_numeric_value_of_a_renamed_field_is_rejected(name: str, older: dict
         codec_of(definition).decode(payload, newer={99: ("timestamp", *older)})
 
 
-def test_layout_is_found_by_field_names_in_any_order() -> None:
+def test_layout_is_identified_by_field_names_in_any_order() -> None:
     """A log has no message version, so field names alone must identify each layout."""
     for definition in MESSAGES.values():
         for layout in definition.layouts.values():
@@ -276,7 +276,7 @@ def test_model_fields_rows_and_arrays_agree(case: tuple[Definition[Any], dict[st
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_golden_bytes(name: str) -> None:
+def test_payload_equals_golden_bytes(name: str) -> None:
     """A message from a real flight (twelve_messages.ulg) must always encode to these bytes."""
     definition, golden = MESSAGES[name], json.loads(GOLDEN.read_text())[name]
     message = definition.model.model_validate_json(json.dumps(golden["fields"]))

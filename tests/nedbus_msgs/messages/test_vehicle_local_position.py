@@ -27,7 +27,7 @@ def rejection(**fields: object) -> str:
 
 
 def test_omitted_field_is_nan_false_or_zero() -> None:
-    """An omitted field holds NaN, false or 0, and is absent from model_fields_set."""
+    """An omitted field is NaN, false or 0, and is absent from model_fields_set."""
     message = VehicleLocalPosition(timestamp=1)
     assert math.isnan(message.x)
     assert all(map(math.isnan, message.delta_xy))
@@ -155,7 +155,7 @@ def test_messages_are_compared_by_value() -> None:
 @pytest.mark.parametrize(
     "fields", [{"x": "nan"}, {"x": "1.0"}, {"timestamp": "NaN"}, {"xy_valid": "NaN"}, {"delta_xy": [1.0]}, {"x": [1.0]}]
 )
-def test_other_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
+def test_unexpected_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
     """The model accepts only the strings and lengths that its own JSON has."""
     with pytest.raises(ValidationError) as info:
         VehicleLocalPosition.model_validate({"timestamp": 1, **fields})

@@ -38,7 +38,7 @@ def test_fixture_matches_px4_page(name: str) -> None:
     assert [[field, kind] for kind, field in rows] == SEEDS[name]["fields"]
 
 
-def test_table_has_the_px4_layouts() -> None:
+def test_layout_table_lists_px4_layouts() -> None:
     """There are five layouts with PX4's field counts, two of them used on the wire, and the table is JSON."""
     table = json.loads(json.dumps(layout_table()))
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
@@ -51,7 +51,7 @@ def test_table_has_the_px4_layouts() -> None:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_layout_is_found_from_names_in_any_order(name: str) -> None:
+def test_layout_is_identified_by_names_in_any_order(name: str) -> None:
     """A ULog sorts fields by size, so field names alone identify the layout."""
     assert find_layout(reversed(LAYOUTS[name].fields)) is LAYOUTS[name]
     assert find_layout(LAYOUTS[name].fields[1:]) is None
@@ -83,7 +83,7 @@ def test_fields_missing_in_an_old_layout_are_not_provided() -> None:
     assert (message.hagl_max_z, message.hagl_max_xy) == (5.0, 5.0)
 
 
-def test_yaw_of_1_11_becomes_heading() -> None:
+def test_yaw_of_px4_1_11_becomes_heading() -> None:
     """In logs up to 1.11, yaw is renamed, unknown fields are ignored, and missing ones are not provided."""
     message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
     assert (message.heading, message.x) == (0.5, 1.0)

@@ -96,12 +96,12 @@ def test_annotations_become_rules() -> None:
     ],
 )
 def test_invalid_msg_file_raises(text: str, reason: str) -> None:
-    """The error has line, column and reason."""
+    """The error states the line, the column and the reason."""
     with pytest.raises(MsgError, match=reason):
         define_msg("Wrong", text)
 
 
-def test_value_for_unknown_survives_float32_rounding() -> None:
+def test_invalid_sentinel_survives_float32_rounding() -> None:
     """The `@invalid` value passes the rules before and after rounding to float32; it may be infinite."""
     text = "uint64 timestamp\nfloat32 a # @range 1, 5 @invalid 0.1\nfloat32 b # @range 1, 5 @invalid inf\n"
     definition = define_msg("Gauge", text)

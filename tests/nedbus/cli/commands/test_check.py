@@ -64,7 +64,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
 
 
 def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
-    """Options and environment variables are still checked; settings that the file may have are not called missing."""
+    """Options and environment variables are still checked; settings possibly in the file are not reported missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
     for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
@@ -76,7 +76,7 @@ def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
 
 
 def test_two_sources_of_one_address_are_a_mistake(tmp_path: Path) -> None:
-    """Two sources must not publish the same address; found for replays and for live sources that name a vehicle."""
+    """Two sources must not publish the same address: checked for replays, and live sources that name a vehicle."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
@@ -112,7 +112,7 @@ def test_router_config_of_settings_is_checked(tmp_path: Path) -> None:
     assert len(check(file)) == 3
 
 
-def test_mistakes_in_source_tables_have_a_position(tmp_path: Path) -> None:
+def test_mistakes_in_source_tables_are_reported_with_line(tmp_path: Path) -> None:
     """An unknown option is reported at its line; a missing log at its table, but not with --offline."""
     file = tmp_path / "nedbus.toml"
     file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
@@ -133,7 +133,9 @@ def test_mistakes_in_source_tables_have_a_position(tmp_path: Path) -> None:
         ("udp/gcs:mavlink", ["is not an endpoint: write PROTOCOL/HOST:PORT"] * 2),
     ],
 )
-def test_invalid_endpoint_in_router_file_has_a_position(tmp_path: Path, endpoint: str, reasons: list[str]) -> None:
+def test_invalid_endpoint_in_router_file_is_reported_with_position(
+    tmp_path: Path, endpoint: str, reasons: list[str]
+) -> None:
     """Every invalid endpoint of a router file is reported with line and column."""
     file = tmp_path / "router.json5"
     file.write_text(
@@ -145,7 +147,7 @@ def test_invalid_endpoint_in_router_file_has_a_position(tmp_path: Path, endpoint
 
 
 def test_router_files_are_parsed_like_zenohd(tmp_path: Path, endpoint: str) -> None:
-    """Syntax errors, unknown keys and missing files are found; the shipped files and a valid setup have no mistake."""
+    """Syntax errors, unknown keys and missing files are reported; the shipped files and a valid setup pass."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
     broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')
     unknown.write_text('{ mode: "router",\n  lisen: {} }\n')
@@ -161,7 +163,7 @@ def test_router_files_are_parsed_like_zenohd(tmp_path: Path, endpoint: str) -> N
 
 
 def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
-    """Certificates of clients and router files that expire within 30 days are reported, later ones are not."""
+    """Certificates of clients and routers are reported only if they expire within 30 days."""
     make_authority(tmp_path / "pki")
     for name, days in (("soon", 20), ("late", 200)):
         make_certificate(tmp_path / "pki", name, days=days)

@@ -96,7 +96,7 @@ def test_events_of_a_file_have_evidence(log: Path) -> None:
 
 @pytest.mark.parametrize(("severity", "count"), [("bad", 2), ("watch", 3), ("info", 6)])
 def test_severity_selects_events(log: Path, severity: str, count: int) -> None:
-    """--severity selects events of this severity and worse ones."""
+    """--severity selects events of this severity or worse."""
     assert len(run_command("events", str(log), "--severity", severity).out.splitlines()) == count
 
 
@@ -181,7 +181,7 @@ def test_why_prints_verdict_and_faults(log: Path) -> None:
 
 
 def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
-    """Without UTC in the log, --at takes seconds since boot or since the start of the recording."""
+    """Without UTC in the log, --at accepts seconds since boot or since the start of the recording."""
     for moment in ("10", "+9"):
         assert run_command("why", str(log), "--at", moment, "--all").out == WHY
     result = run_command("why", str(log), "--at", "6.5").out
@@ -227,7 +227,7 @@ def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
 
 
 def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of more events than the limit, the last ones are shown, and stderr has the total."""
+    """Above the limit only the most recent events are shown, and stderr states the total."""
     monkeypatch.setattr("nedbus.sources.file_events.MAX_FILE_EVENTS", 2000)
     writer = UlogWriter()
     writer.define([VLP])
@@ -298,7 +298,7 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
 def test_why_live_uses_service_history(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path
 ) -> None:
-    """`why` uses the history of a service for all or one vehicle; a vehicle of a script has no history."""
+    """`why` uses the history of a service for all or one vehicle; a vehicle published by a script has no history."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
     result = run_command("why", "-c", endpoint)

@@ -92,7 +92,7 @@ def test_frozen_service_is_not_healthy(run_nedbus: Start, endpoint: str, bus: ne
 
 
 def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
-    """--vehicle checks only that vehicle, also one that a script publishes, and fails if it is not published."""
+    """--vehicle checks only that vehicle, even if a script publishes it, and fails if nothing publishes it."""
     with serving(endpoint, "ulog:/gone.ulg", "sim:") as daemon, bus.publisher(VLP, vehicle="script") as publisher:
         wait_for_state(daemon, "retrying")
         wait_for(lambda: len(bus.vehicles()) == 2, what="both vehicles")
@@ -117,7 +117,7 @@ def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health:
 
 
 def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
-    """--expect requires vehicles by id and --vehicles by number, on any host, including those of scripts."""
+    """--expect requires vehicles by id and --vehicles by number, on any host, even if scripts publish them."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
         wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
         result = health("--expect", "1,7, 8", "--vehicles", "3")
@@ -138,7 +138,7 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
 
 
 def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
-    """--valid checks the current flags, --within past events; stderr has a line per fault, --json has all."""
+    """--valid checks the current flags, --within past events; stderr gets one line per fault, --json lists all."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 60):

@@ -77,7 +77,7 @@ def test_list_shows_published_streams(simulation: str) -> None:
 
 
 def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
-    """--vehicle lists one vehicle, also one without a message yet, and fails for one that is not published."""
+    """--vehicle lists one vehicle, even before its first message, and fails if it is not published."""
     for vehicle, topic in (("1", VLP), ("1", f"{VLP}_groundtruth"), ("2", VLP)):
         bus.publisher(topic, vehicle=vehicle).publish(message(1))
     bus.publisher(VLP, vehicle="silent")
@@ -113,7 +113,7 @@ def test_late_list_is_not_reported_as_empty(
 
 
 def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -> None:
-    """`hz` prints rate, jitter, latency and loss per stream, as a table, JSON or CSV; positions have about 100 Hz."""
+    """`hz` prints rate, jitter, latency and loss per stream, as table, JSON or CSV; positions arrive at 100 Hz."""
     table, csv_form = (run_nedbus("hz", "-c", simulation, "-t", VLP, *form, coverage=False) for form in ([], ["--csv"]))
     measured: list[dict[str, Any]] = []
 
@@ -181,7 +181,7 @@ def test_schema_needs_no_network() -> None:
 def test_no_data_yet_is_reported(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """Without a vehicle `list` reports it and exits, `echo` reports it and waits."""
+    """Without a published vehicle, `list` reports that and exits, and `echo` reports it and waits."""
     listed = run_command("list", "-c", endpoint)
     assert (listed.exit_code, listed.out, "no vehicle is published" in listed.err) == (0, "", True)
     notice = follow.write_notice
@@ -221,7 +221,7 @@ def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.Mo
     assert len(ended.err.splitlines()) == 1
 
 
-def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
+def test_wait_option_waits_for_a_router(run_nedbus: Start) -> None:
     """--wait makes a command wait until a router is started."""
     where = free_endpoint()
     echo = run_nedbus("echo", "-c", where, "--wait", "-n", "3")
@@ -272,7 +272,7 @@ def test_invalid_option_exits_with_2(endpoint: str, arguments: list[str], text: 
     [["web", "--listen", "127.0.0.1:0"], ["export", "--listen", "127.0.0.1:0"], ["foxglove", "--port", "0"]],
     ids=" ".join,
 )
-def test_http_option_is_the_same_for_all_commands(endpoint: str, arguments: list[str]) -> None:
+def test_http_option_is_identical_in_all_commands(endpoint: str, arguments: list[str]) -> None:
     """Every command that serves HTTP or a WebSocket has --http, and validates it before it connects."""
     assert run_command(*arguments, NEDBUS_CONNECT=endpoint).exit_code == 2
     wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=free_endpoint())
@@ -280,7 +280,7 @@ def test_http_option_is_the_same_for_all_commands(endpoint: str, arguments: list
     assert "--http: '8765' is not an address: write HOST:PORT" in wrong.err
 
 
-def test_version_and_help(run_nedbus: Start) -> None:
+def test_version_and_help_are_printed(run_nedbus: Start) -> None:
     """--version prints the package's version, with and without the fast path; --help lists every command."""
     version = run_nedbus("--version")
     assert version.wait() == 0

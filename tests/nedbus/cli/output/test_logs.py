@@ -39,7 +39,7 @@ VEHICLES = 2 * BURST + 10
 
 
 def record(text: str = "%s is stale", *args: object, event: str | None = "stale", **more: object) -> logging.LogRecord:
-    """Return a record like that of a log call in a service."""
+    """Return a log record as a log call in a service creates it."""
     warning = {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": args}
     return logging.makeLogRecord(warning | (about(event) if event else {}) | more)
 
@@ -82,7 +82,7 @@ def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
 
 
 def test_log_calls_use_exactly_the_documented_events() -> None:
-    """Every log call above DEBUG has an event of the table EVENTS, and every event of the table is used."""
+    """Every log call above DEBUG uses an event from the table EVENTS, and every event in the table is used."""
     used: set[str] = set()
     for path, text in ((path, path.read_text()) for path in sorted(SERVICE.rglob("*.py"))):
         tree = ast.parse(text if "_log." in text else "")
@@ -135,7 +135,7 @@ def test_json_traceback_is_one_string() -> None:
 
 
 def test_journal_lines_have_syslog_priorities() -> None:
-    """Each line, also of a traceback, has a syslog priority: 3 for errors to 7 for debug."""
+    """Each line, including those of a traceback, has a syslog priority: 3 for errors to 7 for debug."""
     formatter = JournalFormatter(TextFormatter("%(message)s"))
     assert formatter.format(record("%s\nforged", "x")) == "<4>x\\nforged"
     for level, number in ((logging.DEBUG, 7), (logging.INFO, 6), (logging.ERROR, 3), (logging.CRITICAL, 3)):
@@ -310,7 +310,7 @@ def count_lines(text: str, elapsed: float) -> Counter[str]:
 
 
 def test_flood_of_invalid_payloads_is_rate_limited(run_nedbus: Start, endpoint: str, zenoh_session: Session) -> None:
-    """Invalid payloads under ever new keys make a subscriber log a few lines and a count."""
+    """A flood of invalid payloads with changing keys makes a subscriber log only a few lines and a count."""
     start = time.monotonic()
     echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint, coverage=False)
     wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")

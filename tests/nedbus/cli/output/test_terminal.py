@@ -71,7 +71,7 @@ def test_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) ->
     assert (ROWS[0][0] in shown) == (width >= 60)
 
 
-def test_table_without_rows_is_its_header() -> None:
+def test_table_without_rows_prints_only_its_header() -> None:
     """Before the first message a table is only its header."""
     assert to_table(HEAD, [], optional=OPTIONAL).split() == list(HEAD)
 
@@ -182,7 +182,7 @@ def on_terminal(fork_server: ForkServer) -> OnTerminal:
 
 @contextmanager
 def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
-    """Publish topics of vehicles on the ground."""
+    """Publish topics of landed vehicles."""
     publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
 
     def publish() -> None:
@@ -296,7 +296,7 @@ def states(lines: str) -> list[str]:
     return [json.loads(line)["state"] for line in lines.splitlines() if line.endswith("}")]
 
 
-def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_streams_of_killed_service_are_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """`hz` reports a stream whose service was killed as "gone", once."""
     service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="data")
@@ -369,7 +369,7 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
 
 
 def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
-    """For 100 vehicles `hz` prints 50 rows a second and the number of the others."""
+    """For 100 vehicles `hz` prints 50 rows per second, and the number of omitted vehicles."""
     with publishing(bus, *(f"flood-{number}" for number in range(100))):
         hz = run_command("hz", "-c", endpoint, "-n", "1000")  # each vehicle has sent by then
     assert hz.exit_code == 0

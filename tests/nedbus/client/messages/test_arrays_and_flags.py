@@ -143,7 +143,7 @@ def test_batch_has_one_message_type(subscription: nedbus.Subscription[Any], bus:
 
 @BOTH
 def test_max_rate_downsamples(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
-    """Of 1 s at 100 Hz, `max_rate=10` delivers ten messages, evenly spaced and unchanged."""
+    """`max_rate=10` delivers ten messages of one second at 100 Hz, evenly spaced and unchanged."""
     publisher = publisher_of(bus, address)
     publisher.publish(make(address, 0))
     subscription = client.subscribe(address.topic, mode="every", max_rate=10)

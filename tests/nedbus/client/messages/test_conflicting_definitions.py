@@ -235,7 +235,7 @@ def test_definition_with_wrong_hash_is_ignored(client: nedbus.Bus, zenoh_session
         wait_for(is_rejected, what="the message to be rejected")
 
 
-def test_unresponsive_publisher_delays_no_reader(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_unresponsive_publisher_does_not_delay_readers(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
     """A message is read once one publisher has sent its definition, even if another one does not reply."""
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))

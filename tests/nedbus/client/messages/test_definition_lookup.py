@@ -27,7 +27,7 @@ COUNT = 500
 def test_message_with_queried_definition_is_read_completely(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
-    """No message is lost during the lookup of its definition, in any form; the values are those of the log."""
+    """No message is lost during the lookup of its definition, in any form; the values equal the log's."""
     log = write_wheels(tmp_path / "rover.ulg", COUNT)
     with bus.subscribe("wheel_encoders", mode="every") as subscription:
         run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
@@ -66,7 +66,7 @@ def test_message_with_queried_definition_is_read_completely(
         {"fields": []},
     ],
 )
-def test_hostile_definition_affects_no_other_stream(
+def test_hostile_definition_does_not_affect_other_streams(
     client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session, answer: bytes | dict[str, Any]
 ) -> None:
     """If a peer replies with an invalid definition, only its own message is invalid."""
@@ -123,7 +123,7 @@ def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.B
 def test_encoding_without_name_and_hash_is_invalid(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log has the reason."""
+    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log states why."""
     with client.subscribe("wheel_encoders") as subscription:
         wait_for_matching(zenoh_session, "nedbus/7/wheel_encoders")
         zenoh_session.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")

@@ -129,7 +129,7 @@ def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
 @pytest.mark.slow
 @each_flight
 def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
-    """A replay delivers all messages that the arrays have, and rejects the known invalid ones."""
+    """A replay delivers all messages in the arrays, and rejects those known to be invalid."""
     run = open_replay(f"ulog:{flight}?topics=*")
     arrays = nedbus.read(flight, ["*"])
     messages: dict[str, list[Any]] = {}
@@ -192,7 +192,7 @@ def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None
 
 
 @each_flight
-def test_utc_is_found_in_a_log(flight: Path) -> None:
+def test_utc_is_derived_from_a_log(flight: Path) -> None:
     """UTC comes from GNSS, a companion computer's clock or the log's information messages; otherwise it is None."""
     found = nedbus.utc_of(flight)
     source_and_time = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")

@@ -111,7 +111,7 @@ class FakeSession:
         self.schedule(until, lambda: setattr(reader, "alive", True))
 
     def restart_router(self, reader: Reader, at: float, *, until: float) -> None:
-        """Break the link of the publisher for a second, and that of a reader for longer."""
+        """Break the publisher's link for a second, and a reader's link for longer."""
         self.cut(reader, at, until=until)
         self.schedule(at, self.routers.clear)
         self.schedule(at + 1.0, lambda: self.routers.append("r2"))

@@ -46,7 +46,7 @@ def test_publisher_without_readers_never_waits(
     assert session.now == pytest.approx(1.0)
 
 
-def test_fast_reader_causes_no_wait(session: FakeSession, control: FlowControl) -> None:
+def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
     """An acknowledgement of the last message is requested every 250 messages, one at a time."""
     session.readers.append(Reader("fast"))
     session.publish(control, 10_000)
@@ -128,7 +128,7 @@ def test_slow_reader_leaves_others_ten_messages_per_second(session: FakeSession,
     assert session.longest_pause() < 0.2
 
 
-def test_closed_reader_causes_no_wait(session: FakeSession, control: FlowControl) -> None:
+def test_closed_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
     """A closing reader acknowledges the open request, and the publisher continues."""
     reader = Reader("stuck", rate=0.0)
     session.readers += [reader, Reader("fast")]
@@ -229,7 +229,7 @@ def test_publisher_waits_for_a_suspended_reader(
 def test_reader_suspended_while_replying_is_recognized(
     session: FakeSession, control: FlowControl, others: list[str], back: float
 ) -> None:
-    """Once a reader that was suspended while replying returns, the publisher waits for no unknown reader."""
+    """A reader suspended while replying is recognized on return: the publisher does not wait for an unknown one."""
     reader = Reader("back", stops_in_answer=True)
     session.readers += [reader, *map(Reader, others)]
     session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))

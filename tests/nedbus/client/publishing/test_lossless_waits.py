@@ -69,7 +69,7 @@ async def waiting_publishers(bus: nedbus.AsyncBus, number: int) -> AsyncIterator
 
 
 @pytest.mark.usefixtures("stuck")
-def test_waiting_publishers_delay_no_query(endpoint: str) -> None:
+def test_waiting_publishers_do_not_delay_queries(endpoint: str) -> None:
     """`latest` and a subscription work while 40 publishers wait for a reader, more than there are threads for queries.
 
     Cancelling the waits frees their threads, and an error in the block closes the bus without waiting.
@@ -140,7 +140,7 @@ def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Se
 
 
 def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """A `with` block that ends with an exception, such as Ctrl-C, waits for no reader."""
+    """A `with` block that ends with an exception, such as Ctrl-C, does not wait for readers."""
     queries: list[zenoh.Query] = []
     silent = answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append)
     with silent, suppress(RuntimeError), client.publisher(VLP, vehicle="1", lossless=True) as publisher:
@@ -165,7 +165,7 @@ def test_close_returns_after_its_timeout(client: nedbus.Bus, zenoh_session: Sess
 
 
 @pytest.mark.parametrize("whole_bus", [False, True])
-def test_ctrl_c_during_close_closes(endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool) -> None:
+def test_ctrl_c_during_close_ends_the_wait(endpoint: str, monkeypatch: pytest.MonkeyPatch, whole_bus: bool) -> None:
     """Ctrl-C during a close ends the wait for readers and closes everything."""
 
     def interrupt(*_: object) -> bool:
@@ -234,7 +234,7 @@ def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: p
     assert bool(flushed) is not fails
 
 
-def test_lossless_publisher_loses_nothing_in_a_router_restart() -> None:
+def test_lossless_publisher_loses_nothing_during_a_router_restart() -> None:
     """Without a router, a lossless publisher sends no more than its history cache, and continues with its reader."""
     endpoint, count = free_endpoint(), CACHE + 1000
     router = open_router(listen=(endpoint,))

@@ -1,4 +1,4 @@
-"""Slow, stuck, suspended and killed readers: they delay no other reader, and all losses are counted."""
+"""Slow, stuck, suspended and killed readers: they do not delay other readers, and all losses are counted."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_stuck_reader_slows_down_a_replay_without_losses(
 def test_suspended_reader_gets_all_messages(
     start: Start, endpoint: str, bus: nedbus.Bus, timings: Timings, *, when: str, lease: int
 ) -> None:
-    """A reader suspended (SIGSTOP) until its lease has expired, after 5 s or here 1 s, loses nothing."""
+    """A reader suspended (SIGSTOP) until its lease expires (normally 5 s, in this test also 1 s) loses nothing."""
     assert timings.lease == 5
     begin = time.monotonic()
     timings.lease = lease

@@ -80,7 +80,7 @@ def stream(monkeypatch: pytest.MonkeyPatch) -> Stream:
 
 @pytest.mark.parametrize("rate", [5, 7, 50, 400])
 def test_busy_stream_sends_no_heartbeats(stream: Stream, rate: int) -> None:
-    """A stream of 5 Hz or more needs no heartbeats: its next message reveals losses; nor does an unused stream."""
+    """A stream of 5 Hz or more needs no heartbeats, because its next message reveals losses; an unused one neither."""
     assert stream.wait(10.0) == []
     for _ in range(20 * rate):
         stream.publish()

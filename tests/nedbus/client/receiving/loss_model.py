@@ -22,7 +22,7 @@ UNLIMITED: Final = 100_000
 """More messages than any run of a publisher sends."""
 
 
-class Setting(NamedTuple):
+class InitialState(NamedTuple):
     """The initial state of a simulation.
 
     `caches`: size of each publisher's history cache. `capacity`: of the queue. Both in messages.
@@ -49,7 +49,7 @@ class ReceivePath(Protocol):
     `read`: the timestamps of one or more messages, and the reported losses.
     """
 
-    def __init__(self, setting: Setting) -> None: ...
+    def __init__(self, setting: InitialState) -> None: ...
     def put(self, batch: Sequence[RawSample], *, overflowed: bool) -> None: ...
     def heartbeat(self, key: str, publisher: str, number: int) -> None: ...
     def link(self, *, broken: bool) -> None: ...
@@ -65,7 +65,7 @@ class ReceivePath(Protocol):
 class QueueReceivePath(PendingQueue):
     """The receive path of PendingQueue, with a fake clock."""
 
-    def __init__(self, setting: Setting) -> None:
+    def __init__(self, setting: InitialState) -> None:
         self._now, self._since_link = 0.0, 0.0
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # time passes only between steps
@@ -147,7 +147,7 @@ class Simulation:
     Each public method is a step; positions wrap around.
     """
 
-    def __init__(self, setting: Setting, path: ReceivePath) -> None:
+    def __init__(self, setting: InitialState, path: ReceivePath) -> None:
         self.setting, self.path = setting, path
         self.in_flight: list[tuple[PublisherRun, int]] = []
         self.open_requests: list[Request] = []

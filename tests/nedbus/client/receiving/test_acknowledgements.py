@@ -89,7 +89,7 @@ def test_number_of_open_requests_is_bounded(reader: AcknowledgingReader) -> None
 
 
 def test_reception_is_acknowledged_at_once(reader: AcknowledgingReader) -> None:
-    """A request without `read`, such as that of a flush, is acknowledged once its message is queued, even if unread."""
+    """A request without `read`, such as a flush, is acknowledged once its message is queued, even if unread."""
     reader.put(raw(0))
     assert reader.request(0) == ["0"]
     assert reader.request(1) == ["0"]

@@ -80,7 +80,7 @@ def test_mode_latest_keeps_samples_of_quiet_vehicles(
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_unread_subscription_delays_no_other_reader(
+def test_unread_subscription_does_not_delay_other_readers(
     client: nedbus.Bus, endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, mode: Mode
 ) -> None:
     """A full subscription delays neither other subscriptions of any bus, nor queries, nor its own close."""
@@ -203,7 +203,7 @@ def test_long_invalid_keys_are_not_kept(
     assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [True]
 
 
-def test_newer_layout_is_looked_up(
+def test_newer_layout_is_looked_up_once(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An unknown layout is looked up once; its messages are invalid until then, and unknown fields are logged once."""
@@ -230,7 +230,7 @@ def test_newer_layout_is_looked_up(
 
 
 def test_last_message_of_a_newer_layout_is_decoded(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """A query for last messages waits for the lookup of a layout that is not installed here."""
+    """A query for last messages waits for the lookup of a layout that is not installed locally."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)
@@ -253,8 +253,10 @@ def test_messages_of_a_malformed_layout_are_invalid(bus: nedbus.Bus, zenoh_sessi
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_peer_that_never_replies_delays_no_other_stream(bus: nedbus.Bus, zenoh_session: Session, mode: Mode) -> None:
-    """A peer that sends unknown layouts and leaves lookups unanswered delays no other stream, and is queried once."""
+def test_peer_that_never_replies_does_not_delay_other_streams(
+    bus: nedbus.Bus, zenoh_session: Session, mode: Mode
+) -> None:
+    """A peer that sends unknown layouts but answers no lookup is queried once, and does not delay other streams."""
     held = zenoh_session.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(VLP, mode=mode)

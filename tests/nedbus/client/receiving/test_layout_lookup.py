@@ -43,7 +43,7 @@ def test_failed_layout_lookups_back_off() -> None:
 
 
 def test_only_requested_layouts_are_stored() -> None:
-    """Of thousands of layouts in a reply, only the requested ones are stored, up to a limit."""
+    """Only the requested layouts in a reply with thousands are stored, up to a limit."""
     fields = {"timestamp": "uint64", "x": "float32"}
     known: Schemas = {("VehicleLocalPosition", number): fields for number in range(9, 2000)}
     lookup = LayoutLookup(lambda _: known)
@@ -105,7 +105,7 @@ def test_requests_during_a_lookup_are_queried_next() -> None:
 def test_wait_for_unanswered_lookups_is_bounded() -> None:
     """A peer that invents definitions makes readers wait for 3 s in total, then for a tenth of the time.
 
-    Definitions of other peers are found, and memory for failed lookups is bounded.
+    Definitions from other peers are still looked up, and memory for failed lookups is bounded.
     """
 
     def find(schema_ids: Collection[SchemaId]) -> Schemas:
@@ -124,7 +124,7 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
 
 
 def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """The fields of all definitions are bounded; further ones are rejected, and logged once.
+    """The fields of all definitions are bounded; additional ones are rejected, and logged once.
 
     Definitions no longer in use are evicted, least recently used first.
     """

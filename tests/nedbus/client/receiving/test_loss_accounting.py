@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition,
 
 from nedbus import Mode
 
-from .loss_model import UNLIMITED, QueueReceivePath, Setting, Simulation
+from .loss_model import UNLIMITED, InitialState, QueueReceivePath, Simulation
 
 SLOT, POSITION, COUNT, FLAG = st.integers(0, 2), st.integers(0, 40), st.integers(1, 12), st.integers(0, 1)
 MISSING = st.sampled_from([0, 0, -1]) | st.integers(0, 255)
@@ -37,7 +37,7 @@ class LossMachine(RuleBasedStateMachine):
         capacity=st.sampled_from([UNLIMITED, UNLIMITED, 16]),
     )
     def begin(self, mode: Mode, caches: list[int], capacity: int) -> None:
-        setting = Setting(mode, tuple(caches), capacity)
+        setting = InitialState(mode, tuple(caches), capacity)
         self.simulation = Simulation(setting, QueueReceivePath(setting))
 
     publish = step("publish", SLOT, COUNT, FLAG)
@@ -63,26 +63,26 @@ TestLossAccounting.settings = settings(stateful_step_count=40, phases=set(Phase)
 
 SEEDS = [
     # 0 arrives twice, and was read twice.
-    (Setting("latest"), "publish 0 1, delay 0 1 1, deliver 2"),
+    (InitialState("latest"), "publish 0 1, delay 0 1 1, deliver 2"),
     # 0 replaces 1, which is newer.
-    (Setting("latest"), "publish 0 2, delay 0 1, deliver 2"),
+    (InitialState("latest"), "publish 0 2, delay 0 1, deliver 2"),
     # 1 counts as lost before it arrives.
-    (Setting("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
+    (InitialState("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
     # 1 and 2 are requested, only 2 arrives: 1 is not requested again, and lost.
-    (Setting(), "publish 0 4, deliver 1, drop 0 2, deliver 1, answer 0 1 0"),
+    (InitialState(), "publish 0 4, deliver 1, drop 0 2, deliver 1, answer 0 1 0"),
     # The first run has sent 0 to 5: 6 of the second run was mistaken for its 6, read before 0 to 5, and read again.
-    (Setting(), "publish 0 6, deliver 6, link 1, restart 0, publish 0 8, drop 0 6, deliver 2"),
+    (InitialState(), "publish 0 6, deliver 6, link 1, restart 0, publish 0 8, drop 0 6, deliver 2"),
     # 1 is requested and 2 announced by a heartbeat when the publisher disappears: 1 is lost, 2 is not counted.
-    (Setting(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),
+    (InitialState(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),
     # The cache has 2 to 4, then 3 to 5: 1 is lost, and 5 is still requested.
-    (Setting(caches=(3,)), "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1"),
+    (InitialState(caches=(3,)), "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1"),
     # 1 and 3 are missing, and the cache has 3 to 5: 2, which has arrived, is not skipped.
-    (Setting(caches=(3,)), "publish 0 6, deliver 1, drop 0 1, drop 1 1"),
+    (InitialState(caches=(3,)), "publish 0 6, deliver 1, drop 0 1, drop 1 1"),
 ]
 
 
 @pytest.mark.parametrize(("setting", "steps"), SEEDS)
-def test_invariants_hold_after_steps_that_found_bugs(setting: Setting, steps: str) -> None:
+def test_invariants_hold_after_steps_that_found_bugs(setting: InitialState, steps: str) -> None:
     """All invariants hold after step sequences that found a bug in an earlier receive path."""
     simulation = Simulation(setting, QueueReceivePath(setting))
     for name, *arguments in map(str.split, f"{steps}, settle".split(", ")):

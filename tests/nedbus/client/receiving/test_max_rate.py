@@ -144,7 +144,7 @@ def test_slower_stream_passes_completely(rate: float) -> None:
 
 @given(st.lists(st.floats(-0.09, 0.09), min_size=50, max_size=50))
 def test_jitter_omits_at_most_one_message(jitter: list[float]) -> None:
-    """Of a stream at exactly the rate, with a jitter of half a period, at most one message is omitted."""
+    """A stream at exactly the rate, with a jitter of half a period, loses at most one message."""
     times = [number / 5 + late for number, late in enumerate(jitter)]
     assert len(passed(5, times)) >= len(times) - 1
 

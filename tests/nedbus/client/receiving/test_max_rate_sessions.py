@@ -1,6 +1,6 @@
 """A subscription with a maximum rate, through a real router: messages, bytes on the link, and counts.
 
-Publishers downsample by a fake clock, 10 ms per message, at any speed of the machine.
+Publishers use a fake clock, 10 ms per message, so the speed of the machine does not matter.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ BOTH: list[Mode] = ["latest", "every"]
 def test_requested_rate_is_received(
     client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, mode: Mode, max_rate: float
 ) -> None:
-    """Of 10 s at 100 Hz, the requested rate is received, evenly spaced; omitted messages do not count as lost."""
+    """A 100 Hz stream arrives evenly at the requested rate for 10 s; omitted messages do not count as lost."""
     step = rate_step(max_rate)
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
@@ -102,7 +102,7 @@ def test_downsampled_messages_are_unchanged(bus: nedbus.Bus, clock: Clock) -> No
 
 
 def test_publish_many_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
-    """Of the messages of one `publish_many`, sent at one time of the clock, one passes."""
+    """One message of each `publish_many` passes, because all are sent at the same clock time."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with bus.subscribe(VLP, mode="every", max_rate=5) as subscription:
@@ -167,7 +167,7 @@ def test_closed_publishers_leave_no_listeners(bus: nedbus.Bus, clock: Clock) -> 
 
 
 def test_last_messages_of_a_storage_are_ignored(bus: nedbus.Bus, zenoh_session: Session, clock: Clock) -> None:
-    """A subscription with a maximum rate starts with the last messages of publishers, not with those of a storage."""
+    """A subscription with a maximum rate starts with the last messages of publishers, not of a storage."""
     stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=zenoh_session.new_timestamp())
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
@@ -255,7 +255,7 @@ def test_lossless_publisher_does_not_wait_for_downsampling_reader(endpoint: str,
 
 @pytest.mark.parametrize(("mode", "slow_end"), [("latest", "reader"), ("every", "vehicle")])
 def test_slow_link_carries_the_requested_rate_only(endpoint: str, clock: Clock, mode: Mode, slow_end: str) -> None:
-    """At 5 Hz, a 100 Hz stream needs less than 5 kB/s on the link of the reader, and on that of the vehicle."""
+    """At 5 Hz, a 100 Hz stream needs less than 5 kB/s on each link, the reader's and the vehicle's."""
     with closing(Link(endpoint)) as link:
         near, far = (link.endpoint, endpoint) if slow_end == "reader" else (endpoint, link.endpoint)
         with nedbus.connect(far) as vehicle, nedbus.connect(near) as reader:

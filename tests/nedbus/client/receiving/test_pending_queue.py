@@ -115,7 +115,7 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogC
 
 
 def test_memory_for_invented_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader keeps the state of at most 10,000 keys, here 10; messages on further keys arrive."""
+    """A reader keeps the state of at most 10,000 keys, here 10; messages on additional keys still arrive."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_KEYS", 10)
     pending_queue = make_queue("every")
     tracemalloc.start()
@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 2,000 vehicles that appear and disappear, eight at a time, those of the last ten minutes stay in memory.
+    """2,000 vehicles appear and disappear, eight at a time; only those of the last ten minutes stay in memory.
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
@@ -202,7 +202,7 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
     assert set(measured.values()) == {2}
 
 
-def test_loss_of_a_long_outage_is_counted() -> None:
+def test_losses_during_a_long_outage_are_counted() -> None:
     """Messages lost in an outage of an hour are counted, even if other vehicles appeared in that time."""
     now = [0.0]
     pending_queue = make_queue("latest", clock=lambda: now[0])
@@ -237,7 +237,7 @@ def test_wait_ends_with_sample_wake_end_or_timeout() -> None:
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
+def small_queue(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
     """Return a queue of mode `every` for 10 samples, of which 4 stay attached to their receive buffer."""
     monkeypatch.setattr(module, "CAPACITY", 10)
     monkeypatch.setattr(module, "_MAX_FRESH", 4)
@@ -245,41 +245,44 @@ def small(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
 
 
 def test_oldest_samples_are_dropped_counted_and_logged_once(
-    small: PendingQueue, caplog: pytest.LogCaptureFixture
+    small_queue: PendingQueue, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A full queue drops the oldest samples, which count as dropped, not as lost, and are logged once."""
     assert CAPACITY == 65_536
     for start in range(0, 40, 10):
-        assert (small.counts, len(caplog.messages)) == (Counts(dropped=max(0, start - 10)), start > 10)
-        put(small, [raw(number, timestamp=number + 1) for number in range(start, start + 10)])
-    samples = drain(small)
+        assert (small_queue.counts, len(caplog.messages)) == (Counts(dropped=max(0, start - 10)), start > 10)
+        put(small_queue, [raw(number, timestamp=number + 1) for number in range(start, start + 10)])
+    samples = drain(small_queue)
     assert [(sample.message.timestamp, sample.lost) for sample in samples] == [(each, 0) for each in range(31, 41)]
-    assert small.counts == Counts(received=10, dropped=30)
+    assert small_queue.counts == Counts(received=10, dropped=30)
     assert caplog.messages == ["queue: the reader is slower than the data: messages are dropped"]
 
 
-def test_losses_before_dropped_samples_are_reported_later(small: PendingQueue) -> None:
+def test_losses_before_dropped_samples_are_reported_later(small_queue: PendingQueue) -> None:
     """A loss in transit is reported by a later sample of the key if the sample after the gap was dropped."""
-    put(small, [raw(0), raw(3), raw(0, key=OTHER_KEY, publisher="b"), raw(2, key=OTHER_KEY, publisher="b"), raw(5)])
-    put(small, [raw(number) for number in range(6, 15)])
-    put(small, [raw(3, key=OTHER_KEY, publisher="b")])
-    samples = drain(small)
+    put(
+        small_queue,
+        [raw(0), raw(3), raw(0, key=OTHER_KEY, publisher="b"), raw(2, key=OTHER_KEY, publisher="b"), raw(5)],
+    )
+    put(small_queue, [raw(number) for number in range(6, 15)])
+    put(small_queue, [raw(3, key=OTHER_KEY, publisher="b")])
+    samples = drain(small_queue)
     assert [(sample.vehicle, sample.lost) for sample in samples if sample.lost] == [("1", 3), ("2", 1)]
     assert samples[-1].vehicle == "2"
-    assert small.counts == Counts(received=10, lost=4, dropped=5)
+    assert small_queue.counts == Counts(received=10, lost=4, dropped=5)
 
 
-def test_losses_before_a_dropped_sample_survive_invalid_ones(small: PendingQueue) -> None:
+def test_losses_before_a_dropped_sample_survive_invalid_ones(small_queue: PendingQueue) -> None:
     """Losses before dropped and invalid samples are reported by the next valid sample of the key."""
-    put(small, [raw(0), raw(3)])
-    put(small, [raw(number, payload=INVALID) for number in range(4, 13)])
-    put(small, [raw(13)])
-    assert [sample.lost for sample in drain(small)] == [2]
-    assert small.counts == Counts(received=1, lost=2, dropped=2, invalid=9)
+    put(small_queue, [raw(0), raw(3)])
+    put(small_queue, [raw(number, payload=INVALID) for number in range(4, 13)])
+    put(small_queue, [raw(13)])
+    assert [sample.lost for sample in drain(small_queue)] == [2]
+    assert small_queue.counts == Counts(received=1, lost=2, dropped=2, invalid=9)
 
 
 @pytest.mark.parametrize("in_batches", [False, True])
-def test_waiting_samples_release_their_receive_buffer(small: PendingQueue, in_batches: bool) -> None:
+def test_waiting_samples_release_their_receive_buffer(small_queue: PendingQueue, in_batches: bool) -> None:
     """A Zenoh sample keeps its receive buffer alive, so samples deep in the queue are detached from it.
 
     They keep their sequence number, timestamp and provenance.
@@ -288,15 +291,15 @@ def test_waiting_samples_release_their_receive_buffer(small: PendingQueue, in_ba
     arriving = [raw(number, stamp=STAMP if number % 2 else None, encoding=encodings[number]) for number in range(9)]
     arrived = [weakref.ref(each) for each in arriving]
     while arriving:
-        put(small, [arriving.pop(0)])
+        put(small_queue, [arriving.pop(0)])
     assert [each() is None for each in arrived] == [False] * 5 + [True] * 4
     if in_batches:
-        batch = small.pop_batch()
+        batch = small_queue.pop_batch()
         assert batch is not None
         assert batch.sequence.tolist() == list(range(9))
         sent, provenances = batch.sent.tolist(), list(batch.provenances)
     else:
-        samples = drain(small)
+        samples = drain(small_queue)
         sent, provenances = [sample.sent or 0 for sample in samples], [sample.provenance for sample in samples]
     assert sent == [STAMP.get_time_as_ntp64().as_nanos() if number % 2 else 0 for number in range(9)]
     assert [(each.source, len(each.missing)) for each in provenances] == [(f"source{each}", 52) for each in range(9)]
@@ -317,13 +320,13 @@ def test_stream_keeps_no_receive_buffer(mode: Mode) -> None:
     assert reference() is None
 
 
-def test_long_encodings_are_truncated(small: PendingQueue) -> None:
-    """Of a long encoding, waiting samples keep at most 512 characters."""
+def test_long_encodings_are_truncated(small_queue: PendingQueue) -> None:
+    """Queued samples keep at most 512 characters of a long encoding."""
     for number in range(9):
-        put(small, [raw(number, encoding=SOURCE + number * 10_000 * "x")])
-    encodings = [arrival[2].encoding for arrival in small._every]
+        put(small_queue, [raw(number, encoding=SOURCE + number * 10_000 * "x")])
+    encodings = [arrival[2].encoding for arrival in small_queue._every]
     assert all(len(str(encoding)) <= 512 for encoding in encodings[5:])
-    assert len(drain(small)) == 9
+    assert len(drain(small_queue)) == 9
 
 
 def test_gaps_of_a_full_ring_count_as_dropped(caplog: pytest.LogCaptureFixture) -> None:

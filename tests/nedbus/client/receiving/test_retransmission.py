@@ -192,7 +192,7 @@ def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, zenoh_session
     "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
 )
 def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, entity: str) -> None:
-    """A malformed heartbeat causes no request and prevents no other one."""
+    """A malformed heartbeat neither causes a request nor prevents a later one."""
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
     lossy.queue.missing = {1}
@@ -204,7 +204,7 @@ def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, 
     assert not lossy.queue.counters.requesting
 
 
-def test_unanswered_requests_delay_no_others(lossy: Lossy, zenoh_session: Session) -> None:
+def test_unanswered_requests_do_not_delay_others(lossy: Lossy, zenoh_session: Session) -> None:
     """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"

@@ -1,6 +1,6 @@
 """Simulated MAVLink 2 vehicle for tests: a process that sends the streams of a PX4 over UDP, with values from a file.
 
-Each position sent is a JSON line on stdout with its float32 values; the last line has the number of dropped packets.
+Each position sent is a JSON line on stdout with its float32 values; the last line is the number of dropped packets.
 The same arguments produce the same packets in the same order; commands are not answered.
 Unlike PX4, it sends GLOBAL_POSITION_INT (the heading) even without an origin, and repeats GPS_GLOBAL_ORIGIN.
 """

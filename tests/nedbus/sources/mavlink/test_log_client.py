@@ -27,7 +27,7 @@ StateAndReason = tuple[LogState, LogReason | None]
 
 
 class Session:
-    """A client, a hand-driven vehicle, the commands sent, and each state with its reason."""
+    """A client, a manually stepped vehicle, the commands sent, and each state with its reason."""
 
     def __init__(self, *log: Log, armed: bool = False, autopilot: int = PX4) -> None:
         self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
@@ -233,7 +233,7 @@ class TestOwnership:
         assert set(session.commands) == {"start"}
         assert session.client.status.state == "stopped"
 
-    def test_owner_of_stream_is_named(self, session: Session) -> None:
+    def test_owner_of_stream_is_reported(self, session: Session) -> None:
         """Data on the same link reveals the ids of the client that owns the stream."""
         session.wait(0.1)
         session.answer(START, REJECTED)
@@ -639,8 +639,8 @@ class TestRecordedSessions:
 
     STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("streaming", None)]
 
-    def test_flight_is_acknowledged_like_recorded_client(self) -> None:
-        """The acknowledgements are the recorded ones in the same order, including late topics and those after STOP."""
+    def test_acknowledgements_match_recorded_client(self) -> None:
+        """The acknowledgements equal the recording's, in order, including late topics and messages after STOP."""
         replay = Replay("flight1", 0, 90, (245, 190))
         assert replay.acknowledged == replay.recorded
         assert len(replay.acknowledged) == 320
@@ -672,7 +672,7 @@ class TestRecordedSessions:
         assert replay.states[1:] == [*self.STARTED, ("ended", "silent")]
 
     def test_restarted_vehicle_begins_new_stream(self) -> None:
-        """After a kill and restart time_boot_ms is near 0 again, and a new header follows START."""
+        """After a kill and a restart, time_boot_ms is near 0 again, and a new header follows START."""
         replay = Replay("session", 95.0, 110.5, (247, 190))
         assert replay.states[1:] == [*self.STARTED, ("idle", None), *self.STARTED]
 

@@ -49,7 +49,7 @@ def plain(sequence: int, data: bytes = b"data", offset: int = 0) -> Message:
     return Message(False, sequence, offset, data)
 
 
-def test_retransmitted_first_message_begins_no_new_stream() -> None:
+def test_retransmitted_first_message_does_not_begin_new_stream() -> None:
     """Sequence number 0 with ULog's magic bytes begins a stream; identical bytes are a retransmission."""
     reassembly = CountingReassembly()
     begin(reassembly, b"a")
@@ -158,7 +158,7 @@ def test_largest_loss_is_half_of_sequence_range() -> None:
     assert add(reassembly, plain(2**15 + 1)) == Chunk("duplicate")
 
 
-def test_stream_resumes_after_loss_of_more_than_half_of_sequence_range() -> None:
+def test_stream_resumes_after_loss_of_over_half_the_sequence_range() -> None:
     """A long run of consecutive old sequence numbers continues the stream: all messages in between were lost."""
     reassembly = CountingReassembly()
     begin(reassembly)
@@ -316,7 +316,7 @@ class TestRecordings:
     pytestmark = needs_recordings
 
     def test_stream_equals_log_of_vehicle(self, name: str, messages: int, lost: int, common: int) -> None:
-        """Each data message is in the log, in order; the log has more only at gaps."""
+        """Each data message is in the log, in order; only at gaps does the log contain more."""
         records, reassembly = deliver(recorded(name))
         compared = compare(records, name)
         assert (reassembly.counts["delivered"], reassembly.counts.total(), reassembly.lost) == (

@@ -125,7 +125,7 @@ def test_gps_time_comes_from_system_time() -> None:
 
 
 @pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
-def test_statustexts_are_in_log() -> None:
+def test_statustexts_appear_in_log() -> None:
     """Each STATUSTEXT of a flight is a logged string without its module name, or an event with a trailing tab."""
     vehicle, parser = Vehicle("1", MavlinkOptions(topics=("log_message",))), new_parser()
     texts = [

@@ -165,7 +165,7 @@ def test_validity_without_estimator_status_is_unknown(
 def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int) -> None:
     """All positions that were not dropped are published, at 10 % packet loss and with a reboot.
 
-    The whole flight fits into the receive buffer of the link, as the service may run late.
+    The whole flight fits into the receive buffer of the link, because the service may be late.
     """
     source = f"mavlink:udpin:127.0.0.1:{port}?rate=50&topics={VLP}"
     service = run_nedbus("serve", "--connect", *bus.routers, "-s", source)

@@ -67,7 +67,7 @@ def test_constant_position_mode_invalidates_only_without_velocity(vehicle: Vehic
     [(0, 7_000_000), (6_500_000, 6_500_000), (1_700_000_000_000_000, 7_000_000), (2**64 - 1, 7_000_000)],
 )
 def test_unusable_message_time_is_replaced(time_usec: int, timestamp: int) -> None:
-    """A time that is Unix time, unknown or invalid is replaced by that of the newest message since boot."""
+    """A timestamp that is Unix time, unknown or invalid is replaced by the newest time since boot."""
     vehicle = new_vehicle(f"{VLP},sensor_gps")
     estimate(vehicle, 7000, 100.0)
     gps = dialect.MAVLink_gps_raw_int_message(time_usec, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
@@ -289,7 +289,7 @@ def test_statustext_chunks_are_joined() -> None:
 
 
 def test_flood_of_statustexts_is_limited() -> None:
-    """Of 10,000 texts in a second, 100 are published, and the others rejected."""
+    """Of 10,000 texts within a second, 100 are published and the rest are rejected."""
     vehicle = new_vehicle("log_message")
     vehicle.handle(position(1000), 0.0)
     found = [vehicle.handle(chunk(b"flood", 0), 50.0 + number / 11_000) for number in range(10_000)]

@@ -106,7 +106,7 @@ def test_topics_of_one_vehicle_may_share_a_gid(streams: StreamRegistry) -> None:
 
 
 def test_reconnected_vehicle_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """A publisher silent for 3 s does not block its successor, as a router detects a dead link only after 10 s."""
+    """A publisher silent for 3 s does not block its successor: a router detects a dead link only after 10 s."""
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)
@@ -139,7 +139,7 @@ def test_restarted_ros_2_publisher_is_accepted_at_once(streams: StreamRegistry) 
 
 
 def test_reboot_is_counted_once_per_vehicle(streams: StreamRegistry) -> None:
-    """A reboot counts once, whichever topic shows it first, and so does the next one."""
+    """Each reboot counts once, whichever topic reveals it first."""
     topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
     vehicle = [streams.on_message(str(key(topic)), 0.0) for topic in topics]
     other = streams.on_message(str(key(domain=1)), 0.0)

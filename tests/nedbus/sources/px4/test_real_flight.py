@@ -353,9 +353,9 @@ def test_topics_lost_by_default_pubcsv_are_reported_silent(where: str) -> None:
 
 @pytest.mark.slow
 def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
-    """Of two PX4s with equal keys and gids the first is published until the second appears, then both are rejected.
+    """The first of two PX4s with equal keys and gids is published until the second appears; then both are rejected.
 
-    A key that the second one only announces is rejected, too. Nothing counts as lost or as a reboot.
+    A key that the second one only announces is also rejected. Nothing counts as lost or as a reboot.
     """
     lines = list(read_recording(ALIKE))
     second = next(number for number, sent in enumerate(lines) if sent.px4 == 1)

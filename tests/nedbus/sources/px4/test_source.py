@@ -1,4 +1,4 @@
-"""A simulated Zenoh module of PX4, and other publishers on such keys."""
+"""A simulated Zenoh module of PX4, and other publishers on the same keys."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Px4:
     def put(
         self, each: VehicleLocalPosition | int, *, topic: str = VLP, attachment: bytes | None = None, skip: int = 0
     ) -> None:
-        """Send a message, or one with this timestamp; the default attachment is like that of PX4."""
+        """Send a message, or one with this timestamp; the default attachment equals PX4's."""
         sent = message(each) if isinstance(each, int) else each
         fields = downgrade(sent, self._layout)
         self._sequences[topic] = self._sequences.get(topic, 0) + 1 + skip
@@ -197,7 +197,7 @@ def test_vehicles_are_named_by_domain_and_namespace(
 def test_loss_and_reboot_are_counted(
     listener: Listener, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Losses before the service are counted by PX4's sequence; a sequence that goes back is a reboot."""
+    """PX4's sequence numbers reveal losses before the service; a backward step is a reboot."""
     caplog.set_level("WARNING")
     px4 = Px4(zenoh_session)
     px4.put(1)
@@ -316,7 +316,7 @@ def test_message_of_another_type_is_rejected(listener: Listener, zenoh_session: 
     ],
 )
 def test_invalid_msg_file_raises(tmp_path: Path, text: str, where: str, reason: str) -> None:
-    """The error has file, line and column; in a folder such a file is skipped; a missing file raises."""
+    """The error states file, line and column; an invalid file in a folder is skipped; a missing file raises."""
     file = tmp_path / "EscStatus.msg"
     file.write_text(text)
     with pytest.raises(ConfigError, match=rf"{file}: {where}: .*{reason}"):

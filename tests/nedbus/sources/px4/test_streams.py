@@ -70,7 +70,7 @@ def test_key_is_released_after_3_s(streams: StreamRegistry) -> None:
     ("sequence", "lost", "rebooted"), [(11, 0, False), (15, 4, False), (10 + 1_000_001, 0, False), (1, 0, True)]
 )
 def test_sequence_gap_counts_as_lost(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
-    """A gap is that many lost messages, unless it is implausibly large; a step back is a reboot."""
+    """A gap counts as that many lost messages, unless it is implausibly large; a step back is a reboot."""
     stream = streams.on_message(key(), 100.0)
     for each, expected in ((10, (0, False)), (sequence, (lost, rebooted)), (sequence + 1, (0, False))):
         assert streams.accept(stream, Attachment(each, 0, GID), 100.0) == expected

@@ -50,7 +50,7 @@ def test_vehicle_without_any_message_has_no_silent_topics(streams: StreamRegistr
 
 
 def test_event_topic_is_never_silent(streams: StreamRegistry) -> None:
-    """A topic without a nominal rate, such as home_position, may be absent for any time."""
+    """A topic without a nominal rate, such as home_position, may be silent indefinitely."""
     streams.add_publisher(token("home_position"), 100.0)
     assert streams.report(200.0) == UnavailableTopics()
     assert report_after_message(streams, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
