@@ -22,7 +22,7 @@ from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_nam
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-_MIN_PREFIX: Final = len("NEDBUS_TLS")  # length from which a variable's name counts as a truncated setting
+_MIN_PREFIX: Final = len("NEDBUS_TLS")  # minimum length of a variable's name to count as a truncated setting
 
 _Position = tuple[int | None, int | None]  # line and column from 1; None if unknown
 
@@ -258,7 +258,7 @@ def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
     name = str(detail["loc"][0])
     reason = detail["msg"].removeprefix("Value error, ").removeprefix("endpoint: ")
     if detail["type"] == "extra_forbidden":
-        reason = f"there is no setting {name!r}: choose from {', '.join(Settings.model_fields)}"
+        reason = f"unknown setting {name!r}: choose from {', '.join(Settings.model_fields)}"
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
     return locate_setting(settings, name, reason)

@@ -21,10 +21,10 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 KEPT: Final = 2000
-"""Maximum number of events in an event log; beyond, the oldest of the vehicle with the most events is dropped."""
+"""Maximum number of events in an event log; beyond that, the oldest of the vehicle with the most events is dropped."""
 
 MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an event log; beyond, the one gone longest is forgotten."""
+"""Maximum number of vehicles in an event log; beyond that, the one gone longest is forgotten."""
 
 MAX_GONE: Final = 50
 """Number of gone vehicles remembered, or the maximum number ever present at once if that is larger."""

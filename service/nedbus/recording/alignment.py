@@ -58,7 +58,7 @@ def align(
     utc: bool = False,
     dataframe: Library = None,
 ) -> Any:
-    """Return several streams of one or several files, or arrays from `read`, as one table, aligned in time.
+    """Return several streams of one or more files, or arrays from `read`, as one table, aligned in time.
 
     `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
     `fields`: the columns in addition to `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".

@@ -313,7 +313,7 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
             first = len(published)
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
-            wait_for(lambda: " s late: ROS 2 nodes would use them as current" in bridge.err, what="the recovery")
+            wait_for(lambda: " s late: ROS 2 nodes would treat them as current" in bridge.err, what="the recovery")
             last = len(published)
             wait_for(lambda: has_received(last), what="a current message")
         flight.result()

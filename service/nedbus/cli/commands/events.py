@@ -121,9 +121,9 @@ def why(
 ) -> None:
     """Show the verdict on each vehicle, live or from a file: usable or not, since when, for how long, and why.
 
-    --all shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions
+    --all shows start, duration and possible causes of each fault: events of the ten seconds before it, and conditions
     that were already active; and missing topics that might explain it, with a hint. Live verdicts use the event history
-    of the nedbus services. Exits with 0, with and without faults.
+    of the nedbus services. Exits with 0 even if there are faults.
     """
     if files:
         read, found = _read(files)
@@ -140,7 +140,7 @@ def why(
         hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
         raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
     if not files and not reporting:
-        raise NedbusError(f"no nedbus service at {routers} has data of a vehicle: start one with 'nedbus serve'")
+        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: start one with 'nedbus serve'")
     _require_vehicle(where, reporting, vehicle)
     for name in reporting if vehicle == ANY else [vehicle]:
         events = [event for event in found if event.vehicle in (name, ANY)]

@@ -35,7 +35,7 @@ _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED"
 _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
-_SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
+_SIMILAR: Final = 0.8  # minimum similarity of a name that counts as a misspelling
 _MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 

@@ -36,7 +36,7 @@ class ProgressLog:
         self._hinted = False
         self._reports = 0
         self._reported = time.monotonic()
-        self._counts: dict[str, int] = {}  # messages published by each source until the last report
+        self._counts: dict[str, int] = {}  # messages published by each source up to the last report
 
     def update(self) -> None:
         """Log a report if one is due."""
