@@ -55,7 +55,7 @@ class Timings:
     old: float = 1.0  # minimum latency to display, for retained or recovered messages
     reports: tuple[float, ...] = (*(10.0,) * 6, 60.0)  # between progress reports of `serve`; the last interval repeats
     systemd_patience: float = 30.0  # until a client without a router reports READY, to let the boot continue
-    systemd_status: float = 1.0  # between status texts
+    systemd_status: float = 1.0  # between status updates
 
 
 TIMINGS: Final = Timings()

@@ -122,8 +122,8 @@ class Ros2Bridge:
                 end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
             elif time.monotonic() > end:
                 raise NedbusError(
-                    "the router's access control denies the keys of ROS 2, so no ROS 2 node sees this bridge:"
-                    " start the router of ROS 2 and set its endpoint with --to"
+                    "the router's access control denies ROS 2's keys, so no ROS 2 node sees this bridge:"
+                    " start ROS 2's router and set its endpoint with --to"
                 )
             stop.wait(0.05)
 

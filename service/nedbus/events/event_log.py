@@ -61,7 +61,7 @@ class EventLog:
 
     @property
     def is_full(self) -> bool:
-        """True if further vehicles are ignored."""
+        """True if new vehicles are ignored."""
         return len(self.vehicles) >= MAX_VEHICLES
 
     @property
@@ -140,7 +140,7 @@ class EventLog:
                 vehicle.update(time, state, is_connected=not link)
 
     def settle(self, time: float) -> None:
-        """Report bursts of losses and rejections, and flapping, that have ended; call it at the end of a file, too."""
+        """Report bursts of losses and rejections, and flapping, that have ended; also call it at the end of a file."""
         with self._lock:
             for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)

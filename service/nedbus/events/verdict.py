@@ -64,8 +64,8 @@ def verdict_of(
     of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
     head = "position valid throughout, but " if usable else "not usable: " * of_estimate
     head = head if is_then else "no fault at that time; nearest: "
-    # Evidence: events before the fault, and PX4's texts until a second after its start, or all of them for a bad fault
-    # that was active in the first message. Texts that also appeared long before the first fault are excluded.
+    # Evidence: events before the fault, and PX4's log messages until a second after its start, or all of them for a bad
+    # fault that was active in the first message. Texts that also appeared long before the first fault are excluded.
     said = [event for event in events if event.kind == "text"]
     earlier = {each.text for each in said if each.time < stories[0].since - WINDOW}
     late = TOGETHER if worst.begin else math.inf if worst.is_bad else -WINDOW

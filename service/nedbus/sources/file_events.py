@@ -124,7 +124,7 @@ def follow(
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
     """Detect events in a replay; yield each message with its rejection reason or its payload.
 
-    `ended`: vehicles without further messages, which do not count as silent.
+    `ended`: vehicles that send no more messages, which do not count as silent.
     """
     checked = due = 0.0
 

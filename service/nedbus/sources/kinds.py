@@ -24,7 +24,7 @@ class SourceKind:
     """One kind of source: its options, its target, and its function or class, which is imported on first use.
 
     `target`: name of the part after the colon, in brackets if it is optional; None if there is none.
-    `extra`: the extra of nedbus that it requires.
+    `extra`: the nedbus extra that it requires.
     """
 
     options: type[Options]
@@ -71,7 +71,7 @@ class SourceSpec:
 
 
 def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
-    """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path, write `?` as `%3F` and `%` as `%25`.
+    """Parse a string such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path, write `?` as `%3F` and `%` as `%25`.
 
     A mapping holds the kind, the target by name (`file`, `link` or `endpoint`) and the options, such as
     {"kind": "ulog", "file": "flight.ulg", "speed": 2, "vehicle": 7}.

@@ -51,7 +51,7 @@ _DAMAGED: Final = (LookupError, TypeError, ValueError, AttributeError, Recursion
 
 
 def to_log_text(text: str) -> str:
-    """Return a text as one printable line of at most 127 bytes in UTF-8."""
+    """Return a string as one printable line of at most 127 bytes in UTF-8."""
     short = _COLOUR.sub("", text[:_MAX_CHARACTERS])
     plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
     data = plain.encode()
@@ -185,7 +185,7 @@ class LogMessageBuilder:
         """Yield the records, and each log message after the last record that it is derived from."""
         for record in records:
             name = record.subscription.name if isinstance(record, Data) else ""
-            if name != LOG_MESSAGE.name:  # PX4 may log the topic itself, too
+            if name != LOG_MESSAGE.name:  # PX4 may also log the topic itself
                 yield record
             if name not in _TOPICS:
                 continue

@@ -53,7 +53,7 @@ def events(
     ] = None,
     severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
     origin: Annotated[
-        str, typer.Option(metavar="px4|nedbus", help="PX4's own texts, or events derived by nedbus")
+        str, typer.Option(metavar="px4|nedbus", help="PX4's own log messages, or events derived by nedbus")
     ] = ANY,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
@@ -61,9 +61,9 @@ def events(
 ) -> None:
     """Show vehicle events and their evidence, live or from a file.
 
-    Events are PX4's own texts, and those derived from messages: validity, dead reckoning, resets, origin, GPS, fusion,
-    failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. The evidence of an
-    event is the events up to ten seconds before it that may explain it. Live events are shown until Ctrl-C.
+    Events are PX4's own log messages, and those derived from messages: validity, dead reckoning, resets, origin, GPS,
+    fusion, failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. An event's
+    evidence is the events up to ten seconds before it that may explain it. Live events are shown until Ctrl-C.
     """
     require_one({"--json": json_output, "--csv": csv_output})
     for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):

@@ -107,7 +107,7 @@ def renew(
     names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all expiring soon")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
-    new_key: Annotated[bool, typer.Option("--new-key", help="Create new keys, too")] = False,
+    new_key: Annotated[bool, typer.Option("--new-key", help="Also create new keys")] = False,
     days: DaysOption = None,
 ) -> None:
     """Renew certificates; names, hosts and keys do not change.

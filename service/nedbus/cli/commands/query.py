@@ -42,7 +42,7 @@ _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 @command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
-    """List the published streams with state and age of their last message.
+    """List the published streams with the state of each and the age of its last message.
 
     Exits with 1 if the list is incomplete because the router is too slow or refuses the query.
     """
@@ -99,7 +99,7 @@ def get(
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services of the network with their sources and streams."""
+    """Show the services on the network with their sources and streams."""
     services, vehicles = bus.services(), bus.vehicles()
     if json_output:
         for service in services:

@@ -67,7 +67,7 @@ class ProgressLog:
 
 @contextmanager
 def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
-    """Yield a function that shows a text, the number done and the total; it does nothing without a terminal."""
+    """Yield a function that shows a label, the number done and the total; it does nothing without a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

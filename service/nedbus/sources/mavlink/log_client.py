@@ -53,7 +53,7 @@ LogState = Literal[
 
 
 class LogStatus(NamedTuple):
-    """State of the stream, its cause, and a text for the log.
+    """State of the stream, its cause, and a description for the log.
 
     `idle`: before the first heartbeat. `starting`: a command is pending. `header`, `streaming`: data arrives.
     `waiting_for_disarm`, `refused`, `ended`: START is retried when allowed. `stopping`, `stopped`: after `stop`.

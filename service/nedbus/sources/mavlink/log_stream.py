@@ -108,7 +108,7 @@ class LogStream:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
         count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
-        yield from [Rejection(where, "more than 100 texts a second", count=count)] * (count > 0)
+        yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
         """Use the answer to a TIMESYNC request sent at `sent`, if its round trip is the shortest so far."""
