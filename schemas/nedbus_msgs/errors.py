@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-_MAX_SHOWN: Final = 200  # characters of a value; a peer's key may have 64 kB
+_MAX_SHOWN: Final = 200  # characters of a value; a peer's key may be 64 kB long
 
 
 class NedbusError(Exception):

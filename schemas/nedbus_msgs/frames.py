@@ -37,30 +37,30 @@ class Ned(NamedTuple):
 
 
 def ned_to_enu(vector: Vector) -> Vector:
-    """Convert a position, velocity or acceleration from NED to ENU, or back."""
+    """Convert a position, velocity or acceleration from NED to ENU, or vice versa."""
     north, east, down = vector
     return east, north, -down
 
 
 def frd_to_flu(vector: Vector) -> Vector:
-    """Convert a vector from the body frame FRD (PX4) to FLU (ROS), or back."""
+    """Convert a vector from the body frame FRD (PX4) to FLU (ROS), or vice versa."""
     forward, right, down = vector
     return forward, -right, -down
 
 
 def yaw_ned_to_enu(yaw: float) -> float:
-    """Convert a heading, clockwise from north, to ENU, counterclockwise from east, or back; within [-pi, pi]."""
+    """Convert a heading, clockwise from north, to ENU, counterclockwise from east, or vice versa; within [-pi, pi]."""
     return wrap(math.pi / 2 - yaw)
 
 
 def variances_ned_to_enu(variances: Vector) -> Vector:
-    """Convert variances of north, east and down to east, north and up, or back; no sign changes."""
+    """Convert variances of north, east and down to east, north and up, or vice versa; no sign changes."""
     north, east, down = variances
     return east, north, down
 
 
 def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
-    """Convert an attitude (w, x, y, z): PX4's rotation from FRD to NED becomes ROS's from FLU to ENU, or back."""
+    """Convert an attitude (w, x, y, z) from PX4's rotation, FRD to NED, to ROS's, FLU to ENU, or vice versa."""
     w, x, y, z = (value * math.sqrt(0.5) for value in q)
     return w + z, x + y, x - y, w - z
 

@@ -72,7 +72,7 @@ def short_hash(name: str, types: Mapping[str, FieldType]) -> str:
 
 @lru_cache(1024)
 def identity_of(encoding: str) -> tuple[str, str] | None:
-    """Return message name and hash from an encoding; None if it has no hash."""
+    """Return the message name and hash from an encoding; None if it has no hash."""
     found = _IDENTITY.fullmatch(encoding)
     return (found[1], found[2]) if found else None
 

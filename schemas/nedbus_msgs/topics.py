@@ -22,7 +22,7 @@ REJECTED: Final = "/@rejected"
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TOPIC_LENGTH: Final = 64
-_TYPO_SIMILARITY: Final = 0.9  # from which a name counts as a misspelling
+_TYPO_SIMILARITY: Final = 0.9  # minimum similarity of a name that counts as a misspelling
 _STREAM = re.compile(r"/([^/]*)/([^/]*)(?:/(0|[1-9][0-9]{0,2}))?")
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64

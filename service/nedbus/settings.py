@@ -22,13 +22,13 @@ from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_nam
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-_MIN_PREFIX: Final = len("NEDBUS_TLS")  # length from which a variable's name counts as a truncated setting
+_MIN_PREFIX: Final = len("NEDBUS_TLS")  # minimum length of a variable's name to count as a truncated setting
 
 _Position = tuple[int | None, int | None]  # line and column from 1; None if unknown
 
 
 def split_sources(value: object) -> object:
-    """Split a text at semicolons and line breaks; without any, at commas followed by `KIND:`."""
+    """Split a string at semicolons and line breaks; without any, at commas followed by `KIND:`."""
     if not isinstance(value, str):
         return value
     parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
@@ -36,7 +36,7 @@ def split_sources(value: object) -> object:
 
 
 def split_values(value: object) -> object:
-    """Split a text at commas."""
+    """Split a string at commas."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
@@ -88,7 +88,7 @@ class Settings(BaseSettings):
         "1", description="Default vehicle id of sources"
     )
     source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
-        (), description="Sources to publish: texts, or TOML tables"
+        (), description="Sources to publish: strings, or TOML tables"
     )
     http: Annotated[str, _checked(split_http)] | None = Field(
         None, description="HOST:PORT of the HTTP server for /metrics, /healthz, /readyz, /vehicles and /status"
@@ -258,7 +258,7 @@ def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
     name = str(detail["loc"][0])
     reason = detail["msg"].removeprefix("Value error, ").removeprefix("endpoint: ")
     if detail["type"] == "extra_forbidden":
-        reason = f"there is no setting {name!r}: choose from {', '.join(Settings.model_fields)}"
+        reason = f"unknown setting {name!r}: choose from {', '.join(Settings.model_fields)}"
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
     return locate_setting(settings, name, reason)
@@ -288,13 +288,13 @@ def _read_toml(path: Path) -> dict[str, object]:
 
 
 def _find_key(text: str, name: str) -> _Position:
-    """Return line and column of a key or table, which `tomllib` does not report."""
+    """Return the line and column of a key or table, which `tomllib` does not report."""
     found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
     return position_at(text, found.start(1)) if found else (None, None)
 
 
 def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Position:
-    """Return line and column of a source, a table or a text in a list, or of one of its options."""
+    """Return the line and column of a source, a table or a string in a list, or of one of its options."""
     source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
     if not isinstance(source, str) and index < len(headers):
@@ -311,7 +311,7 @@ def _find_source(text: str, sources: Sequence[object], index: int, key: str = ""
 
 
 def position_at(text: str, start: int) -> _Position:
-    """Return line and column of an index into a text; (None, None) for -1, as `str.find` returns."""
+    """Return the line and column of an index into a string; (None, None) for -1, as `str.find` returns."""
     if start < 0:
         return None, None
     return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

@@ -38,7 +38,7 @@ class Timings:
     probe: float = 3.0  # for an allowed message to arrive
     bridge_poll: float = 1.0  # between queries for addresses and for publishers of other nodes
     token_visible: float = 5.0  # for a liveliness token to become visible to other sessions; later counts as denied
-    lateness: float = 1.0  # latency from which a sample is late: recovered, or queued behind recovered ones
+    lateness: float = 1.0  # minimum latency of a late sample: recovered, or queued behind recovered ones
     take_over: float = 5.0  # after another node's publisher has gone, before its topic is published
     http_client: float = 5.0  # to send a request, to read the response, and to wait for a free thread
     page_request: float = 10.0  # for a browser to send a request, and between two requests
@@ -52,10 +52,10 @@ class Timings:
     tls_alert: float = 0.5  # for the TLS alert of a router that rejects our certificate
     list_timeout: float = 10.0  # for a router to list all streams
     first_sample: float = 2.0  # without a sample until a notice is printed to stderr
-    old: float = 1.0  # latency from which it is displayed, for retained or recovered messages
+    old: float = 1.0  # minimum latency to display, for retained or recovered messages
     reports: tuple[float, ...] = (*(10.0,) * 6, 60.0)  # between progress reports of `serve`; the last interval repeats
     systemd_patience: float = 30.0  # until a client without a router reports READY, to let the boot continue
-    systemd_status: float = 1.0  # between status texts
+    systemd_status: float = 1.0  # between status updates
 
 
 TIMINGS: Final = Timings()

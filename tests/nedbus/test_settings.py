@@ -83,7 +83,7 @@ def test_settings_file_is_found_by_flag_variable_or_default(tmp_path: Path, monk
     [
         ('connect = ["tcp/a:1"', "line 1, column 21", "Unclosed array"),
         ("vehicle = 1\nx y", "line 2, column 3", "Expected '=' after a key"),
-        ("vehicle = 1\n\n  conect = 3", "line 3, column 3", "there is no setting 'conect': choose from connect,"),
+        ("vehicle = 1\n\n  conect = 3", "line 3, column 3", "unknown setting 'conect': choose from connect,"),
         ('until_done = "maybe"', "line 1, column 1", "until_done: "),
         ("[source]\na = 1", "line 1, column 2", "source: "),
         ('{\n  mode: "router",\n  acess_control: {}\n}', "line 3, column 3", "unknown field 'acess_control'"),
@@ -123,7 +123,7 @@ def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     file.write_bytes(b'\xef\xbb\xbfprefix = "own"\n')
     assert load_settings().prefix == "own"
     file.write_bytes(b"\xef\xbb\xbfconect = 3\n")
-    with pytest.raises(ConfigError, match=r"^nedbus\.toml, line 1, column 1: there is no setting 'conect'"):
+    with pytest.raises(ConfigError, match=r"^nedbus\.toml, line 1, column 1: unknown setting 'conect'"):
         load_settings()
     file.write_text('prefix = "own"\n', encoding="utf-16")
     with pytest.raises(ConfigError, match="not UTF-8 text"):

@@ -173,7 +173,7 @@ class Definition(Generic[M_co]):
         return found
 
     def meaning(self, name: str) -> str:
-        """Return unit and meaning of a field of any layout."""
+        """Return the unit and meaning of a field of any layout."""
         field = self.model.model_fields.get(name)
         return (field.description if field else self.older[name].doc if name in self.older else "") or ""
 

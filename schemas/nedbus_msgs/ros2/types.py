@@ -72,7 +72,7 @@ def describe_field(name: str, kind: FieldType) -> FieldDescription:
 
 
 def definition_text(definition: Definition[Any], layout: Layout) -> str:
-    """Return the .msg definition of a layout, with unit and meaning of each field."""
+    """Return the .msg definition of a layout, with the unit and meaning of each field."""
     lines = ((f"{kind} {name}", definition.meaning(name)) for name, kind in layout.types.items())
     return "".join(f"{field}  # {meaning}\n" if meaning else f"{field}\n" for field, meaning in lines)
 

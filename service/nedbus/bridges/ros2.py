@@ -39,7 +39,7 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
-_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; above the 20 s of recovery
+_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; longer than the 20 s of recovery
 _MAX_UNSUPPORTED: Final = 1000  # addresses that are logged as unsupported
 _REFUSALS: Final = {
     "conflict": "%s is not published: %s already uses the topic /%s: set --namespace",
@@ -122,8 +122,8 @@ class Ros2Bridge:
                 end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
             elif time.monotonic() > end:
                 raise NedbusError(
-                    "the router's access control denies the keys of ROS 2, so no ROS 2 node sees this bridge:"
-                    " start the router of ROS 2 and set its endpoint with --to"
+                    "the router's access control denies ROS 2's keys, so no ROS 2 node sees this bridge:"
+                    " start ROS 2's router and set its endpoint with --to"
                 )
             stop.wait(0.05)
 
@@ -149,7 +149,7 @@ class Ros2Bridge:
     def _poll(self) -> None:
         """Report late samples, query the bus and the ROS 2 nodes, and apply the decisions."""
         if held_back := self._late_filter.report():
-            _log.warning("%s: ROS 2 nodes would use them as current", held_back, extra=about("bridge_late"))
+            _log.warning("%s: ROS 2 nodes would treat them as current", held_back, extra=about("bridge_late"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
             self._held.pop(address, None)

@@ -107,7 +107,7 @@ def _exit_on_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except BrokenPipeError:
-        # The reader of the pipe has gone (`| head`): the flush at exit would fail, too.
+        # The reader of the pipe has gone (`| head`): the flush at exit would also fail.
         discard_stdout()
         raise typer.Exit(0) from None
     except OSError as exc:

@@ -1,4 +1,4 @@
-"""Run the body of a command in a thread until it ends or a signal arrives; works as PID 1 of a container, too."""
+"""Run the body of a command in a thread until it ends or a signal arrives; also works as PID 1 of a container."""
 
 import logging
 import os

@@ -23,7 +23,7 @@ from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
 
 _WAKE_INTERVAL: Final = 1.0  # s between checks for Ctrl-C while connecting
-_MAX_QUERIES: Final = 32  # concurrent queries of a bus, each in a thread; further ones wait
+_MAX_QUERIES: Final = 32  # concurrent queries of a bus, each in a thread; others wait
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")

@@ -27,9 +27,9 @@ StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"] 
 _log = logging.getLogger(__name__)
 
 _REBOOT_STEP: Final = 1_000_000  # us by which PX4's time steps back in a reboot; less is a message out of order
-_GAP_FACTOR: Final = 3.0  # multiple of the usual step of PX4's time
-_MIN_STEPS: Final = 5  # steps before gaps are counted
-_SMOOTHING: Final = 0.05  # smoothing factor of the usual step and the usual rate
+_GAP_FACTOR: Final = 3.0  # multiple of the usual interval between PX4's timestamps
+_MIN_STEPS: Final = 5  # intervals before gaps are counted
+_SMOOTHING: Final = 0.05  # smoothing factor of the usual interval and the usual rate
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 _MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
@@ -48,7 +48,7 @@ class Health:
 
     Over the last full second: `rate` [Hz], `jitter` (standard deviation of arrival intervals) [s], `latency` (median)
     and `latency_max` [s], and `flags`, the share of messages with each flag set, 0 to 1; unknown flags do not count.
-    Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's time above three times the usual step),
+    Since the start: `messages`, `lost` in transit, `gaps` (PX4 timestamps over three usual intervals apart),
     `out_of_order`, `reboots` (PX4's time stepped back by more than 1 s), `resets` per quantity, `flags_ever` (shares).
     `nominal`: PX4's rate of this topic [Hz], 0 if it has none; logs and links are usually slower.
     `age`: seconds since the last message.

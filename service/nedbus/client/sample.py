@@ -46,7 +46,7 @@ class Sample(Generic[M_co]):
     `stamp`: Zenoh's timestamp with its clock id; None if the publisher sent none, and in copies.
     `lost`: messages of this key lost in transit just before this one.
     `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
-    `retained`: True for the last message of a publisher from before the subscription, and from `bus.latest()`.
+    `retained`: True for a publisher's last message before the subscription, and from `bus.latest()`.
     `stored`: True if it came from a storage because no publisher of the address replied; `bus.latest()` only.
     """
 

@@ -121,7 +121,7 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
 
 def _read_certificate(host: str, port: int) -> str:
     """Return the unverified certificate of a server in PEM; "" if it does not speak TLS."""
-    with suppress(OSError):  # SSLError, too
+    with suppress(OSError):  # also catches SSLError
         return ssl.get_server_certificate((host, port), timeout=TIMINGS.handshake)
     return ""
 

@@ -120,7 +120,7 @@ class _Contradiction:
     text: str = ""
 
     def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
-        """Add an error, NaN if not measured; return the begin or end of a contradiction."""
+        """Add an error, NaN if not measured; return the start or end of a contradiction."""
         self.errors[name] = (stamp, error, limit)
         if not self.since and not abs(error) > limit:
             return None

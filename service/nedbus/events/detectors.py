@@ -54,7 +54,7 @@ class Finding:
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
 """Yields findings from the fields of the previous message, {} at first, and of the current one."""
 Detection = tuple[Sequence[str], Sequence[str], Detect]
-"""Fields whose changes trigger the function, further fields that it needs, and the function."""
+"""Fields whose changes trigger the function, other fields that it needs, and the function."""
 
 
 class FieldReader:
@@ -78,7 +78,7 @@ class FieldReader:
 class ChangeDetector:
     """Detector for one stream; calls `detect` only when one of the `compared` fields changes.
 
-    `detect` receives None for fields that were not provided. `context`: further fields passed to it.
+    `detect` receives None for fields that were not provided. `context`: other fields passed to it.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: timestamps of the last message and of the one before [us].
     `pause`: minimum interval between messages [s]; earlier ones, until `due` on the event log's clock, are skipped.
@@ -122,7 +122,7 @@ class ChangeDetector:
 
 
 class TextDetector(ChangeDetector):
-    """Detector for PX4's own texts; each is an event, even if it repeats the previous one."""
+    """Detector for PX4's own log messages; each is an event, even if it repeats the previous one."""
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Return the finding in a message."""

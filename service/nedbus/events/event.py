@@ -13,7 +13,7 @@ from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import LARGE_CORRECTION
 
 WINDOW: Final = 10.0
-"""Seconds before an event in which other events are evidence; the begin of an active condition always is."""
+"""Seconds before an event in which other events are evidence; the start of an active condition always is."""
 
 ALL: Final = "*"
 """Vehicle name of events that concern all vehicles: those of the router link and of the reader."""
@@ -54,7 +54,7 @@ class Event:
 
     @property
     def origin(self) -> str:
-        """The author: "px4" for PX4's own texts, "nedbus" for events derived from messages."""
+        """The author: "px4" for PX4's own log messages, "nedbus" for events derived from messages."""
         return "px4" if self.kind == "text" else "nedbus"
 
     @property
@@ -124,8 +124,8 @@ def state_of(conditions: Iterable[Condition]) -> State:
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
     """Return the possible causes of an event: the latest of each kind within WINDOW seconds, or still active.
 
-    Begins and PX4's texts may explain a begin, ends since the begin may explain an end, and both may explain a
-    correction of the estimate. All PX4 texts are returned, not just the latest.
+    The start of a condition may be caused by other starts and PX4's log messages, its end by ends since its start, and
+    a correction of the estimate by all of these. All log messages are returned, not just the latest.
     """
     kind, latest = KINDS[event.kind], dict[object, Event]()
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""

@@ -21,10 +21,10 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 KEPT: Final = 2000
-"""Maximum number of events in an event log; beyond, the oldest of the vehicle with the most events is dropped."""
+"""Maximum number of events in an event log; beyond that, the oldest of the vehicle with the most events is dropped."""
 
 MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an event log; beyond, the one gone longest is forgotten."""
+"""Maximum number of vehicles in an event log; beyond that, the one gone longest is forgotten."""
 
 MAX_GONE: Final = 50
 """Number of gone vehicles remembered, or the maximum number ever present at once if that is larger."""
@@ -61,7 +61,7 @@ class EventLog:
 
     @property
     def is_full(self) -> bool:
-        """True if further vehicles are ignored."""
+        """True if new vehicles are ignored."""
         return len(self.vehicles) >= MAX_VEHICLES
 
     @property
@@ -140,7 +140,7 @@ class EventLog:
                 vehicle.update(time, state, is_connected=not link)
 
     def settle(self, time: float) -> None:
-        """Report bursts of losses and rejections, and flapping, that have ended; call it at the end of a file, too."""
+        """Report bursts of losses and rejections, and flapping, that have ended; also call it at the end of a file."""
         with self._lock:
             for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)

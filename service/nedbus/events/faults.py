@@ -1,4 +1,4 @@
-"""Health checks of vehicles."""
+"""Vehicle health checks."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

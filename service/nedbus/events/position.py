@@ -19,7 +19,7 @@ _COMPARED: Final = (
 )  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; smaller steps are never jumps
 _MAX_INTERVAL: Final = 0.5  # s between messages; longer intervals are not checked for jumps
-_SURE_INTERVAL: Final = 0.1  # s; beyond, rates at the two ends do not give the motion accurately
+_SURE_INTERVAL: Final = 0.1  # s; over longer intervals, the rates at both ends do not determine the motion accurately
 # By quantity with a reset counter: its fields, rates of change of each field, names in the event's `numbers`, text.
 _Quantity = tuple[tuple[str, ...], tuple[tuple[str, ...], ...], tuple[str, ...], str]
 _RESETS: Final[Mapping[Quantity, _Quantity]] = {

@@ -27,7 +27,7 @@ class VehicleReport:
     """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, kinds of all.
 
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
-    `has_position`: it publishes a position. `held`: active conditions whose begin is not among the events.
+    `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
     `unknown`: flags that its position does not provide.
     """
 

@@ -76,8 +76,8 @@ GNSS_DELAY: Final = 0.5  # s
 SIGMAS: Final = 3.0
 UNKNOWN_ACCURACY: Final = 10.0  # m, in place of a missing eph or epv
 CONTRADICTED: Final = {"height": 1.5, "position": 3.0}  # s for which all references must disagree with the estimate
-FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of its kind, within WINDOW; beyond, only the last is reported
-MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; beyond, only the last is reported
+FLAPPING_CHANGES: Final = 4, 20  # of a condition, and of its kind, within WINDOW; above, only the last is reported
+MAX_SINGLE: Final = 200  # single events of a kind within WINDOW; beyond that, only the last is reported
 PAUSE: Final = 5.0  # s without a recurrence after which flapping, losses, rejections or an overload have ended
 MAX_BURST: Final = 20.0  # s after which continuing losses are reported
 

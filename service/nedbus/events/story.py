@@ -69,7 +69,7 @@ def stories_of(
     topics: Collection[str] = (),
     at: float | None = None,
 ) -> list[Story]:
-    """Return the stories of one vehicle in order of time; [] if it has no faults.
+    """Return the stories of one vehicle in chronological order; [] if it has no faults.
 
     `events`: all events of the vehicle, in order. `conditions`: conditions active after the last event.
     `topics`: published topics. `at`: return only stories active at this time, else the last one before.
@@ -104,7 +104,7 @@ def story_of(
 def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
     """Return the conditions and single events of one vehicle as spans, ordered by start.
 
-    `conditions`: active or initial conditions, added if their begin is not among the events.
+    `conditions`: active or initial conditions, added if their start is not among the events.
     """
     known = {event.identity for event in events}
     unreported = [
@@ -206,7 +206,7 @@ def _is_part(story: Story, of: Story) -> bool:
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
-    """Return all spans of one story: `span`, and validity lost with it, or initial conditions like it."""
+    """Return all spans of one story: `span`, and validity lost with it or similar initial conditions."""
 
     def is_part(each: Span) -> bool:
         if KINDS[span.kind].validity:

@@ -1,4 +1,4 @@
-"""Times of events as text: UTC if known, else seconds since boot; and durations."""
+"""Event times as text: UTC if known, else seconds since boot; and durations."""
 
 import math
 import re
@@ -118,5 +118,5 @@ def format_duration(seconds: float) -> str:
 
 
 def format_since(since: float | None, now: float) -> str:
-    """Format the begin of a condition as a suffix for its text; "" if unknown."""
+    """Format the start of a condition as a suffix for its text; "" if unknown."""
     return "" if since is None else f", since {format_utc(since)} UTC ({format_duration(now - since)})"

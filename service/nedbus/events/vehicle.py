@@ -94,7 +94,7 @@ class Vehicle:
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
         # If the message before the previous one is close in time, the previous one was damaged: no reboot.
-        # PX4's texts are queued, and a log may begin with old ones.
+        # PX4's log messages are queued, and a log may begin with old ones.
         is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
         if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
@@ -227,7 +227,7 @@ class Vehicle:
 
     @property
     def held_from_start(self) -> str:
-        """Texts of conditions, other than info, active since the first message; "" if none."""
+        """Conditions, other than info, active since the first message, as text; "" if none."""
         held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
         return ", ".join(dict.fromkeys(held))
 

@@ -23,7 +23,7 @@ class Verdict:
     `text`: human-readable; names the clock of its times, and may quote text from the vehicle: escape it.
     `usable`: False if the fault kept the vehicle from its task, True if not; None if the data has no position validity.
     `begin`, `end`: events that began and ended the worst fault, None if it was active in the first or last message.
-    `cause`: its evidence in order of time. `stories`: all faults in order of time.
+    `cause`: its evidence. `stories`: all faults. Both are in chronological order.
     """
 
     text: str
@@ -47,8 +47,8 @@ def verdict_of(
 ) -> Verdict:
     """Return the verdict on a vehicle.
 
-    `events`: events in order of time; only those of this vehicle and of ALL are used. `held`: conditions active after
-    the last event. `topics`: published topics. `unknown`: flags that its position does not provide.
+    `events`: events in chronological order; only those of this vehicle and of ALL are used. `held`: conditions active
+    after the last event. `topics`: published topics. `unknown`: flags that its position does not provide.
     `end`: now, or the end of the file, on the event log's clock [s]. `at`: the time in question, None for all.
     """
     events = [event for event in events if event.vehicle in (vehicle, ALL)]
@@ -64,8 +64,8 @@ def verdict_of(
     of_estimate = worst.is_bad and KINDS[worst.spans[0].kind].message == "VehicleLocalPosition"
     head = "position valid throughout, but " if usable else "not usable: " * of_estimate
     head = head if is_then else "no fault at that time; nearest: "
-    # Evidence: events before the fault, and PX4's texts until a second after its start, or all of them for a bad fault
-    # that was active in the first message; without texts that also appeared before all faults.
+    # Evidence: events before the fault, and PX4's log messages until a second after its start, or all of them for a bad
+    # fault that was active in the first message. Texts that also appeared long before the first fault are excluded.
     said = [event for event in events if event.kind == "text"]
     earlier = {each.text for each in said if each.time < stories[0].since - WINDOW}
     late = TOGETHER if worst.begin else math.inf if worst.is_bad else -WINDOW
@@ -73,7 +73,7 @@ def verdict_of(
     found = [each for each in near if each.text not in earlier] + [e for e in worst.before if e.kind != "text"]
     cause = tuple(sorted(found, key=lambda each: each.time))
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
-    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # the rest is for others
+    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # reserved for others
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
     largest = {each.spans[0].kind: each for each in reversed(ranked)}
     also = ""  # the worst other fault of each kind, nearest in time first

@@ -209,7 +209,7 @@ def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> I
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     """Yield all metrics of a service."""
     seen, sources = Counter[str](), dict[str, SourceMeasures]()
-    for measures in daemon.measures:  # numbered if texts are equal: time series must be unique
+    for measures in daemon.measures:  # numbered if equal: time series must be unique
         text = measures.status.source
         seen[text] += 1
         sources[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures

@@ -51,7 +51,7 @@ def why_not_ready(daemon: Daemon) -> list[str]:
 
 
 def _one_line(text: str) -> str:
-    return "".join(each if each.isprintable() else " " for each in text)  # texts may quote a peer
+    return "".join(each if each.isprintable() else " " for each in text)  # a fault may quote a peer
 
 
 def _health(daemon: Daemon) -> Page:

@@ -88,7 +88,7 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
         loaded, certificate, problem = load_certificate(path), Certificate.read(path), ""
         with suppress(OSError, ValueError, TypeError):  # the key is missing, or not readable by this user
             key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
-            problem = "" if key.public_key() == loaded.public_key() else "does not match the key beside it"
+            problem = "" if key.public_key() == loaded.public_key() else "does not match the key next to it"
         try:
             loaded.verify_directly_issued_by(authority)
         except (ValueError, TypeError, InvalidSignature):

@@ -48,7 +48,7 @@ def make_bundle(
         if not router.startswith("tls/"):
             raise ConfigError("--router", f"{router!r} does not use TLS: use a tls/ endpoint")
     if not routers:
-        raise ConfigError("--router", "give at least one router, such as tls/192.168.1.5:7447")
+        raise ConfigError("--router", "specify at least one router, such as tls/192.168.1.5:7447")
     authority = Authority.read(folder)
     for path in (output, folder / f"{name}.key", folder / f"{name}.crt"):
         if path.exists():

@@ -11,7 +11,7 @@ from nedbus.extras import import_optional
 from nedbus_msgs import AddressError, check_vehicle
 
 DAYS: Final = 825  # default validity of a certificate [days]
-RENEW_WITHIN: Final = 30  # days before expiry from which a certificate is due for renewal
+RENEW_WITHIN: Final = 30  # days before expiry when a certificate becomes due for renewal
 CERTIFICATE_PREFIX: Final = "vehicle-"
 """Prefix of the vehicle id in common names, which prevents a vehicle named like a reader or router."""
 

@@ -58,7 +58,7 @@ def align(
     utc: bool = False,
     dataframe: Library = None,
 ) -> Any:
-    """Return several streams of one or several files, or arrays from `read`, as one table, aligned in time.
+    """Return several streams of one or more files, or arrays from `read`, as one table, aligned in time.
 
     `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
     `fields`: the columns in addition to `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".
@@ -134,7 +134,7 @@ def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> d
     """Return the time columns and those that `fields` selects; raise ArgumentError for an unknown field."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):
-        raise ArgumentError("fields", sorted(unknown), f"some of {', '.join(columns)}", problem="are in no stream")
+        raise ArgumentError("fields", sorted(unknown), f"any of {', '.join(columns)}", problem="are in no stream")
     times = {"timestamp", "utc"}
     return {name: column for name, column in columns.items() if name in times or known[name] & {*fields}}
 

@@ -54,7 +54,7 @@ class RecordingWriter:
 
     Each combination of address, definition and provenance has its own channel. Its layout is the current one; if no
     PX4 release has all its fields, a release with exactly the fields that the source provides is preferred.
-    PX4's texts are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
+    PX4's log messages are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
     `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
     vehicle's boot [us], for `utc_of` if the messages do not provide it.
 
@@ -185,7 +185,7 @@ class RecordingWriter:
 
 
 def _encode_log(vehicle: str, message: LogMessage, time_ns: int) -> bytes:
-    """Encode a text of a vehicle as the CDR payload of _LOG_TYPE."""
+    """Encode a vehicle's log message as the CDR payload of _LOG_TYPE."""
     seconds = min(time_ns // 10**9, 2**31 - 1)
     body = struct.pack("<iIB", seconds, time_ns % 10**9, _LOG_LEVELS[message.severity])
     for part in (vehicle, message.text, "", ""):

@@ -64,7 +64,7 @@ class _Stream(NamedTuple):
 
 
 class _Mark(NamedTuple):
-    """An event with its text, begin and end [s]; an instantaneous event has equal ones."""
+    """An event with its text, start and end [s], which are equal for an instantaneous event."""
 
     event: Event
     text: str
@@ -219,7 +219,7 @@ def _draw_flags(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
 
 
 def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> dict[str, list[_Mark]]:
-    """Return the marks of the plotted vehicles by row, the most severe row first, each row in order of time.
+    """Return the marks of the plotted vehicles by row, the most severe row first, each row in chronological order.
 
     Events far from all messages are left out, because their timestamps must be damaged.
     """

@@ -1,4 +1,4 @@
-"""Reading of streams from one or several files as arrays or data frames."""
+"""Read streams from one or more files as arrays or data frames."""
 
 from __future__ import annotations
 

@@ -48,11 +48,11 @@ class UlogReader:
         """Damage found and parts skipped so far."""
         warnings = self._warnings + [reason for stream in self.streams.values() for reason in stream.omitted.values()]
         if self._damages > _MAX_NAMED:
-            warnings.append(f"damaged: {self._damages - _MAX_NAMED} further locations")
+            warnings.append(f"damaged: {self._damages - _MAX_NAMED} more locations")
         if self._parser.undecodable:
             warnings.append(f"damaged: {self._parser.undecodable} messages without a definition")
         if self._texts.limit.omitted:
-            warnings.append(f"left out: {self._texts.limit.omitted} texts above 100 per second")
+            warnings.append(f"left out: {self._texts.limit.omitted} log messages above 100 per second")
         return [*warnings, *filter(None, [self._texts.problem])]
 
     def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:

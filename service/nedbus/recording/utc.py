@@ -27,7 +27,7 @@ class UtcOffset:
 
     `source`: the stream, "boot_time_utc_us" of a log, or "timestamp" if timestamps are Unix time already, as uXRCE-DDS
     sends them once synchronized. The stream timesync_status is as accurate as the clock of the companion computer.
-    `offset_us`: median over the messages of the source; a GNSS fix is some tenths of a second older than its message.
+    `offset_us`: median over the messages of the source; a GNSS fix is a few tenths of a second older than its message.
     `count`: messages within one second of the median; `spread_us`: their maximum minus minimum.
     """
 

@@ -1,4 +1,4 @@
-"""Sources of messages: `parse_source` parses a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
+"""Sources of messages: `parse_source` parses a string such as `ulog:flight.ulg?speed=2&vehicle=7`."""
 
 from .conversion import convert
 from .file_events import MAX_FILE_EVENTS, FileEvents, Flights, follow, read_file_events

@@ -84,7 +84,7 @@ class Flights:
         return {name: utc for name, utc in found if utc is not None}
 
     def messages(self) -> Iterator[SourceMessage]:
-        """Yield the messages in order of time; raise SourceError if there are several files and one has no UTC."""
+        """Yield the messages in chronological order; raise SourceError for several files if one has no UTC."""
         if len(self._files) == 1:
             return self._files[0][1].messages
         starts = [self._start(*file) for file in self._files]
@@ -100,7 +100,7 @@ class Flights:
         times = ((utc.unix_us(cast("int", each.fields["timestamp"])), each.due) for utc, each in known if utc)
         found = [float(unix) / 1e6 - due for unix, due in times]
         if not found:
-            raise SourceError(str(path), "no message gives UTC, which merging several files requires: read it alone")
+            raise SourceError(str(path), "no message provides UTC, which merging several files requires: read it alone")
         return median(found)
 
     def _shift(self, run: ReplayRun, names: Mapping[str, str], offset: float) -> Iterator[SourceMessage]:
@@ -124,7 +124,7 @@ def follow(
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
     """Detect events in a replay; yield each message with its rejection reason or its payload.
 
-    `ended`: vehicles without further messages, which do not count as silent.
+    `ended`: vehicles that send no more messages, which do not count as silent.
     """
     checked = due = 0.0
 

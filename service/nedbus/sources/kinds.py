@@ -24,7 +24,7 @@ class SourceKind:
     """One kind of source: its options, its target, and its function or class, which is imported on first use.
 
     `target`: name of the part after the colon, in brackets if it is optional; None if there is none.
-    `extra`: the extra of nedbus that it requires.
+    `extra`: the nedbus extra that it requires.
     """
 
     options: type[Options]
@@ -71,7 +71,7 @@ class SourceSpec:
 
 
 def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
-    """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path, write `?` as `%3F` and `%` as `%25`.
+    """Parse a string such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path, write `?` as `%3F` and `%` as `%25`.
 
     A mapping holds the kind, the target by name (`file`, `link` or `endpoint`) and the options, such as
     {"kind": "ulog", "file": "flight.ulg", "speed": 2, "vehicle": 7}.
@@ -85,7 +85,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         path = rest if rest and "/" not in kind_name else text
         kind_of_file = find_format(path.partition("?")[0])
         hint = f"write {kind_of_file}:{path}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
-        raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")
+        raise ConfigError(f"source {text!r}", f"unknown kind {kind_name!r}: {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     if not kind.accepts(target):
         form = f"{kind_name}:{kind.target}" if kind.target else f"{kind_name}:?OPTION=VALUE"
@@ -97,7 +97,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         detail = exc.errors()[0]
         name = str(detail["loc"][0])
         if (field := kind.options.model_fields.get(name)) is None:
-            reason = f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}"
+            reason = f"unknown option {name!r}: choose from {', '.join(kind.options.model_fields)}"
         elif isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
             reason = str(cause)
         else:
@@ -125,7 +125,7 @@ def _text_of_table(table: Mapping[str, object]) -> str:
     name = options.pop("kind", None)
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        problem, key = ("kind is missing", "") if name is None else (f"there is no kind {name!r}", "kind")
+        problem, key = ("kind is missing", "") if name is None else (f"unknown kind {name!r}", "kind")
         raise ConfigError("source", f"{problem}: choose from {', '.join(SOURCE_KINDS)}", key=key)
     target_name = (kind.target or "").strip("[]").lower()
     target = options.pop(target_name, "")

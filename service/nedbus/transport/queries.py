@@ -1,6 +1,6 @@
 """Zenoh queries and their replies.
 
-Replies are queued in Rust channels until a thread of nedbus polls them. A Python callback, or its destructor, would
+Replies are queued in Rust channels until a nedbus thread polls them. A Python callback, or its destructor, would
 wait for the GIL on a Zenoh thread. During a liveliness query that thread holds the session lock: a deadlock as soon as
 another thread waits for the lock with the GIL held.
 """
@@ -54,7 +54,7 @@ class Replies:
 def send_query(session: Session, selector: str, *, timeout: float, capacity: int = 1024, **options: Any) -> Replies:
     """Query all matching queryables without waiting; the session blocks while `capacity` replies are pending.
 
-    `options`: further arguments of `zenoh.Session.get`, such as `priority`.
+    `options`: other arguments of `zenoh.Session.get`, such as `priority`.
     """
     timeout = zenoh_timeout(timeout)
     options |= {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}

@@ -5,7 +5,7 @@
     tokens       @ros2_lv/<domain>/<session>/<node>/<entity>/NN|MP|MS/<enclave>/<namespace>/<node name>
                  and for a publisher (MP) or a subscription (MS) /<topic>/<DDS type>/RIHS01_<hash>/<QoS>
 
-Source: the design document of rmw_zenoh, with which PX4's module is compatible.
+Source: rmw_zenoh's design document; PX4's module is compatible with it.
 """
 
 import re

@@ -126,7 +126,7 @@ def _forward(read: int, stdout: int) -> None:
             found = _REFUSED.search(_COLOUR.sub("", line.decode(errors="replace")))
             if found is not None:
                 reason = next((text for part, text in _REASONS.items() if part in found[1]), found[1])
-                _log.warning("a client is refused: %s", reason, extra=about("client_refused", reason=reason))
+                _log.warning("refused a client: %s", reason, extra=about("client_refused", reason=reason))
                 continue
             with suppress(OSError):  # the reader of stdout has closed it
                 os.write(stdout, line)

@@ -1,4 +1,4 @@
-"""Zenoh sessions of clients, and translation of Zenoh errors."""
+"""Zenoh client sessions, and translation of Zenoh errors."""
 
 import json
 import math

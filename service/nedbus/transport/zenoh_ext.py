@@ -1,7 +1,7 @@
 """Heartbeats and cache queries of zenoh-ext's advanced publishers.
 
 Source: the code of zenoh-ext 1.10.2, as Zenoh does not document the formats as stable. With them, advanced subscribers
-in any language recover samples from publishers of nedbus, and nedbus recovers samples from any advanced publisher.
+in any language recover samples from nedbus publishers, and nedbus recovers samples from any advanced publisher.
 """
 
 import re

@@ -27,16 +27,16 @@ LOG_MESSAGE: Final = Subscription(-1, 0, "log_message", _LAYOUT)
 
 _TOPICS: Final = ("", "event", "vehicle_status")
 _INFO: Final = 6
-_PROTOCOL: Final = 8  # log level from which on events are for ground stations, not for display
+_PROTOCOL: Final = 8  # lowest log level of events meant for ground stations, not for display
 _ALL_MODES: Final = 2**32 - 1
-_WINDOW: Final = 50_000  # us between an event and its logged string; 4 ms were seen
+_WINDOW: Final = 50_000  # us between an event and its logged string; 4 ms was observed
 _MAX_PER_SECOND: Final = 100  # messages; PX4 logs 20 at boot
 _MAX_BYTES: Final = 127
 _MAX_CHARACTERS: Final = 1000  # read, including colour codes
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
-_MAX_PACKED: Final = 2**18  # bytes; PX4's have 17,000
-_MAX_UNPACKED: Final = 2**21  # bytes; PX4's have 170,000
+_MAX_PACKED: Final = 2**18  # bytes; PX4's take 17,000
+_MAX_UNPACKED: Final = 2**21  # bytes; PX4's take 170,000
 _MAX_MEMORY: Final = 2**27  # bytes for the xz dictionary
 _MAX_PARTS: Final = 64  # components, event groups, mode groups, and modes per group; PX4 has 30
 _MAX_TEXT: Final = 200  # characters of a template, or of an argument; PX4's longest template has 120
@@ -51,7 +51,7 @@ _DAMAGED: Final = (LookupError, TypeError, ValueError, AttributeError, Recursion
 
 
 def to_log_text(text: str) -> str:
-    """Return a text as one printable line of at most 127 bytes in UTF-8."""
+    """Return a string as one printable line of at most 127 bytes in UTF-8."""
     short = _COLOUR.sub("", text[:_MAX_CHARACTERS])
     plain = "".join(c if c.isprintable() else " " if c.isspace() else "" for c in short).strip()
     data = plain.encode()
@@ -185,7 +185,7 @@ class LogMessageBuilder:
         """Yield the records, and each log message after the last record that it is derived from."""
         for record in records:
             name = record.subscription.name if isinstance(record, Data) else ""
-            if name != LOG_MESSAGE.name:  # PX4 may log the topic itself, too
+            if name != LOG_MESSAGE.name:  # PX4 may also log the topic itself
                 yield record
             if name not in _TOPICS:
                 continue

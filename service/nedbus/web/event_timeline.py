@@ -1,4 +1,4 @@
-"""Event timeline of a page: events in order of time, with their spans, stories and verdicts."""
+"""Event timeline of a page: events in chronological order, with their spans, stories and verdicts."""
 
 import functools
 import math
@@ -64,7 +64,7 @@ class EventTimeline:
             self.unit = unit_of("boot" if utc is None else "vehicle")
 
     def format_time(self, seconds: float) -> str:
-        """Format an event time on the clock of the axes."""
+        """Format an event time as on the time axes."""
         seconds += self.clock_offset
         return format_utc(seconds) if self.unit == "UTC" else f"{seconds:.1f}"
 
@@ -99,7 +99,7 @@ class EventTimeline:
 
     @property
     def faults(self) -> Sequence[tuple[str, Story]]:
-        """The vehicle and story of each fault, in order of time."""
+        """The vehicle and story of each fault, in chronological order."""
         self._refresh()
         stories = [(name, story) for name in self._by_vehicle for story in self._find_stories_cached(name, None)]
         return sorted(stories, key=lambda each: each[1].since)

@@ -32,7 +32,7 @@ _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
 class Recording:
-    """The messages of one or several files in order of time, loaded in a background thread.
+    """The messages of one or more files in chronological order, loaded in a background thread.
 
     `overview`: the whole flight at two points per second; `timeline`: the events, in seconds since the first message.
     `entries`: the address of each message with its payload (positions and status topics), rejection reason, or only

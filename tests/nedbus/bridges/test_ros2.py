@@ -313,7 +313,7 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
             first = len(published)
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
-            wait_for(lambda: " s late: ROS 2 nodes would use them as current" in bridge.err, what="the recovery")
+            wait_for(lambda: " s late: ROS 2 nodes would treat them as current" in bridge.err, what="the recovery")
             last = len(published)
             wait_for(lambda: has_received(last), what="a current message")
         flight.result()
@@ -428,7 +428,7 @@ def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path)
         nedbus.connect(endpoint) as bus,
         plain_session(endpoint) as session,
         plain_session(endpoint) as observer,
-        pytest.raises(NedbusError, match="access control denies the keys of ROS 2"),
+        pytest.raises(NedbusError, match="access control denies ROS 2's keys"),
     ):
         Ros2Bridge(bus, session, observer=observer).run(threading.Event())
 
@@ -436,7 +436,7 @@ def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path)
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "text"),
     [
-        (["--to", "tcp/127.0.0.1:1"], 1, "no router answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
+        (["--to", "tcp/127.0.0.1:1"], 1, "no router answers at tcp/127.0.0.1:1: start ROS 2's router there"),
         (["--layout", "1.12"], 2, "unknown layout '1.12': choose from 1.13, 1.14, 1.15, 1.16, 1.17, 1.18, main, V0"),
         (["--namespace", "1:7up"], 2, "namespace '7up' is not valid"),
         (["--namespace", "7up"], 2, "VEHICLE:NAMESPACE"),

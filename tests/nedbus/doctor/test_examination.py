@@ -611,7 +611,7 @@ def test_settings_are_reported_with_their_origin(monkeypatch: pytest.MonkeyPatch
     find(findings, "settings", "ok", "connect: tcp/127.0.0.1:7447, the default")
     find(findings, "settings", "ok", "prefix by nedbus.toml, vehicle by NEDBUS_VEHICLE")
     find(findings, "settings", "wrong", "gone.ulg: no such file")
-    find(findings, "settings", "wrong", "there is no option 'nonsense'")
+    find(findings, "settings", "wrong", "unknown option 'nonsense'")
 
 
 def test_missing_extra_is_reported(start: Start) -> None:

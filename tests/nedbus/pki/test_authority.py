@@ -313,7 +313,7 @@ def test_renew_replaces_expiring_certificates_only(tmp_path: Path) -> None:
         "alien": ("client", "signed by another authority"),
         "router": ("router", "expires soon"),
         "vehicle-99": ("client", "valid"),
-        "operator": ("client", "does not match the key beside it"),
+        "operator": ("client", "does not match the key next to it"),
         "reader": ("client", "valid"),
     }
     assert pki_command(0, "renew", str(folder))[0] == [str(folder / "vehicle-1.crt"), str(folder / "router.crt")]

@@ -135,7 +135,7 @@ def test_fields_select_the_columns() -> None:
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
     assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
     assert np.array_equal(table[f"{VLP}.z"], nedbus.align(flight)[f"{VLP}.z"], equal_nan=True)
-    with pytest.raises(ArgumentError, match=rf"fields \['zz'\] are in no stream: expected some of .*, {VLP}.age, "):
+    with pytest.raises(ArgumentError, match=rf"fields \['zz'\] are in no stream: expected any of .*, {VLP}.age, "):
         nedbus.align(flight, fields=["zz"])
 
 

@@ -37,8 +37,8 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
     ("source", "reason"),
     [
         ({}, "kind is missing: choose from sim, ulog"),
-        ({"kind": "ulg"}, "there is no kind 'ulg': choose from sim, ulog"),
-        ({"kind": 5}, "there is no kind 5"),
+        ({"kind": "ulg"}, "unknown kind 'ulg': choose from sim, ulog"),
+        ({"kind": 5}, "unknown kind 5"),
         ({"kind": "ulog"}, 'it needs file = "..."'),
         ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
         ({"kind": "sim", "speed": 0}, "speed=0 is invalid: expected a factor from 0.001"),

@@ -311,10 +311,10 @@ def test_refused_clients_are_logged(
         assert str(refused.value).startswith(f"no TLS connection to {endpoint}: ")
         assert advice in str(refused.value)
         assert len(str(refused.value)) < 250, "readable length"
-        wait_for(lambda: f"WARNING a client is refused: {reason}\n" in router.err, what=reason)  # noqa: B023 - called immediately
+        wait_for(lambda: f"WARNING refused a client: {reason}\n" in router.err, what=reason)  # noqa: B023 - called immediately
     with pytest.raises(nedbus.ConnectError):
         nedbus.connect(endpoint.replace("tls/", "tcp/"), timeout=0.1)
-    wait_for(lambda: "a client is refused: it does not speak TLS\n" in router.err, what="the client without TLS")
+    wait_for(lambda: "refused a client: it does not speak TLS\n" in router.err, what="the client without TLS")
     assert ("Zenoh can be reached at" in router.out) == bool(environment)
     assert "certificate" not in router.out
 

@@ -102,14 +102,14 @@ def ros2(
     bus: Bus,
     selection: Selection = ALL,
     *,
-    humble: Annotated[bool, typer.Option("--humble", help="Use keys of ROS 2 Humble, without type hash")] = False,
+    humble: Annotated[bool, typer.Option("--humble", help="Use ROS 2 Humble's keys, without type hash")] = False,
     layout: Annotated[
         str, typer.Option(help=f"PX4 release of px4_msgs in the ROS 2 workspace: {', '.join(RELEASES)}")
     ] = RELEASES[-1],
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
     namespace: NamespaceOption = None,
     to: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Router of ROS 2 (default: the router of nedbus)")
+        str | None, typer.Option(metavar="ENDPOINT", help="ROS 2's router (default: nedbus's router)")
     ] = None,
 ) -> None:
     """Publish px4_msgs on /fmu/out/... to ROS 2 with rmw_zenoh."""
@@ -120,7 +120,7 @@ def ros2(
     try:
         session, observer = bus.open_session(to), bus.open_session(to)
     except ConnectError as exc:
-        raise NedbusError(f"no router answers at {to}: start the router of ROS 2 there, or correct --to") from exc
+        raise NedbusError(f"no router answers at {to}: start ROS 2's router there, or correct --to") from exc
     with closing(session), closing(observer):
         bridge = bridges.Ros2Bridge(
             bus, session, observer=observer, selection=selection, layout=layout, domain=domain, hashed=not humble,

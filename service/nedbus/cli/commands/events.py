@@ -53,7 +53,7 @@ def events(
     ] = None,
     severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
     origin: Annotated[
-        str, typer.Option(metavar="px4|nedbus", help="PX4's own texts, or events derived by nedbus")
+        str, typer.Option(metavar="px4|nedbus", help="PX4's own log messages, or events derived by nedbus")
     ] = ANY,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
@@ -61,9 +61,9 @@ def events(
 ) -> None:
     """Show vehicle events and their evidence, live or from a file.
 
-    Events are PX4's own texts, and those derived from messages: validity, dead reckoning, resets, origin, GPS, fusion,
-    failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. The evidence of an
-    event is the events up to ten seconds before it that may explain it. Live events are shown until Ctrl-C.
+    Events are PX4's own log messages, and those derived from messages: validity, dead reckoning, resets, origin, GPS,
+    fusion, failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. An event's
+    evidence is the events up to ten seconds before it that may explain it. Live events are shown until Ctrl-C.
     """
     require_one({"--json": json_output, "--csv": csv_output})
     for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):
@@ -121,9 +121,9 @@ def why(
 ) -> None:
     """Show the verdict on each vehicle, live or from a file: usable or not, since when, for how long, and why.
 
-    --all shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions
+    --all shows start, duration and possible causes of each fault: events of the ten seconds before it, and conditions
     that were already active; and missing topics that might explain it, with a hint. Live verdicts use the event history
-    of the nedbus services. Exits with 0, with and without faults.
+    of the nedbus services. Exits with 0 even if there are faults.
     """
     if files:
         read, found = _read(files)
@@ -140,7 +140,7 @@ def why(
         hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
         raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
     if not files and not reporting:
-        raise NedbusError(f"no nedbus service at {routers} has data of a vehicle: start one with 'nedbus serve'")
+        raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: start one with 'nedbus serve'")
     _require_vehicle(where, reporting, vehicle)
     for name in reporting if vehicle == ANY else [vehicle]:
         events = [event for event in found if event.vehicle in (name, ANY)]

@@ -19,7 +19,7 @@ from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
 pki = typer.Typer(help="Manage keys, certificates and access rules for tls/ endpoints.", no_args_is_help=True)
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
-WithinOption = Annotated[int, typer.Option(min=0, help="Days before expiry from which a certificate is due")]
+WithinOption = Annotated[int, typer.Option(min=0, help="Days before expiry when a certificate becomes due")]
 DaysOption = Annotated[int | None, typer.Option(min=1, help=f"Validity in days (default: {certificates.DAYS})")]
 
 
@@ -107,7 +107,7 @@ def renew(
     names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all expiring soon")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
-    new_key: Annotated[bool, typer.Option("--new-key", help="Create new keys, too")] = False,
+    new_key: Annotated[bool, typer.Option("--new-key", help="Also create new keys")] = False,
     days: DaysOption = None,
 ) -> None:
     """Renew certificates; names, hosts and keys do not change.

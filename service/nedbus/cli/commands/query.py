@@ -35,14 +35,14 @@ _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED"
 _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
-_SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
+_SIMILAR: Final = 0.8  # minimum similarity of a name that counts as a misspelling
 _MAX_ROWS: Final = 200  # rows of a table, and services shown: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 
 @command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
-    """List the published streams with state and age of their last message.
+    """List the published streams with the state of each and the age of its last message.
 
     Exits with 1 if the list is incomplete because the router is too slow or refuses the query.
     """
@@ -99,7 +99,7 @@ def get(
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services of the network with their sources and streams."""
+    """Show the services on the network with their sources and streams."""
     services, vehicles = bus.services(), bus.vehicles()
     if json_output:
         for service in services:

@@ -1,4 +1,4 @@
-"""Logging to stderr, limited against floods: text for terminals, syslog priorities for the journal, or JSON."""
+"""Rate-limited logging to stderr: text for terminals, syslog priorities for the journal, or JSON."""
 
 import atexit
 import json

@@ -36,7 +36,7 @@ class ProgressLog:
         self._hinted = False
         self._reports = 0
         self._reported = time.monotonic()
-        self._counts: dict[str, int] = {}  # messages published by each source until the last report
+        self._counts: dict[str, int] = {}  # messages published by each source up to the last report
 
     def update(self) -> None:
         """Log a report if one is due."""
@@ -67,7 +67,7 @@ class ProgressLog:
 
 @contextmanager
 def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
-    """Yield a function that shows a text, the number done and the total; it does nothing without a terminal."""
+    """Yield a function that shows a label, the number done and the total; it does nothing without a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

@@ -45,7 +45,7 @@ def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38)
 class Lines:
     """Format samples as lines; on a terminal in columns, with a heading per screenful and when the columns change.
 
-    A narrow terminal omits eph, then heading, then velocity, but never position, doubts and loss.
+    A narrow terminal omits eph, then heading, then velocity, but never position, doubtful flags or loss.
     If stdout is not a terminal, lines are complete and have no heading.
     """
 
@@ -87,7 +87,7 @@ class Lines:
 
 
 def _to_state(sample: Sample[Any]) -> str:
-    """Return the doubts about a sample, or "ok"; then its age if it is old, and the number lost before it."""
+    """Return the doubtful flags of a sample, or "ok"; then its age if it is old, and the number lost before it."""
     is_position = sample.message.DEFINITION is DEFAULT
     return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(sample)
 

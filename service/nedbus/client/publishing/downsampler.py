@@ -35,7 +35,7 @@ class MatchingListener:
         self._try_recv = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
-        """Return True if there are subscribers, by the latest report of Zenoh."""
+        """Return True if there are subscribers, by Zenoh's latest report."""
         with self._lock:
             try:
                 if (status := self._try_recv()) is not None:

@@ -22,13 +22,13 @@ _log = logging.getLogger(__name__)
 
 WINDOW: Final = 2000  # unacknowledged messages of a session; this fits into the queues of a link and of a reader
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
-_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; beyond, not even one per trickle period is sent
+_MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; at this limit even the trickle stops
 _MIN_WINDOW: Final = 100  # messages per publisher, however many there are
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
 _RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have dropped, is repeated; doubles each time
 _QUERY_TIMEOUT: Final = 10.0  # s, timeout of each query, and the longest pause before a request is repeated
-_STALE_POLL: Final = 1.0  # s without a poll after which replies are too old to tell which readers exist
+_STALE_POLL: Final = 1.0  # s without a poll after which replies are too old to show which readers exist
 _AWAY_PAUSE: Final = 0.2  # s before the next request while readers are away
 _POLL_EVERY: Final = 16  # messages between polls
 _DROP: Final = CongestionControl.DROP  # blocking on a full queue could make Zenoh close the link

@@ -80,7 +80,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         return self._writer.closed or self._writer.session.is_closed()
 
     def relabel(self, source: str) -> None:
-        """Set the source of all further messages, which readers see in `sample.source`."""
+        """Set the source of all subsequent messages, which readers see in `sample.source`."""
         if source != self.source:
             self.source, self._encoding = source, encoding_of(self.definition, source)
             self._partial = self._all, self._encoding

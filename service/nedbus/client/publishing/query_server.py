@@ -43,7 +43,7 @@ class QueryServer:
             self._queryables[key_expr] = _Queryable(self._session, key_expr, reply)
 
     def answer_json(self, key: str, parts: Callable[[Callable[[str], str | None]], Iterable[bytes]]) -> None:
-        """Reply to queries on a key with the JSON texts of `parts(get)`; `get` returns a parameter of the query."""
+        """Reply to queries on a key with the JSON documents of `parts(get)`; `get` returns a parameter of the query."""
 
         def reply(query: zenoh.Query) -> None:
             for part in parts(query.parameters.get):

@@ -17,7 +17,7 @@ from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
 _TURN: Final = 256  # heartbeats per call; more would delay other jobs
-HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # s, at most, until readers detect that they missed a last message
+HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # maximum time [s] until readers detect the loss of the last message
 
 
 class Writer:

@@ -165,7 +165,8 @@ class LayoutLookup:
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
         if not self._evict(len(fields) + _BASE):
             if not self._full:
-                _log.warning("%s: not decoded: too many messages are not installed here", name, extra=about("invalid"))
+                text = "%s: not decoded: too many definitions from publishers in use"
+                _log.warning(text, name, extra=about("invalid"))
             self._full = True
             return False
         try:

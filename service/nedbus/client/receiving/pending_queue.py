@@ -102,7 +102,7 @@ class PendingQueue:
         self._settling_until = float("-inf")
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
-        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest go unanswered
+        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # the oldest may go unanswered
         self._arrived = self._received = 0
 
     @property
@@ -368,7 +368,7 @@ class PendingQueue:
             info, writer = raw.source_info, stream.writer
             if info is not None:
                 source = info.source_id
-                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than names
+                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than by name
                     name = entity_name(source)
                     writer = stream.writers.get(name)
                     if writer is None:

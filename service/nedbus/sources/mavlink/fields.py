@@ -80,7 +80,7 @@ def _battery(message: Any) -> dict[str, object]:
 
 
 def _odometry(message: Any) -> dict[str, object]:
-    """Convert ODOMETRY; pose and velocity only in frames that PX4 has, too."""
+    """Convert ODOMETRY; pose and velocity only in frames that PX4 supports."""
     pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
     of_pose = {
         "pose_frame": pose, "position": (message.x, message.y, message.z), "q": tuple(message.q),

@@ -81,7 +81,7 @@ class _StreamLink:
 
 
 Link = _UdpLink | _StreamLink
-"""An open connection to one or several vehicles; its methods raise OSError."""
+"""An open connection to one or more vehicles; its methods raise OSError."""
 
 
 def parse_link(text: str) -> tuple[str, str, int]:

@@ -12,10 +12,10 @@ COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_C
 
 _TRIES: Final = 3  # per unanswered command
 _RESTARTS: Final = 2  # after START was accepted, but no data arrived
-_MIN_COUNT: Final = 32  # messages of a header from which its duration is estimated
+_MIN_COUNT: Final = 32  # messages of a header before its duration is estimated
 _EXPECTED_COUNT: Final = 400  # messages of a header; 274 to 410 were measured
 _STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
-_DECAY: Final = 0.98  # factor per message on the longest interval between messages
+_DECAY: Final = 0.98  # decay of the longest interval between messages, per message
 
 
 LogReason = Literal[
@@ -53,7 +53,7 @@ LogState = Literal[
 
 
 class LogStatus(NamedTuple):
-    """State of the stream, its cause, and a text for the log.
+    """State of the stream, its cause, and a description for the log.
 
     `idle`: before the first heartbeat. `starting`: a command is pending. `header`, `streaming`: data arrives.
     `waiting_for_disarm`, `refused`, `ended`: START is retried when allowed. `stopping`, `stopped`: after `stop`.

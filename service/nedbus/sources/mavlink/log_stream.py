@@ -108,7 +108,7 @@ class LogStream:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
         count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
-        yield from [Rejection(where, "more than 100 texts a second", count=count)] * (count > 0)
+        yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
         """Use the answer to a TIMESYNC request sent at `sent`, if its round trip is the shortest so far."""
@@ -183,7 +183,7 @@ class LogStream:
         least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
         self._at_least += least
         self._unreported += least
-        # Include the message that ends the gap, and the record that the gap cut.
+        # Include the message that ends the gap, and the record that the gap truncated.
         self._at_most += math.ceil(_CHUNK_SIZE * (lost + 1) / smallest) + 1
         self._parser.gap()
 
@@ -229,7 +229,7 @@ class LogFile:
         del self._partial[:end]
 
     def mark_gap(self, seconds: float) -> None:
-        """Discard the record that the gap cut, and write a dropout of this duration."""
+        """Discard the record that the gap truncated, and write a dropout of this duration."""
         self._partial.clear()
         if not self._begins:
             self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))

@@ -35,7 +35,7 @@ _COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 
 class MavlinkSource:
-    """A link to one or several vehicles.
+    """A link to one or more vehicles.
 
     Fields that MAVLink does not transmit are left out, not derived from others: resets, variances of heading and tilt,
     accelerations and limits of VehicleLocalPosition, and the mode of VehicleStatus.

@@ -27,8 +27,8 @@ _FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter one is the last
-_MAX_WAITING: Final = 100  # texts
-_MAX_BYTES: Final = 500  # of a text
+_MAX_WAITING: Final = 100  # log messages
+_MAX_BYTES: Final = 500  # of a log message
 _DEBUG: Final = 7
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -146,7 +146,7 @@ class Vehicle:
         if kind == "STATUSTEXT" and LOG_MESSAGE.name in self._topics:
             if not self._text_limit.admits(round(now * 1e6)):
                 address = Address(self._name, LOG_MESSAGE.name)
-                return Rejection(str(address), "more than 100 texts a second", address)
+                return Rejection(str(address), "more than 100 log messages per second", address)
             self._texts.add(message, now)
         if fields_of is None and self._newest is not None:
             topic, timestamp, fields_of = LOG_MESSAGE.name, self._newest * 1000, lambda _: self._texts.pop(now)

@@ -219,7 +219,7 @@ def _read_definitions(paths: str) -> Definitions:
 
     Unsupported messages in a folder are skipped and logged.
 
-    Raises ConfigError for a file that is unreadable, or invalid, with line and column.
+    Raises ConfigError for an unreadable file, or with line and column for an invalid one.
     """
     found: dict[str, dict[str, Definition[Any]]] = {}
     skipped: list[str] = []
@@ -259,7 +259,7 @@ def _with_nested_messages(file: Path) -> str:
 
 
 def _read_text(file: Path) -> str:
-    """Read a text in UTF-8, with or without a byte order mark, or else in Latin-1."""
+    """Read a text file in UTF-8, with or without a byte order mark, or else in Latin-1."""
     content = file.read_bytes()
     try:
         return content.decode("utf-8-sig")

@@ -41,7 +41,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     )
     expected = [
         (1, 1, "prefix 'a//b' is not valid"),
-        (2, 1, "there is no setting 'conect'"),
+        (2, 1, "unknown setting 'conect'"),
         (3, 1, "vehicle 'a b' is not valid"),
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
@@ -51,9 +51,9 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
         (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"),
         (7, 1, "until_done: "),
         (8, 1, "gone.crt cannot be read"),
-        (9, 12, "source 'foo:': there is no kind 'foo'"),
+        (9, 12, "source 'foo:': unknown kind 'foo'"),
         (9, 20, "source 'mavlink:udpin:0.0.0.0:99999?sed=1&baud=0': baud=0 is invalid"),
-        (9, 64, "source 'ulog:gone.ulg?sed=1': there is no option 'sed'"),
+        (9, 64, "source 'ulog:gone.ulg?sed=1': unknown option 'sed'"),
     ]
     for command in (("check",), ("serve", "--check", "--config")):
         lines = check(file, command=command)
@@ -116,7 +116,7 @@ def test_mistakes_in_source_tables_are_reported_with_line(tmp_path: Path) -> Non
     """An unknown option is reported at its line; a missing log at its table, but not with --offline."""
     file = tmp_path / "nedbus.toml"
     file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
-    wrong = f"{file}, line 3, column 1: source 'sim:?sed=1': there is no option 'sed'"
+    wrong = f"{file}, line 3, column 1: source 'sim:?sed=1': unknown option 'sed'"
     lines = check(file)
     assert lines[0].startswith(wrong)
     assert lines[1] == f"{file}, line 5, column 3: source 'ulog:gone.ulg': gone.ulg: no such file or directory"
