@@ -29,7 +29,7 @@ def open_mcap(path: str, options: RecordedOptions, default_vehicle: str) -> Repl
         found = ", ".join(sorted({stream.address.topic for stream in reader.counts}))
         raise SourceError(path, f"this recording has none of the requested topics; it has {found}")
     if options.vehicle is not None and len(vehicles) > 1:
-        raise ConfigError("vehicle", f"{path} has several vehicles ({', '.join(vehicles)}): remove it")
+        raise ConfigError("vehicle", f"{path} has several vehicles ({', '.join(vehicles)}): remove this option")
     total = sum(counts.values())
     absent = options.absent_from({each.topic for each in addresses}, "this recording")
     return ReplayRun(
