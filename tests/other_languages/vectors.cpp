@@ -91,6 +91,7 @@ json checked(const json& value, const Type& type) {
     if (!value.is_string()) fail();
     auto text = value.get<std::string>();
     text = text.substr(0, text.find('\0'));
+    if (text.size() > type.length) fail();
     const auto dumped = json(text).dump(-1, ' ', false, json::error_handler_t::replace);  // U+FFFD for what is not UTF-8
     text = json::parse(dumped).get<std::string>();
     for (std::size_t at; (at = text.find("\xef\xbf\xbd")) != std::string::npos;) text.replace(at, 3, "?");

@@ -19,7 +19,9 @@ function decodeValue(value, { base, length }) {
   if (base === "char") {
     if (!(value instanceof Uint8Array)) throw new Error("type");
     const end = value.indexOf(0);
-    return new TextDecoder().decode(end < 0 ? value : value.subarray(0, end)).replaceAll("\ufffd", "?");
+    const text = end < 0 ? value : value.subarray(0, end);
+    if (text.length > length) throw new Error("type");
+    return new TextDecoder().decode(text).replaceAll("\ufffd", "?");
   }
   if (typeof value !== "number" && typeof value !== "bigint") throw new Error("type");
   if (base === "float32") return Math.fround(Number(value));

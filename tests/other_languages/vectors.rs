@@ -99,6 +99,9 @@ fn checked(value: &Value, kind: &Type) -> Result<Json> {
     if kind.base == "char" {
         let Value::String(text) = value else { return Err("type".into()) };
         let bytes = text.as_bytes().split(|byte| *byte == 0).next().unwrap_or_default();
+        if bytes.len() > kind.length {
+            return Err("type".into());
+        }
         return Ok(String::from_utf8_lossy(bytes).replace('\u{fffd}', "?").into());
     }
     if kind.base.starts_with("float") {

@@ -16,7 +16,7 @@ from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, Un
 from nedbus_msgs.model.declaration import cached_on_owner
 from nedbus_msgs.model.definition import Definition, M, upgrade_with
 from nedbus_msgs.model.message import fill
-from nedbus_msgs.model.px4_types import BASES, FieldType
+from nedbus_msgs.model.px4_types import BASES, FieldType, decode_text
 from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
@@ -196,7 +196,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
     if len(payload) > PAYLOAD_LIMIT:
         raise reject(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
     try:
-        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="replace")
+        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="surrogateescape")
     except (ValueError, msgpack.UnpackException) as exc:
         raise reject(f"{len(payload)} bytes are not a single msgpack value ({exc or type(exc).__name__})") from exc
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
@@ -208,6 +208,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
         raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
     if len(values) != len(names):
         raise reject(f"{len(values)} fields, expected {len(names)} for layout {layout}")
+    fields: dict[str, object] = {}
     for name, value in zip(names, values, strict=True):
         # No field has nested arrays, and formatting a deeply nested value would overflow the stack.
         parts = value if isinstance(value, tuple) else (value,)
@@ -217,4 +218,5 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
         # The model would accept the float names of JSON, such as "NaN".
         if not is_text and any(isinstance(part, str) for part in parts):
             raise reject(f"{name}: text, expected numbers or bools")
-    return dict(zip(names, values, strict=True))
+        fields[name] = decode_text(value.encode(errors="surrogateescape")) if isinstance(value, str) else value
+    return fields
