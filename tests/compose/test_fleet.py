@@ -1,4 +1,4 @@
-"""Failures in a fleet of two ground stations and a cloud, each with a router, and a narrow link to the cloud."""
+"""Failures in a fleet of two ground stations and a cloud, each with a router, and a low-bandwidth link to the cloud."""
 
 from __future__ import annotations
 
