@@ -1,4 +1,4 @@
-# Every target creates .venv; only Python 3.11 or newer and make have to be installed.
+# Every target creates .venv; only Python 3.11 or newer and make must be installed.
 
 PYTHON ?= python3
 VENV := .venv
