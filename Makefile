@@ -88,7 +88,7 @@ lock: $(DEV)  ## update the pinned dependencies of the image to the newest versi
 	$(BIN)/uv pip compile $(LOCK) $(IMAGE_EXTRAS:%=--extra %) pyproject.toml -o packaging/requirements-image.txt
 	$(BIN)/uv pip compile $(LOCK) --group sbom -o packaging/requirements-build.txt
 
-bench: $(DEV)  ## run the benchmarks: comparison with peers, fleets, slow readers, replay pacing, idle load
+bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow readers, replay pacing, idle load
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
 	$(BIN)/python -m benchmarks.compare.picture
