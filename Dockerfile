@@ -1,7 +1,7 @@
 # The service and the commands. Zenoh has no wheels for musl: the base must be Debian or another glibc system.
 ARG NEDBUS_BASE_IMAGE=python:3.11-slim-bookworm
 
-# Dependencies, which change rarely: exactly the files whose hashes are locked; `make lock` renews the locks.
+# Dependencies, which change rarely: exactly the files whose hashes are locked; `make lock` updates them.
 FROM ${NEDBUS_BASE_IMAGE} AS dependencies
 WORKDIR /build
 RUN python3 -m venv /opt/tools && python3 -m venv --without-pip /opt/nedbus

@@ -1,4 +1,4 @@
-# Every target creates .venv; only Python 3.11 or newer and make have to be installed.
+# Every target creates .venv; only Python 3.11 or newer and make must be installed.
 
 PYTHON ?= python3
 VENV := .venv
@@ -41,10 +41,10 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	$(BIN)/pip install -q --group docs
 	$(BIN)/python -m docs.generator --site
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --fresh-env docs build/site
-	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from elsewhere
+	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from other hosts
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## run the tests without routers and processes: under half a minute
+quick: $(DEV)  ## run the tests without routers or processes: under half a minute
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
 test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two cores
@@ -83,12 +83,12 @@ wheel: $(DEV)  ## build the wheel, install it in a clean environment, use it, an
 	PATH=$(abspath $(BIN)):$$PATH packaging/sbom build/wheel-venv "$$(echo dist/nedbus-*.whl | sed 's/-py3.*/.cdx.json/')"
 	@! grep -qF '[SECURITY CONTACT' SECURITY.md || echo 'warning: SECURITY.md has no contact; fill it in before a release' >&2
 
-lock: $(DEV)  ## renew the pinned dependencies of the image: the newest versions that pyproject.toml allows
+lock: $(DEV)  ## update the pinned dependencies of the image to the newest versions that pyproject.toml allows
 	$(BIN)/pip install -q --group lock
 	$(BIN)/uv pip compile $(LOCK) $(IMAGE_EXTRAS:%=--extra %) pyproject.toml -o packaging/requirements-image.txt
 	$(BIN)/uv pip compile $(LOCK) --group sbom -o packaging/requirements-build.txt
 
-bench: $(DEV)  ## run the benchmarks: comparison with peers, fleets, slow readers, replay pacing, idle load
+bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow readers, replay pacing, idle load
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
 	$(BIN)/python -m benchmarks.compare.picture

@@ -164,7 +164,7 @@ def ack_key(key_expr: str) -> str:
 def get_topic(name: object) -> Topic:
     """Return a topic by name; an unknown name counts as a PX4 topic that is not built in.
 
-    Raises AddressError for a name that is not lower_snake_case, or looks like a misspelling of a known topic.
+    Raises AddressError for a name that is not lower_snake_case, or looks like a misspelling of a built-in topic.
     """
     if not isinstance(name, str):
         raise AddressError("topic", name, 'one topic name (call once per topic), or "*" for all')

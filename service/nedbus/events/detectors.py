@@ -71,7 +71,7 @@ class FieldReader:
             return self._of_fields(message) if type(message) is dict else self._of_message(message)
         except KeyError:
             return tuple(cast("Fields", message).get(name, self._absent) for name in self.names)
-        except AttributeError:  # the publisher defines the fields of a topic without a .msg file
+        except AttributeError:  # the publisher defines the fields of a topic that is not built in
             return tuple(getattr(message, name, self._absent) for name in self.names)
 
 

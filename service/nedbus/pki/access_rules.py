@@ -24,7 +24,7 @@ _BLOCK: Final = re.compile(
 _SUBJECT: Final = re.compile(
     rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE
 )
-# A vehicle sends data, last values, retransmissions (@adv), downsampled streams (@rate), liveliness tokens, probes of
+# A vehicle sends data, last messages, retransmissions (@adv), downsampled streams (@rate), liveliness tokens, probes of
 # `nedbus doctor`, rejection reports and the service status.
 _MESSAGES: Final = '["put", "delete", "reply", "declare_queryable", "liveliness_token"]'
 _KEYS: Final = (

@@ -83,8 +83,8 @@ class UlogReader:
                 self.damaged |= second.address.instance is not None or number == 0
         if not self.streams:
             topics = self._topics
-            wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
-            reason = f"this log has no message of {wanted}"
+            what = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "built-in topics"
+            reason = f"this log has no message of {what}"
             if topics is not None and self._subscribed:
                 names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
                 reason += f", but of {names}: choose them by name, or all with topics=* or read(path, ['*'])"

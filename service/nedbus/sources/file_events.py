@@ -38,7 +38,7 @@ class FileEvents:
 
 
 class _EventOptions(RecordedOptions):
-    """Replay options for event detection: all known topics, and two that nedbus does not define."""
+    """Replay options for event detection: all built-in topics, and two others."""
 
     @property
     def chosen_topics(self) -> Collection[str]:

@@ -65,7 +65,7 @@ class Options(BaseModel):
 
     @property
     def chosen_topics(self) -> Collection[str] | None:
-        """The topics to deliver, by default those that nedbus defines; None means all."""
+        """The topics to deliver, by default the built-in ones; None means all."""
         if ANY in self.topics:
             return None
         return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS

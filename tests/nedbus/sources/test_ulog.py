@@ -30,7 +30,7 @@ REAL = {
     "sitl_1.13_three_topics.ulg": (1871, "1.13", 5),
     "sitl_1.15_events.ulg": (313, "1.15", 1),
 }
-NOTHING = "this log has no message of a known topic"
+NOTHING = "this log has no message of built-in topics"
 
 
 def open_log(path: Path, options: str = "") -> ReplayRun:

@@ -110,7 +110,7 @@ def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
 
 
 def test_message_without_msg_file_is_decoded(join: Join) -> None:
-    """Readers may query vehicles for any definition, even without a .msg file; no topic needs its own rule."""
+    """Readers may query vehicles for definitions, also of messages that are not built in, without a rule per topic."""
     vehicle, reader = join("vehicle-1"), join("reader")
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]

@@ -41,7 +41,7 @@ class KeyState:
     key: str  # key of the full-rate stream
     wire_key: str  # key on which messages arrive, perhaps downsampled
     address: Address
-    codec: Codec[Any] | None = None  # None for messages not installed here: each encoding identifies a definition
+    codec: Codec[Any] | None = None  # None for messages not built in: each encoding identifies a definition
     size: int = -1  # bytes of its payload with all fields
     encoding: tuple[object, str] = None, ""  # the last one, Zenoh's object and its text; accessed by two threads
     provenance: tuple[str, Provenance] = "", Provenance()  # the last one, with its encoding

@@ -1,4 +1,4 @@
-"""Layout lookup: query publishers for message definitions and layouts that are not installed here."""
+"""Layout lookup: query publishers for message definitions and layouts that are not built in."""
 
 import logging
 import threading
@@ -35,7 +35,7 @@ _MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
 _BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait for longer
 
-# Message name, and number of a newer layout or, for a message not installed here, hash of its definition.
+# Message name, and number of a newer layout or, for a message that is not built in, hash of its definition.
 SchemaId = tuple[str, int | str]
 Schemas = Mapping[SchemaId, Mapping[str, str]]  # definitions from publishers: field types by name
 
@@ -68,7 +68,7 @@ class LayoutLookup:
         return self._newer.get(definition.name, {})
 
     def codec(self, name: str, identity: str, *, publisher: object = None, wait: bool = False) -> Codec[Any] | None:
-        """Return the codec of a message not installed here; None if unknown, which starts a lookup.
+        """Return the codec of a message that is not built in; None if unknown, which starts a lookup.
 
         `publisher`: after a failed lookup, one for another publisher starts at once, without backoff.
         `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
@@ -175,7 +175,7 @@ class LayoutLookup:
             _log.warning("%s: invalid definition from a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
         self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
-        text = "%s is not installed here: using the publisher's definition"
+        text = "%s is not built in: using the publisher's definition"
         _log.info(text, name, extra=about("runtime_definition", reason=f"hash {identity}"))
         return True
 

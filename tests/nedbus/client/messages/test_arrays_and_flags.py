@@ -194,7 +194,7 @@ def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bus: nedbus.Bus) -> None:
-    """`nedbus schema` queries publishers for a topic that nedbus does not define; other names are usage errors."""
+    """`nedbus schema` queries publishers for a topic that is not built in; other names are usage errors."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )

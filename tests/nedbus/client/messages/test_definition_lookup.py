@@ -1,4 +1,4 @@
-"""Messages that nedbus does not define, read with the definition queried from their publisher."""
+"""Messages that are not built in, read with the definition queried from their publisher."""
 
 from __future__ import annotations
 

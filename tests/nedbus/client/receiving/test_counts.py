@@ -230,7 +230,7 @@ def test_newer_layout_is_looked_up_once(
 
 
 def test_last_message_of_a_newer_layout_is_decoded(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """A query for last messages waits for the lookup of a layout that is not installed locally."""
+    """A query for last messages waits for the lookup of a layout that is not built in."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     last = reply_with({KEY: msgpack.packb([9, 4, True, 2.5])}, attachment=LIVE)

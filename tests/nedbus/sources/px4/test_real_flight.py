@@ -49,7 +49,7 @@ FLIGHT: Final = PX4 / "gps_loss_zenoh.jsonl.gz"
 TWELVE: Final = PX4 / "twelve_messages"
 DEFAULT_PUBCSV: Final = PX4 / "default_pubcsv_zenoh.jsonl.gz"
 MSG: Final = Path(__file__).parents[3] / "data" / "msg"
-"""PX4's definitions of messages that nedbus does not define."""
+"""PX4's definitions of messages that are not built in."""
 ALIKE: Final = PX4 / "two_alike_zenoh.jsonl.gz"
 MAVLINK: Final = PX4 / "gps_loss_mavlink.bin.gz"
 WINDOW: Final = 100  # messages in flight at once
@@ -276,7 +276,7 @@ def is_equal(value: object, logged: object) -> bool:
 def test_all_topics_of_flight_equal_log(where: str) -> None:
     """All 69,605 messages of 21 topics are published and read; the 46,457 that are in the log equal it in all fields.
 
-    11 that PX4 counted are missing in the recording. The five types that nedbus does not define are supplied, one of
+    11 that PX4 counted are missing in the recording. The five types that are not built in are supplied, one of
     them with nested messages. A reader gets the definitions with the first messages, and loses none.
     """
     logged = read_log(TWELVE.with_suffix(".ulg"))
