@@ -1,4 +1,4 @@
-"""The site of the documentation: `make docs`, which makes docs/reference first. Nothing of it is fetched."""
+"""Sphinx configuration; `make docs` generates docs/reference first. The site loads nothing from other hosts."""
 
 import nedbus
 

@@ -2,7 +2,7 @@
 
 One vehicle is published live at 2,000 messages a second. A script is idle, or computes all the time and reads in a
 second thread, or computes for 10 ms between two reads.
-Targets: mode `every` loses and drops nothing, and messages of mode `latest` are at most 50 ms old (p99).
+Targets: mode `every` loses and drops nothing, and messages in mode `latest` are at most 50 ms old (p99).
 """
 
 from __future__ import annotations

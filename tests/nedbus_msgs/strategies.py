@@ -117,7 +117,7 @@ def bits(message: VehicleLocalPosition) -> dict[str, str]:
 
 
 def pack_full_width(values: Mapping[str, object]) -> bytes:
-    """Return the full-width payload of values of the right types, without checking the rules."""
+    """Encode correctly typed values at full width, without checking the rules."""
     forms = {"uint64": ">BQ", "uint8": ">BB", "float32": ">Bf", "float64": ">Bd"}
     tags = {"uint64": 0xCF, "uint8": 0xCC, "float32": 0xCA, "float64": 0xCB}
     parts = [b"\xdc\x00\x36\x01"]

@@ -187,7 +187,7 @@ class Bus(AbstractContextManager["Bus"]):
 
         It returns once the router has processed its declarations: later subscribers receive the last message.
         `lossless`: flow control for replays as fast as the readers. `publish` slows down to 10 messages per second
-        while a reader of mode "every" has more than 2,000 unread messages; `close` waits until the readers have all
+        while a reader in mode "every" has more than 2,000 unread messages; `close` waits until the readers have all
         messages.
         `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
         `definition`: of a custom message, from `define_msg`; readers query it from the publisher.

@@ -1,6 +1,6 @@
 """The acknowledgement protocol between publishers and readers.
 
-A lossless publisher requests acknowledgements from readers of mode `every` with the query
+A lossless publisher requests acknowledgements from readers in mode `every` with the query
 `<key>/@ack?publisher=<id>;number=<sequence number>;read=<0 or 1>`.
 """
 

@@ -50,7 +50,7 @@ class Times:
         return "start" if event.boot is None else "boot"
 
     def text(self, event: Event) -> str:
-        """Format the time of an event without date, as `find` parses it: 14:05:12.3, 123.400 or +12.300."""
+        """Format the time of an event without the date, as `find` parses it: 14:05:12.3, 123.400 or +12.300."""
         utc = self.utc(event)
         if utc is None:
             return f"+{event.time:.3f}" if event.boot is None else f"{event.boot:.3f}"

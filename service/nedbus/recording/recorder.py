@@ -18,7 +18,7 @@ _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
 
 
 class Recorder:
-    """Write every message of a subscription of mode "every" to a new MCAP file.
+    """Write every message of a subscription in mode "every" to a new MCAP file.
 
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
     """

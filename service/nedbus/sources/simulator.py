@@ -280,7 +280,7 @@ def battery(time: float, _: Truth) -> dict[str, object]:
 
 
 def gps(time: float, truth: Truth) -> dict[str, object]:
-    """Return a GNSS fix with noise; there is none before the origin is set, and in the outage."""
+    """Return a noisy GNSS fix, or no fix before the origin is set and during the outage."""
     now, is_started = _BOOT + round(time * 1e6), time >= _ORIGIN_SET
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
     north, east, down = (

@@ -493,7 +493,7 @@ def test_wrong_protocol_and_wrong_tls_files_are_reported(
 def test_read_and_write_permissions_are_reported(
     run_router: Run, pki: Path, *, client: str, vehicle: str | None, published: str, check: str, state: State, text: str
 ) -> None:
-    """A vehicle's certificate may write it but not read; a reader's may not write, and reveals dropped messages."""
+    """A vehicle may only write, and only as itself; a reader may only read, and detects dropped messages."""
     older = {"@doctor": "@probe"} if client == "older" else {}  # access rules without the probe key
     endpoint, own = run_router(**older), client_tls(pki, "vehicle-1")
     with (

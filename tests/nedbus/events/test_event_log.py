@@ -169,7 +169,7 @@ def test_continuous_loss_is_reported_every_20_s(flight: Flight) -> None:
     assert [event.numbers["messages"] for event in reported] == [22, 22, 22, 22]
 
 
-def test_rejections_are_one_condition(flight: Flight) -> None:
+def test_consecutive_rejections_are_one_condition(flight: Flight) -> None:
     """The first rejected message begins the condition, with its reason; 5 s without a rejection end it."""
     begun = flight.reject("x is NaN")
     assert brief(begun) == [("rejected", "begin", "watch")]

@@ -277,8 +277,8 @@ def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
     assert nedbus.read(path, "battery_status")["cell_count"].tolist() == [6, 0, 0, 7]
 
 
-def test_old_log_without_release_is_not_damaged(tmp_path: Path) -> None:
-    """It is converted with exit code 0, and a change of mode in it is an event."""
+def test_old_log_without_release_is_not_reported_as_damaged(tmp_path: Path) -> None:
+    """The log is converted with exit code 0, and a mode change in it is an event."""
     path = write_old_log(tmp_path / "a.ulg", [6])
     converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)

@@ -132,8 +132,8 @@ def test_oversized_websocket_message_closes_the_connection(url: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
-def test_page_above_the_limit_shows_a_notice(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """A page above the limit, 1 here, shows only a notice."""
+def test_page_above_the_viewer_limit_shows_a_notice(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """A page above the limit of open pages, 1 here, shows only a notice."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for text in ("a word", "limit of 1 open pages reached: close one"):
         session = pull_session(url=url)

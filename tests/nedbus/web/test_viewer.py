@@ -543,7 +543,7 @@ def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFlee
 
 
 def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
-    """The selected vehicle and those with faults come first; the last row counts the hidden vehicles of the 50."""
+    """The selected vehicle and those with faults come first; of 50 vehicles, the last row counts those hidden."""
     addresses = [Address(f"uav-{number}", VLP) for number in range(1, 51)]
     sim.fly(1, *addresses)
     sim.fly(1, addresses[29], xy_valid=False)

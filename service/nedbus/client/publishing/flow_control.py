@@ -1,4 +1,4 @@
-"""Flow control of lossless publishers, by acknowledgements of the readers of mode `every`."""
+"""Flow control of lossless publishers, based on acknowledgements from readers in mode `every`."""
 
 import logging
 import math

@@ -31,7 +31,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
     A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
     `publish` never waits for slow readers, unless the publisher is lossless: it then slows down to 10 messages per
-    second while a reader of mode "every" has more than 2,000 unread messages.
+    second while a reader in mode "every" has more than 2,000 unread messages.
     Not thread-safe. A context manager.
     """
 
@@ -132,7 +132,7 @@ class Publisher(AbstractContextManager["Publisher"]):
             self._put(payloads[start : start + size], self._all)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
-        """Wait until all readers of mode "every" have received all messages; return False on timeout.
+        """Wait until all readers in mode "every" have received all messages; return False on timeout.
 
         If the process ends without a flush, messages in transit to a slow reader are lost and not counted as lost.
         A disconnected reader detects the messages it missed, and recovers those still in the history cache.

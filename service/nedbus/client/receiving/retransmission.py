@@ -1,4 +1,4 @@
-"""Retransmission requests of mode `every`, sent to each publisher by its exact key and repeated for 20 s.
+"""Retransmission requests in mode `every`, sent to each publisher by its exact key and repeated for 20 s.
 
 Zenoh's own recovery sends one query with the subscription's key expression, which routers match against every
 publisher's cache: with 1,000 publishers a router restart caused a query storm that left gaps unfilled.

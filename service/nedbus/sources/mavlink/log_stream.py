@@ -176,7 +176,7 @@ class LogStream:
         return SourceMessage(0.0, stream.address, fields, lost, definition=definition, source=_SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int) -> None:
-        """Count a gap; the bounds of lost records follow from the smallest and largest record."""
+        """Count a gap; derive bounds on the number of lost records from the smallest and largest record size."""
         self._gaps += 1
         self._lost += lost
         smallest, largest = self._record_sizes()

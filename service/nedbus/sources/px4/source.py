@@ -215,7 +215,7 @@ class Px4ZenohNode:
 
 
 def _read_definitions(paths: str) -> Definitions:
-    """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
+    """Read a comma-separated list of .msg files, and folders of them such as PX4's `msg`.
 
     Unsupported messages in a folder are skipped and logged.
 

@@ -75,8 +75,8 @@ def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
         assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host")
 
 
-def test_two_sources_of_one_address_are_a_mistake(tmp_path: Path) -> None:
-    """Two sources must not publish the same address: checked for replays, and live sources that name a vehicle."""
+def test_two_sources_with_the_same_address_are_reported(tmp_path: Path) -> None:
+    """Replays, and live sources with a named vehicle, must not publish an address of another source."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
@@ -96,8 +96,8 @@ def test_two_sources_of_one_address_are_a_mistake(tmp_path: Path) -> None:
     assert [line.partition(": ")[2] for line in check("--offline", file)] == sims
 
 
-def test_router_config_of_settings_is_checked(tmp_path: Path) -> None:
-    """The file of `router_config` is checked with the settings, except endpoints that the settings replace."""
+def test_router_config_named_in_settings_is_checked(tmp_path: Path) -> None:
+    """The file named by `router_config` is checked with the settings, except endpoints that the settings replace."""
     file, router = tmp_path / "nedbus.toml", tmp_path / "router.json5"
     router.write_text(
         '{ listen: { endpoints: ["tls/192.0.2.1:7447"] },\n transport: { link: { tls: {\n'

@@ -579,7 +579,7 @@ def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> No
 @pytest.mark.slow
 @pytest.mark.process
 def test_make_run_twice_explains_the_address_conflict(tmp_path: Path) -> None:
-    """A second `make run` names the address in use and the remedy; Ctrl-C ends the first without an error of make."""
+    """A second `make run` names the address in use and the remedy; Ctrl-C ends the first without a make error."""
     program = tmp_path / "venv" / "bin" / "nedbus"
     program.parent.mkdir(parents=True)
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')

@@ -159,7 +159,7 @@ def test_max_rate_downsamples(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock,
 
 @BOTH
 def test_lost_messages_are_recovered(endpoint: str, bus: nedbus.Bus, address: Address) -> None:
-    """A reader of mode `every` gets lost messages from the publisher's history cache, in order."""
+    """A reader in mode `every` gets lost messages from the publisher's history cache, in order."""
     publisher, queue = publisher_of(bus, address), LossyQueue(address.key())
     queue.missing = {1, 2, 3, 6}
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:

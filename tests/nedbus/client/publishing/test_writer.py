@@ -123,7 +123,7 @@ def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> Non
     assert stream.wait(HEARTBEAT)
 
 
-def test_heartbeat_has_the_number_of_the_last_message(stream: Stream) -> None:
+def test_heartbeat_has_the_last_sequence_number(stream: Stream) -> None:
     """A heartbeat has the sequence number of the last message, which starts at 0 and wraps after 2^32."""
     for published, payload in ((1, b"\0\0\0\0"), (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"), (2**32, b"\xff" * 4)):
         stream.publish(published)

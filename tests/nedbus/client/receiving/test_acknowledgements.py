@@ -1,4 +1,4 @@
-"""Acknowledgements of a reader of mode `every`, without Zenoh and without a publisher."""
+"""Acknowledgements of a reader in mode `every`, without Zenoh and without a publisher."""
 
 from __future__ import annotations
 

@@ -238,7 +238,7 @@ def test_wait_ends_with_sample_wake_end_or_timeout() -> None:
 
 @pytest.fixture
 def small_queue(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
-    """Return a queue of mode `every` for 10 samples, of which 4 stay attached to their receive buffer."""
+    """Return a queue for mode `every` for 10 samples, of which 4 stay attached to their receive buffer."""
     monkeypatch.setattr(module, "CAPACITY", 10)
     monkeypatch.setattr(module, "_MAX_FRESH", 4)
     return make_queue("every")

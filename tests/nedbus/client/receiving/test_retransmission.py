@@ -1,4 +1,4 @@
-"""Recovery of lost messages by a reader of mode `every`, with real publishers and sessions on loopback.
+"""Recovery of lost messages by a reader in mode `every`, with real publishers and sessions on loopback.
 
 Loopback is lossless, so messages are removed between Zenoh and the queue of one reader. The last test restarts a
 real router.

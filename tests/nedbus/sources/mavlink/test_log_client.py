@@ -363,7 +363,7 @@ class TestHeader:
 
     @pytest.mark.parametrize("round_trip", [0.03, 0.08, 0.2, 3.0])
     def test_long_round_trip_aborts_header(self, session: Session, round_trip: float) -> None:
-        """The first messages decide; acknowledgements cease, because during the header PX4 obeys STOP only then."""
+        """Detected in the first messages; acknowledgements stop too, or PX4 would ignore STOP during the header."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         began = session.now

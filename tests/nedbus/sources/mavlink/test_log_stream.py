@@ -103,7 +103,7 @@ def logged_messages(path: Path) -> dict[tuple[str, int], set[str]]:
 
 
 def compare(received: Received, path: Path) -> int:
-    """Return the number of messages that are in the log; only those in its gap during the header may be missing."""
+    """Count the streamed messages that are in PX4's log; only those in its gap during the header may be missing."""
     logged = logged_messages(path)
     missing = [
         each for each in received.stream

@@ -76,7 +76,7 @@ class Sent:
 
     @property
     def address(self) -> Address:
-        """The address under which the service publishes it."""
+        """The address under which the service publishes the message."""
         _, topic, instance = split_ros2_topic("/".join(self.key.split("/")[1:-2]))
         return Address("1", topic, instance)
 
@@ -314,7 +314,7 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
 
 
 @pytest.mark.slow
-def test_topics_lost_by_default_pubcsv_are_reported_silent(where: str) -> None:
+def test_topics_lost_with_default_pub_csv_are_reported_as_silent(where: str) -> None:
     """With PX4's default pub.csv, topics that stop or never arrive are silent, and the doctor suggests the remedy.
 
     In the recording all reliable topics stop after 3.4 s, and only the others continue, for 4.3 s; it is played at half
