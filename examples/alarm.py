@@ -30,6 +30,9 @@ def states(vehicle: str) -> Iterator[str]:
                 yield f"ALARM: {', '.join(doubts).lower()}" if doubts else "good"
 
 
+if any(argument.startswith("-") for argument in sys.argv[1:]):
+    print("usage: alarm.py [VEHICLE]", file=sys.stderr)
+    sys.exit(2)
 with suppress(KeyboardInterrupt):
     watched = sys.argv[1] if len(sys.argv) > 1 else "1"
     shown = ""

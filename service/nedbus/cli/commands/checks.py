@@ -184,7 +184,7 @@ def doctor(
     """Diagnose why no messages arrive.
 
     Checks router, certificates, permissions, clocks, vehicles and MAVLink; lists the worst findings last.
-    Takes a few seconds and changes nothing. Exits with 1 if a finding is wrong, else 0.
+    Takes a few seconds and changes nothing. Exits with 1 if a finding has the state wrong.
     """
     if vehicle is not None:
         check_vehicle(vehicle)

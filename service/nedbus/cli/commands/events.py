@@ -63,7 +63,8 @@ def events(
 
     Events are PX4's own log messages, and those derived from messages: validity, dead reckoning, resets, origin, GPS,
     fusion, failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. An event's
-    evidence is the events up to ten seconds before it that may explain it. Live events are shown until Ctrl-C.
+    evidence is earlier events that may explain it, up to ten seconds old or still active. Live events are shown until
+    Ctrl-C.
     """
     require_one({"--json": json_output, "--csv": csv_output})
     for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):

@@ -110,7 +110,7 @@ def renew(
     new_key: Annotated[bool, typer.Option("--new-key", help="Also create new keys")] = False,
     days: DaysOption = None,
 ) -> None:
-    """Renew certificates; names, hosts and keys do not change.
+    """Renew certificates with their names, hosts and (without --new-key) keys.
 
     The old certificates remain valid until they expire.
     """

@@ -145,7 +145,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a message, or its supported layouts.
 
-    The schema of an undeclared message is requested from its publisher.
+    The schema of a message that is not built in is requested from its publisher.
     """
     try:
         definition: Definition[Any] = definition_of(message)

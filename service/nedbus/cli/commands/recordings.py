@@ -36,7 +36,7 @@ def record(
 ) -> None:
     """Record messages to an MCAP file until Ctrl-C.
 
-    A power failure loses at most the last second.
+    A crash loses at most the last second.
     """
     notice = time.monotonic() + TIMINGS.first_sample
     with bus.subscribe_to(selection, mode="every") as subscription:
@@ -68,7 +68,7 @@ def convert(
 ) -> None:
     """Convert a flight log to an MCAP recording.
 
-    Validates every message, and converts the topics of all declared messages unless --topics selects others.
+    Validates every message, and converts the topics of all built-in messages unless --topics selects others.
     """
     spec = parse_source(source_text_of_file(source, vehicle=vehicle, topics=topics))
     replay = spec.open_source(vehicle="1")
