@@ -1,4 +1,4 @@
-"""Codecs, layouts and schema of a message as plain functions, by default of VehicleLocalPosition."""
+"""Codecs, layouts and schema of a message as plain functions, for VehicleLocalPosition by default."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def decode_cdr(payload: bytes, *, layout: str, message: type[Message] | str = _D
 
 
 def encode_cdr(fields: Mapping[str, object], *, layout: str, message: type[Message] | str = _DEFAULT) -> bytes:
-    """Encode the fields of a layout, as returned by `downgrade`, as CDR; `layout` is that of `decode_cdr`."""
+    """Encode the fields of a layout, as returned by `downgrade`, as CDR; `layout`: as in `decode_cdr`."""
     definition, found = _layout(layout, message)
     return encode_with(definition, fields, found)
 

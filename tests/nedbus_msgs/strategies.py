@@ -77,7 +77,7 @@ POSSIBLE_VIOLATIONS = st.sampled_from(FIELDS_WITH_RULES).flatmap(
     lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]])
 )
 MANY_EXAMPLES = settings(max_examples=10 * settings().max_examples)
-"""For hostile input, which is fast to generate and needs many examples."""
+"""Settings for hostile input, which is fast to generate and needs many examples."""
 
 
 def make_valid(fields: dict[str, object]) -> dict[str, object]:

@@ -141,7 +141,7 @@ def test_malformed_cdr_is_not_valid() -> None:
 
 @given(st.lists(messages(), max_size=5))
 def test_mask_invalid_sets_nan_where_the_flag_is_false(sent: list[VehicleLocalPosition]) -> None:
-    """All other values, and the original array, are unchanged."""
+    """Fields whose flag is false are NaN; all other values, and the original array, are unchanged."""
     array = to_array(sent)
     before, masked = array.tobytes(), mask_invalid(array)
     assert array.tobytes() == before

@@ -66,7 +66,7 @@ def test_flag_shares_are_described_in_words(shares: dict[str, float], text: str)
 
 @given(messages(), st.booleans())
 def test_doubts_of_one_message_have_no_percentage(message: VehicleLocalPosition, as_row: bool) -> None:
-    """A message or row is described by its own flags."""
+    """A single message or row is described by its own flags, without percentages."""
     either = row_of(message) if as_row else message
     assert message_doubts(either) == describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})
     assert "%" not in message_doubts(either)
@@ -144,7 +144,7 @@ def test_gnss_position_requires_a_fix(fix_type: int, flag: bool, has_position: b
 
 
 def test_arithmetic_on_an_invalid_position_raises() -> None:
-    """Before its estimator starts, a vehicle sends zeros: a script that does not check for None fails at once."""
+    """While the vehicle sends zeros without flags, position is None, so a script that does not check for it fails."""
     message = VehicleLocalPosition(timestamp=1, x=0.0, y=0.0, z=0.0)
     assert math.hypot(message.x, message.y, message.z) == 0.0
     with pytest.raises(TypeError):

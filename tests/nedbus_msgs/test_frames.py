@@ -72,7 +72,7 @@ def test_to_global_accepts_a_row() -> None:
 
 @pytest.mark.parametrize("fields", [{"x": 1.0, "y": 2.0}, {"xy_global": True, "ref_lat": 1.0, "ref_lon": 2.0}])
 def test_position_without_origin_is_none(fields: dict[str, object]) -> None:
-    """to_global needs a global origin, x and y; to_local needs a global origin."""
+    """Without a global origin, to_global and to_local return None, and so does to_global without x and y."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
     assert to_global(message) is None
     assert "xy_global" in fields or to_local(GlobalPosition(47.0, 8.0, 0.0), message) is None
@@ -142,7 +142,7 @@ def unit(latitude: float, longitude: float) -> tuple[float, float, float]:
 
 
 def test_frame_conversions_match_hand_computed_values() -> None:
-    """Values worked out by hand from the conventions of PX4 and ROS."""
+    """Conversions match values computed by hand from the conventions of PX4 and ROS."""
     assert ned_to_enu((1.0, 2.0, 3.0)) == (2.0, 1.0, -3.0)
     assert frd_to_flu((1.0, 2.0, 3.0)) == (1.0, -2.0, -3.0)
     assert variances_ned_to_enu((1.0, 2.0, 3.0)) == (2.0, 1.0, 3.0)

@@ -33,7 +33,7 @@ def track(*messages: VehicleLocalPosition) -> list[Continuous]:
 
 
 def test_delta_is_removed_when_counter_rises_by_one() -> None:
-    """The delta then equals the jump."""
+    """If the counter rises by one, the delta equals the jump and is subtracted from the track."""
     first, second, third = track(
         at(1, x=1.0, y=1.0),
         at(2, x=11.5, y=-3.5, xy_reset_counter=1, delta_xy=(10.0, -5.0)),
@@ -71,7 +71,7 @@ def test_every_quantity_has_its_own_delta(
 
 
 def test_counter_wrap_counts_as_one_reset() -> None:
-    """A counter wraps from 255 to 0."""
+    """A counter that wraps from 255 to 0 counts one reset."""
     _, second = track(at(1, z_reset_counter=255), at(2, z=5.0, z_reset_counter=0, delta_z=5.0))
     assert second.z == 0.0
     assert second.resets["z"] == 1
@@ -89,7 +89,7 @@ def test_incomplete_delta_is_not_used() -> None:
 
 
 def test_reset_without_delta_discontinues_the_track() -> None:
-    """Old layouts and some sources do not provide a delta."""
+    """A reset without a delta, as in old layouts and from some sources, discontinues the track."""
     _, second = track(at(1), at(2, heading=1.0, heading_reset_counter=1))
     assert second.discontinued == {"heading"}
 

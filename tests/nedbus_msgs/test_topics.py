@@ -45,7 +45,7 @@ def test_vehicle_local_position_has_four_topics() -> None:
 
 
 def test_keys_match_the_documentation() -> None:
-    """Clients in other languages depend on these strings."""
+    """Keys equal the documented strings, on which clients in other languages depend."""
     assert Address("7", "vehicle_local_position").key() == "nedbus/7/vehicle_local_position"
     estimator = Address("7", "estimator_local_position", 2)
     assert estimator.key() == "nedbus/7/estimator_local_position/2"
@@ -158,7 +158,7 @@ def test_invalid_selection_raises(topic: str, vehicle: str, instance: int | None
 
 @pytest.mark.parametrize("prefix", ["", "/", "a/", "a//b", "*", "a/**", "@a", "a b"])
 def test_invalid_prefix_raises(prefix: str) -> None:
-    """A prefix consists of plain chunks."""
+    """A prefix with an empty chunk, a wildcard, a space or a leading @ raises AddressError."""
     with pytest.raises(AddressError, match="prefix"):
         check_prefix(prefix)
 
@@ -172,6 +172,6 @@ def test_errors_can_be_pickled() -> None:
 
 
 def test_address_without_instance_sorts_first() -> None:
-    """The first instance of a topic that is not built in has no number."""
+    """The first instance of a topic that is not built in has no number, and sorts before numbered ones."""
     plain, second, other = Address("1", "logger_status"), Address("1", "logger_status", 1), Address("1", "event")
     assert sorted([second, plain, other]) == [other, plain, second]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 os.environ["ZENOH_CONFIG_OVERRIDE"] = (
-    # A peer, like every ROS 2 node with rmw_zenoh; BLOCK, as the test publishes without a pause.
+    # A peer, like every ROS 2 node with rmw_zenoh; BLOCK, because the test publishes without a pause.
     'transport/shared_memory/enabled=false;qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]'
 )
 

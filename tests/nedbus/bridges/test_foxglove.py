@@ -165,7 +165,7 @@ def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
         ((-HALF, 0.0, 0.0, -HALF), -500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # the same
         ((HALF, 0.0, HALF, 0.0), 0, 0.0, (0, 0, 1), (-1, 0, 0)),  # north, and the nose up
         ((HALF, HALF, 0.0, 0.0), 0, 0.0, (0, 1, 0), (0, 0, 1)),  # north, and the right wing down
-        ((HALF, HALF, 0.0, 0.0), 500_001, math.pi / 2, (1, 0, 0), (0, 1, 0)),  # too old: the heading
+        ((HALF, HALF, 0.0, 0.0), 500_001, math.pi / 2, (1, 0, 0), (0, 1, 0)),  # too old, so the heading is used
         ((math.nan,) * 4, 0, math.pi / 2, (1, 0, 0), (0, 1, 0)),
     ],
 )
@@ -179,8 +179,8 @@ def test_orientation_falls_back_to_heading_without_recent_attitude(
     assert (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)) == pytest.approx(left, abs=1e-6)
 
 
-def test_pose_has_position_and_attitude(bus: nedbus.Bus) -> None:
-    """The pose uses the vehicle_attitude of its vehicle, not that of another vehicle or the ground truth."""
+def test_pose_uses_attitude_of_its_own_vehicle(bus: nedbus.Bus) -> None:
+    """A pose uses the vehicle_attitude of its own vehicle, not of another vehicle or the ground truth."""
     level, rolled = (VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)))
     with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
         server.log(Sample(rolled, Address("1", "vehicle_attitude"), received=1))

@@ -65,7 +65,7 @@ def definition(layout: str) -> str:
 
 @pytest.fixture
 def run_bridge(endpoint: str, timings: Timings, caplog: pytest.LogCaptureFixture) -> Iterator[RunBridge]:
-    """Run bridges in threads, each with its own bus, that poll 20 times per second."""
+    """Run bridges that poll 20 times per second, each in a thread with its own bus."""
     caplog.set_level("INFO")
     timings.bridge_poll = 0.05
     stop = threading.Event()
@@ -346,7 +346,7 @@ def test_topic_of_another_node_is_not_published_twice(
     timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A topic that PX4 publishes itself is not published, except as a translation to another layout."""
+    """The bridge publishes a topic that PX4 publishes itself only as a translation to another layout."""
     timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
@@ -365,7 +365,7 @@ def test_topic_of_another_node_is_not_published_twice(
 
 
 def test_topics_follow_their_vehicles(run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """ROS 2 lists the topics of a vehicle only while it is published."""
+    """ROS 2 lists a topic only while the vehicle's publisher exists."""
 
     def topics() -> set[str]:
         return {token.split("/")[9] for token in tokens(zenoh_session, "MP")}
@@ -416,7 +416,7 @@ def test_command_bridges_one_instance_for_humble(
 
 
 def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path) -> None:
-    """A router whose access control denies ROS 2 keys does so silently: the bridge detects it and stops."""
+    """The bridge detects that a router's access control silently denies ROS 2 keys, and stops."""
     timings.token_visible = 0.2
     endpoint, file = free_endpoint(), tmp_path / "router.json5"
     rules = [{"id": "no", "permission": "deny", "messages": ["liveliness_token"], "key_exprs": ["@ros2_lv/**"]}]

@@ -56,7 +56,7 @@ HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timesta
 
 
 def test_method_last_never_uses_future_messages() -> None:
-    """With method "last" a row has the last message at or before it, and its age; before the first message NaN."""
+    """With method "last" a row has the last message at or before it, and its age; earlier rows have NaN."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME})
     assert table["timestamp"].tolist() == POSITIONS["timestamp"].tolist()
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4]
@@ -70,7 +70,7 @@ def test_method_last_never_uses_future_messages() -> None:
 
 
 def test_method_nearest_may_use_future_messages() -> None:
-    """With method "nearest" a later message has a negative age; of two equally near messages the earlier is used."""
+    """With method "nearest" a later message has a negative age; the earlier of two equally near ones is used."""
     table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
     assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
     assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
@@ -151,7 +151,7 @@ def test_rate_covers_the_flight() -> None:
 
 @pytest.mark.parametrize("form", ["ULG", "MCAP"])
 def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
-    """PX4 logs the last message of a slow topic with its old time: this does not add empty rows at the start."""
+    """A slow topic's last message, which PX4 logs with its old timestamp, adds no empty rows at the start."""
     log = tmp_path / "a.ULG"
     times = range(300_000_000, 310_000_000, 20_000)
     writer = UlogWriter()
@@ -205,7 +205,7 @@ def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
 
 
 def test_list_of_topics_returns_streams_by_name(tmp_path: Path) -> None:
-    """`read` returns a dict by stream for one vehicle; `align` has the selected streams and the stream of its rows."""
+    """`read` returns a dict of one vehicle's streams; `align` adds the stream that defines the rows to a selection."""
     batteries = [array_of("battery_status", {"timestamp": 1_200_000, "voltage_v": volts}) for volts in (16.0, 12.0)]
     streams = {
         VLP: POSITIONS,
@@ -258,7 +258,7 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
 
 
 def test_utc_comes_from_gnss_then_companion_clock() -> None:
-    """UTC comes from GNSS, else from a companion's clock after 2000; zeros and inconsistent offsets are ignored."""
+    """UTC comes from GNSS, else from a companion's Unix clock; zeros and inconsistent offsets are ignored."""
     times = range(1_000_000, 11_000_000, 1_000_000)
     gnss = array_of(
         "sensor_gps",

@@ -106,7 +106,7 @@ FLAGS = {
 
 def write_variant(*, has_extras: bool, **options: object) -> bytes:
     file = BytesIO()
-    writer = Writer(file, chunk_size=200, **options)  # type: ignore[arg-type] # all combinations of them
+    writer = Writer(file, chunk_size=200, **options)  # type: ignore[arg-type] # any options
     writer.start()
     channels = []
     for topic in ("first_topic", "second_topic"):

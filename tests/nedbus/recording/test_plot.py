@@ -81,8 +81,10 @@ def bars_of(axes: Any) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
-@pytest.mark.parametrize("others", [[], [flight_of(vehicle="8")]], ids=["one", "with another"])
-def test_invalid_estimate_is_thin_and_does_not_affect_axis_limits(others: list[tuple[Address, MessageArray]]) -> None:
+@pytest.mark.parametrize("others", [[], [flight_of(vehicle="8")]], ids=["one vehicle", "two vehicles"])
+def test_invalid_estimate_is_drawn_thin_without_affecting_axis_limits(
+    others: list[tuple[Address, MessageArray]],
+) -> None:
     """Invalid positions, altitudes and speeds are drawn thin and do not affect the axis limits."""
     address, array = flight_of()
     array["xy_valid"][50:80] = array["z_valid"][50:80] = array["v_xy_valid"][50:80] = False
@@ -209,7 +211,7 @@ def test_bar_ends_with_the_last_of_several_flags() -> None:
 
 
 def test_events_of_each_vehicle_have_their_own_rows() -> None:
-    """With two vehicles each row names its vehicle, and has the times of that vehicle's clock."""
+    """With two vehicles each row names its vehicle, and shows times on that vehicle's clock."""
     events = [
         event_of("failsafe", "begin", "bad", 4.0, names=("failsafe",)),
         Event("8", "failsafe", "begin", "bad", "failsafe", 99.0, 6.0, names=("failsafe",)),

@@ -137,7 +137,7 @@ def test_reading_one_stream_does_not_load_the_file(tmp_path: Path) -> None:
     assert peak < 1_100_000, f"{peak} bytes for {path.stat().st_size}"
 
 
-def test_missing_package_error_has_the_pip_command(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_error_contains_the_pip_command(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pandas or mcap the error includes the pip command; an unknown data frame library raises."""
     with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
         nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
@@ -168,14 +168,14 @@ def test_flight_is_plotted(flight: Path, arguments: list[str], streams: int) -> 
     pixels = pytest.importorskip("matplotlib.image").imread(picture)[..., :3]
     height, width, _ = pixels.shape
     assert width == 1440
-    # Each stream has seven rows, six flags and heading resets; each kind of event has one, too.
+    # Each stream has seven rows, for six flags and heading resets; each kind of event adds one row.
     assert height > 960 if streams == 1 else height >= 120 * (6.0 + 0.16 * 7 * streams)
     track, flags = pixels[:480, : width * 2 // 5], pixels[720:]
     for color in COLORS[:streams]:
         assert count_pixels(flags, color) > 1000, color
         assert count_pixels(track, color) > 40, color
     assert count_pixels(track, COLORS[streams - 1]) > 250  # the last track covers the others
-    for color in COLORS[max(2, streams) :]:  # the second one is also used for dead reckoning
+    for color in COLORS[max(2, streams) :]:  # the second color also marks dead reckoning
         assert count_pixels(pixels, color) == 0, color
 
 
@@ -218,7 +218,7 @@ def test_track_has_every_valid_position(tmp_path: Path) -> None:
     assert np.allclose(np.polyval(east, valid["y"]), points[:, 0], atol=0.01)
     assert np.allclose(np.polyval(north, valid["x"]), points[:, 1], atol=0.01)
     bars = [np.array(re.findall(r"[ML] (\S+)", path), float) for path, style in paths if f"fill: {COLORS[0]}" in style]
-    first, second = (float(np.ptp(bar)) for bar in bars)  # of xy_valid, for 0.2 s and from 0.35 s to 0.59 s
+    first, second = (float(np.ptp(bar)) for bar in bars)  # bars of xy_valid: for 0.2 s, and from 0.35 s to 0.59 s
     assert second == pytest.approx(first * 0.24 / 0.2, rel=1e-4)
 
 

@@ -115,7 +115,7 @@ def test_replay_of_a_recording_is_bit_exact(
 def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
     """After kill -9 an independent reader can read the file, which lacks at most the last second.
 
-    A busy host may delay the recorder for longer, but hardly in each of five attempts.
+    A busy host may delay the recorder for longer, but is unlikely to do so in all of five attempts.
     """
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
     costs: list[int] = []
@@ -312,7 +312,7 @@ def due_times(path: Path, *logged: float) -> list[float]:
     ("logged", "due"),
     [
         ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour
-        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # a retained message of three hours ago
+        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # a retained message that is three hours old
         ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 1, 2]),  # an outlier
         ([5, 6, 5.5, 7], [0, 0.5, 1, 2]),  # a message that was written late
         ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set back

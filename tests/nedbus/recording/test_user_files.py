@@ -49,7 +49,7 @@ def account(name: str) -> FileEvents:
 
 EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
     (utc, "08_boot_time_utc_us.ulg", "2025-09-08 13:31:04"),
-    (utc, "28_uxrce_timesync_unix.mcap", "2025-10-09 08:53:19"),  # .997
+    (utc, "28_uxrce_timesync_unix.mcap", "2025-10-09 08:53:19"),  # 19.997 s, truncated
     (count, "15_logging_dropout_5s.ulg", {VLP: 500}),
     (count, "16_home_position_50s_old.ulg", {VLP: 500, "home_position": 1}),
     (count, "31_fmu_in_topics.mcap", {
@@ -67,7 +67,7 @@ EXPECTED: Final[list[tuple[Callable[[str], object], str, object]]] = [
 
 @pytest.mark.parametrize(("value", "name", "expected"), EXPECTED)
 def test_value_matches_independent_tools(value: Callable[[str], object], name: str, expected: object) -> None:
-    """The expected values were determined with pyulog, rosbags, and from the records of the files."""
+    """The expected values come from pyulog, from rosbags, and from the raw records of the files."""
     assert value(name) == expected
 
 
@@ -79,7 +79,7 @@ def test_log_without_release_is_converted_without_warning(tmp_path: Path) -> Non
 
 
 def test_end_of_fake_position_fusion_is_the_cause() -> None:
-    """Fake position fusion ends at 154.1 s, no other begins before 160.4 s: the position is invalid from 154.3 s."""
+    """Fake position fusion ends at 154.1 s, no other fusion begins before 160.4 s: xy is invalid from 154.3 s."""
     lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in lines if "BAD    xy not valid" in line)
     assert invalid.startswith("   154.300")
@@ -95,7 +95,7 @@ def test_end_of_fake_position_fusion_is_the_cause() -> None:
     ],
 )
 def test_unreadable_file_raises_with_the_reason(name: str, reason: str) -> None:
-    """The error for a file that cannot be read has the reason."""
+    """The error for a file that cannot be read states the reason."""
     with pytest.raises(SourceError, match=reason):
         nedbus.read(CASES / name)
 
@@ -104,7 +104,7 @@ def test_unreadable_file_raises_with_the_reason(name: str, reason: str) -> None:
     "name", ["Bom", "BomCrlf", "DefaultValue", "FormFeed", "Latin1", "LineSep", "Nel", "StringConst"]
 )
 def test_msg_file_variants_are_read(name: str) -> None:
-    """The .msg files that rosbags reads are read, and those with a BOM, which it refuses."""
+    """The .msg files that rosbags reads are read, and also files with a BOM, which rosbags rejects."""
     source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(vehicle="1")
     ((definition,),) = (each.values() for each in source._supplied.values())
     assert [*definition.types][:3] == ["timestamp", "angle", "mode"]

@@ -42,7 +42,7 @@ def test_conversion_keeps_the_boot_time(tmp_path: Path) -> None:
 
 
 def test_mixed_clocks_are_distinguished_per_timestamp() -> None:
-    """In a stream with both clocks, Unix timestamps have a UTC, and times since boot have none."""
+    """In a stream with both clocks, Unix timestamps are converted to UTC, and times since boot to NaT."""
     messages = nedbus.read(UNIX)
     messages["timestamp"][:100] = np.arange(100) * 20_000 + 1_000_000  # before the time is synchronized
     table = nedbus.align({DEFAULT_TOPIC: messages}, utc=True)

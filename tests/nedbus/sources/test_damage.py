@@ -4,7 +4,8 @@ Chunks of a recording have CRCs, so each message that is read must equal the ori
 A log has no checksums, so a flipped bit in a value goes unnoticed: there, at most the damaged messages may differ, and
 damage to the structure must be detected.
 
-`DAMAGE_TRIES=10000 pytest tests/nedbus/sources/test_damage.py` tries more, including the real logs of ../shared.
+`DAMAGE_TRIES=10000 pytest tests/nedbus/sources/test_damage.py` makes more tries, including tries with the real logs
+of ../shared.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from tests.peers.ports import free_endpoint
 _log = logging.getLogger(__name__)
 
 TRIES = int(os.environ.get("DAMAGE_TRIES", "320"))
-FEW = 60  # tries of the quick tier, which uses generated files only
+FEW = 60  # number of tries in the quick tier, which uses generated files only
 each_tier = pytest.mark.parametrize("tries", [FEW, pytest.param(TRIES, marks=pytest.mark.slow)])
 MAX_LOG = 150_000  # bytes of a real log per try
 

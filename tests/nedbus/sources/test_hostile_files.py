@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from tests.flights.ulogs import UlogWriter
 from tests.peers.processes import Start
 
-_SECONDS: Final = 30  # of CPU time for all readers, on any machine; they need 1 to 2
+_SECONDS: Final = 30  # CPU time limit for all readers, on any machine; they need 1 to 2 s
 _MEMORY: Final = 100_000  # KiB
 
 # All readers of files in one process; only nedbus's own errors are allowed, which the command line shows as one line.
@@ -139,7 +139,7 @@ def test_hostile_recording_is_read_within_limits(start: Start, tmp_path: Path, k
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nested", "topics", "instances"])
 def test_service_ends_after_hostile_log(run_nedbus: Start, endpoint: str, tmp_path: Path, kind: str) -> None:
-    """A service publishes what it can decode, and ends."""
+    """A service publishes the messages that it can decode, and ends."""
     (tmp_path / "hostile.ulg").write_bytes(ULOGS[kind]())
     service = run_nedbus("serve", "-s", f"ulog:{tmp_path}/hostile.ulg?topics=*", "-c", endpoint, "--until-done")
     assert service.wait() == 1

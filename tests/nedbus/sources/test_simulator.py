@@ -174,7 +174,7 @@ def test_origin_is_set_in_flight(streams: dict[str, list[VehicleLocalPosition]])
     assert (first.xy_global, last.xy_global, last.ref_lat) == (False, True, 47.397742)
 
 
-def test_seeds_have_different_directions() -> None:
+def test_vehicles_with_different_seeds_fly_apart() -> None:
     """Vehicles with different seeds fly apart once they have climbed."""
     ends = [upgrade(simulate(f"?duration=12&seed={seed}")[-1].fields) for seed in (0, 1)]
     assert abs(ends[0].x - ends[1].x) + abs(ends[0].y - ends[1].y) > 5

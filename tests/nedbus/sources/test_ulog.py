@@ -216,7 +216,7 @@ def test_unknown_ulog_version_is_read_with_warning(tmp_path: Path) -> None:
 
 
 def test_damaged_format_is_detected(tmp_path: Path) -> None:
-    """A field with an invalid type, or missing although every release has it, is damage, and never read as another."""
+    """An invalid field type, or the lack of a field that every release has, is damage; no field is read as another."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000), topic="estimator_local_position")
     good = path.read_bytes()
     for before, after in ((b"float[2] delta_xy;", b"float[0] delta_xy;"), (b"float z;", b"float \0;")):
@@ -278,7 +278,7 @@ def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
 
 
 def test_old_log_without_release_is_not_reported_as_damaged(tmp_path: Path) -> None:
-    """The log is converted with exit code 0, and a mode change in it is an event."""
+    """The log is converted with exit code 0, and its mode change is reported as an event."""
     path = write_old_log(tmp_path / "a.ulg", [6])
     converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)
@@ -286,7 +286,7 @@ def test_old_log_without_release_is_not_reported_as_damaged(tmp_path: Path) -> N
 
 
 def test_dropout_is_an_event(tmp_path: Path) -> None:
-    """A dropout of 5 s becomes an event with its duration; a gap without a dropout record is a silent vehicle."""
+    """A dropout of 5 s becomes an event with its duration; a gap without a dropout record is reported as silence."""
     for is_recorded in (True, False):
         writer = UlogWriter()
         writer.define([VLP])

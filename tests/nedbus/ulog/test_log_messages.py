@@ -97,7 +97,7 @@ class Log(UlogWriter):
 @pytest.mark.logs
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
 def test_real_log_yields_each_string_and_event_once(path: Path) -> None:
-    """Each event of pyulog, and each string without an event, is one message; all other messages are failed checks."""
+    """Each event that pyulog finds, and each string without an event, is one message; all others are failed checks."""
     log = ULog(str(path))
     logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
@@ -130,7 +130,7 @@ CHECKS = {
 
 
 def test_string_that_duplicates_an_event_is_dropped() -> None:
-    """A logged string with a trailing tab duplicates the event before it; others are messages."""
+    """A logged string with a trailing tab duplicates the event before it; other strings become messages."""
     log = Log()
     log.event(5_000_000, 1, b"\2", twice=True)
     log.text(5_000_400, b"[commander] Armed by RC switch\t")

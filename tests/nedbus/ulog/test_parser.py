@@ -69,7 +69,7 @@ def test_real_log_equals_pyulog(path: Path) -> None:
         flat = {name.replace("[", "_").replace("]", "").replace(".", "_"): column for name, column in columns.items()}
         compared = 0
         for name in rows.dtype.names or ():
-            is_text = rows[name].dtype.kind == "S"  # pyulog reads it as its characters
+            is_text = rows[name].dtype.kind == "S"  # pyulog returns a column per character
             values = (np.ascontiguousarray(rows[name]).view(np.uint8) if is_text else rows[name]).reshape(len(rows), -1)
             is_array = is_text or rows[name].ndim > 1
             names = [f"{name}_{index}" for index in range(values.shape[1])] if is_array else [name]
@@ -101,7 +101,7 @@ def test_log_can_be_fed_byte_by_byte() -> None:
 @pytest.mark.parametrize("verify", [False, True])
 @pytest.mark.parametrize("size", [1, 16, 64])
 def test_record_of_invalid_type_split_across_chunks_is_skipped(size: int, verify: bool) -> None:
-    """The rest of a record whose type is no letter is skipped when it arrives, not parsed as records."""
+    """The rest of a record whose type is not a letter is skipped when it arrives, not parsed as records."""
     log = small_log()
     log += b"\x40\0\x01" + small_log()[-0x40:] + small_log()[-200:]
     assert text_of(parse(log, chunk=size, verify=verify)) == text_of(parse(log, verify=verify))
@@ -114,7 +114,7 @@ def test_damage_does_not_alter_messages(rng: random.Random, kind: str) -> None:
     whole = data_of(parse(log))
     start = rng.randrange(200, len(log) - 50)
     size = rng.randrange(1, 300)
-    assume(kind != "cut" or size != 11)  # the size of a sync: the next test
+    assume(kind != "cut" or size != 11)  # the size of a sync message, which the next test covers
     if kind == "flip":
         damaged = bytearray(log)
         damaged[start] ^= 1 << rng.randrange(8)

@@ -76,8 +76,8 @@ def as_array(value: object) -> Any:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_payload_longer_than_px4_trailer_is_rejected(layout: str) -> None:
-    """PX4's struct size plus 28 bytes is accepted; one byte more, or one less than CDR needs, is rejected."""
+def test_payload_of_wrong_length_is_rejected(layout: str) -> None:
+    """Up to 28 bytes beyond PX4's struct size are accepted; one byte more, or one less than CDR needs, is rejected."""
     payload = encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout)
     longest = {"1.13": 196, "1.14": 196, "1.15": 212, "V0": 220, "1.16": 220}[layout]
     assert decode_cdr(payload + (longest - len(payload)) * b"\xff", layout=layout)["timestamp"] == 7
@@ -105,7 +105,7 @@ def test_bool_other_than_0_or_1_is_rejected(layout: str) -> None:
 
 @pytest.mark.parametrize(("layout", "size"), {"1.13": 184, "1.14": 188, "1.15": 204, "V0": 216, "1.16": 220}.items())
 def test_padding_is_ignored(layout: str, size: int) -> None:
-    """ROS leaves uninitialized memory in the padding."""
+    """Padding bytes may have any value, because ROS leaves uninitialized memory there."""
     # No byte of these values is 0, so each 0 is padding.
     filled = {"bool": True, "uint8": 255, "uint64": 2**64 - 1, "float32": 0.1, "float64": 0.1}
     values = {name: filled.get(str(LAYOUTS[layout].types[name]), (0.1, 0.1)) for name in LAYOUTS[layout].fields}
@@ -130,14 +130,14 @@ def test_padding_is_ignored(layout: str, size: int) -> None:
     ids=lambda value: repr(value)[:20],
 )  # fmt: skip
 def test_value_of_wrong_type_or_range_raises(name: str, value: object) -> None:
-    """The error names the field; rclpy would send such values as 0, 44 or infinity."""
+    """The error names the field; rclpy would send these values as 0, 44 or infinity."""
     fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {name: value}
     with pytest.raises(EncodeError, match=f"{name}: "):
         encode_cdr(fields, layout="1.16")
 
 
 def test_int_is_accepted_for_float() -> None:
-    """An int in a float field is encoded as that float, as in the model."""
+    """An int in a float field is encoded as a float, as in the model."""
     fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {"x": 3, "delta_xy": (1, 2)}
     assert decode_cdr(encode_cdr(fields, layout="1.16"), layout="1.16")["x"] == 3.0
 

@@ -193,7 +193,7 @@ class StricterPosition(VehicleLocalPosition):
 
 
 def test_subclass_validators_run() -> None:
-    """Only the model itself uses the fast path."""
+    """A subclass does not use the fast path, so its validators run."""
     fields = {name: value for name, value in GOOD.model_dump().items() if name != "z"}
     assert type(StricterPosition(z=-5.0, **fields)) is StricterPosition
     with pytest.raises(ValidationError, match="too high"):
@@ -201,7 +201,7 @@ def test_subclass_validators_run() -> None:
 
 
 def test_validation_of_dicts_and_json_bypasses_the_constructor() -> None:
-    """Pydantic treats the constructor as its own, so JSON may hold strings for NaN and infinities."""
+    """Pydantic validates JSON without calling the constructor, so JSON may contain strings for NaN and infinities."""
     assert not VehicleLocalPosition.__pydantic_custom_init__
 
 

@@ -100,7 +100,7 @@ def test_newer_layout_is_decoded_by_field_names() -> None:
         (REAL[0][1:], "243 bytes are not a single msgpack value"),
     ],
 )
-def test_invalid_payload_error_has_the_reason(payload: bytes, reason: str) -> None:
+def test_invalid_payload_error_states_the_reason(payload: bytes, reason: str) -> None:
     """The error states what is wrong with the payload."""
     with pytest.raises(DecodeError, match=reason):
         decode(payload)

@@ -78,7 +78,7 @@ BOUNDS = {  # baseline, maximum ratio to it, and messages per call
 
 
 MAX_SPREAD = 1.5
-"""Maximum ratio of the time of any valid message to the fastest one in the same form."""
+"""Maximum ratio of the time for any flight to the time for the fastest flight, in the same form."""
 
 
 @pytest.mark.slow  # concurrent tests would distort the measurement

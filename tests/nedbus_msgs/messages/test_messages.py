@@ -190,7 +190,7 @@ def test_fields_of_older_layouts_round_trip_through_the_model(name: str) -> None
 def test_value_beyond_the_range_of_an_older_type_becomes_0(
     name: str, field: str, value: float, layout: str, older: str
 ) -> None:
-    """A valid message can be downgraded to any layout."""
+    """A value that does not fit becomes 0, so that any valid message can be downgraded to any layout."""
     definition = MESSAGES[name]
     message = definition.model(timestamp=1, **{field: value})
     fields = definition.downgrade(message.__dict__, definition.layouts[layout])
@@ -376,7 +376,7 @@ def test_new_message_needs_only_its_file(tmp_path: Path, start: Start, endpoint:
 
 
 def test_messages_package_imports_each_class_for_type_checkers() -> None:
-    """`messages/__init__.py` has an import for each class; without it type checkers reject the class."""
+    """`messages/__init__.py` has an import for each class; without the import, type checkers reject the class."""
     lines = Path(str(nedbus_msgs.messages.__file__)).read_text()
     imported = set(re.findall(r"^    from \.(\w+) import (\w+) as \2$", lines, re.MULTILINE))
     assert imported == {(module_of(definition), name) for name, definition in MESSAGES.items()}

@@ -77,7 +77,7 @@ def test_int_is_accepted_for_float() -> None:
 
 @pytest.mark.parametrize("changes", VIOLATIONS)
 def test_error_for_broken_rule_names_the_field(changes: dict[str, object]) -> None:
-    """A value just beyond a rule (flags, signs, bounds, order of timestamps) is rejected."""
+    """The error for a value just beyond a rule (flags, signs, bounds, order of timestamps) names the field."""
     assert list(changes)[-1] in rejection(**changes)
 
 
@@ -114,7 +114,7 @@ def test_copy_with_updates_is_validated() -> None:
 
 @given(messages())
 def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
-    """JSON has NaN and infinities as strings, and is read back to a bit-identical message."""
+    """JSON contains NaN and infinities as strings, and is parsed to a bit-identical message."""
     text = message.model_dump_json()
     assert "nan" not in text
     assert "inf" not in text
@@ -143,7 +143,7 @@ def test_json_schema_matches_the_model() -> None:
 
 
 def test_messages_are_compared_by_value() -> None:
-    """NaN equals NaN, so that a message equals its copy and can be found in a set."""
+    """NaN equals NaN, so a message equals its copy and can be found in a set."""
     one, two = VehicleLocalPosition(timestamp=1, x=0.5), VehicleLocalPosition(timestamp=1, x=0.5)
     assert one == two
     assert len({one, two}) == 1
@@ -156,7 +156,7 @@ def test_messages_are_compared_by_value() -> None:
     "fields", [{"x": "nan"}, {"x": "1.0"}, {"timestamp": "NaN"}, {"xy_valid": "NaN"}, {"delta_xy": [1.0]}, {"x": [1.0]}]
 )
 def test_unexpected_strings_and_lengths_are_rejected(fields: dict[str, object]) -> None:
-    """The model accepts only the strings and lengths that its own JSON has."""
+    """The model accepts only the strings and lengths that its own JSON contains."""
     with pytest.raises(ValidationError) as info:
         VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
     assert [detail["loc"][0] for detail in info.value.errors()] == list(fields)

@@ -14,7 +14,7 @@ from tests.flights.local_position import decode, encode
 from tests.nedbus_msgs.strategies import DATA
 
 TRIPLET_HASH = "RIHS01_e05aa5eb29374ce845899062b5810cc8487743bb95a976094821c1d0312e45aa"
-"""From the key on which PX4 main of 2026-05 published it."""
+"""Type hash in the key on which PX4 (main of 2026-05) published a PositionSetpointTriplet."""
 NESTED = "\n" + "=" * 80 + "\nMSG: px4_msgs/"
 MANY = "".join(f"uint8 f{number}\n" for number in range(300))
 TRIPLET = (
@@ -35,7 +35,7 @@ def test_definition_text_round_trip(name: str) -> None:
 
 
 def test_nested_messages_are_flattened_and_hashed() -> None:
-    """PositionSetpointTriplet has the 20 fields of PositionSetpoint three times, and the hash sent by a real PX4."""
+    """PositionSetpointTriplet contains PositionSetpoint's 20 fields three times; its hash equals a real PX4's."""
     assert hash_of_msg("PositionSetpointTriplet", TRIPLET) == TRIPLET_HASH
     definition = define_msg("PositionSetpointTriplet", TRIPLET)
     assert len(definition.types) == 61

@@ -22,14 +22,14 @@ from pymavlink.dialects.v20 import common as mavlink
 
 Row = dict[str, float]
 Build = Callable[[int, Row], Any]  # (ms since boot, row) to a message, or None to send nothing
-Stream = tuple[float, Build]  # Hz
+Stream = tuple[float, Build]  # rate [Hz], builder
 NED = ("x", "y", "z", "vx", "vy", "vz")
 NAN = math.nan
 BOOT_MS = 5000  # time_boot_ms after a reboot
 
 
 def covariance(known: dict[int, float]) -> list[float]:
-    """Return the 21 elements of an upper triangle: NaN, as PX4 sends it, except the given ones."""
+    """Return the 21 elements of an upper triangle: the given ones, and NaN elsewhere, as sent by PX4."""
     return [known.get(index, NAN) for index in range(21)]
 
 
@@ -51,7 +51,7 @@ def global_position(ms: int, row: Row) -> Any:
 def origin(ms: int, row: Row) -> Any:
     lat, lon, alt = row["ref_lat"], row["ref_lon"], row["ref_alt"]
     if math.isnan(lat + lon + alt):
-        return None  # PX4 sends none while there is no origin
+        return None  # PX4 sends no GPS_GLOBAL_ORIGIN before it has an origin
     return mavlink.MAVLink_gps_global_origin_message(round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 1_000_000)
 
 
@@ -76,7 +76,7 @@ def odometry(ms: int, row: Row) -> Any:
 
 
 def schedule(streams: list[Stream]) -> Iterator[tuple[float, Build]]:
-    """Yield (seconds since boot, builder) endlessly; at equal times the position comes last."""
+    """Yield (seconds since boot, builder) endlessly, at equal times in the order of `streams`."""
     heap = [(0.0, order, 0) for order, (rate, _) in enumerate(streams) if rate > 0]
     while True:
         now, order, turn = heapq.heappop(heap)

@@ -53,7 +53,7 @@ class Session:
             self.texts.append(self.client.status.text)
 
     def wait(self, seconds: float, *, heartbeats: bool = True) -> None:
-        """Let time pass, with heartbeats at 1 Hz and 10 ticks a second."""
+        """Advance the clock, with heartbeats at 1 Hz and 10 ticks per second."""
         for step in range(round(seconds * 10)):
             self.now += 0.1
             if heartbeats and step % 10 == 0:
@@ -274,7 +274,7 @@ class TestOwnership:
         assert session.states[1:] == [("starting", None), ("refused", "taken")]
 
     def test_stream_of_earlier_process_is_restarted(self, session: Session) -> None:
-        """A stream to the client's own ids without a header is restarted once with STOP, a pause and START."""
+        """A stream without a header that is addressed to the client is restarted once with STOP, a pause and START."""
         session.wait(0.1)
         session.answer(START, REJECTED)
         session.receive(sequence=7000)
@@ -311,7 +311,7 @@ class TestOwnership:
 
 
 class TestNoData:
-    """PX4 accepts START but sends no data: after STOP without waiting, or if another link has the stream."""
+    """PX4 accepts START but sends no data if START follows STOP too soon, or if another link has the stream."""
 
     def test_start_without_data_is_followed_by_restart(self, session: Session) -> None:
         """STOP follows after 1 s, and START 2.5 s after STOP was accepted."""
@@ -363,7 +363,7 @@ class TestHeader:
 
     @pytest.mark.parametrize("round_trip", [0.03, 0.08, 0.2, 3.0])
     def test_long_round_trip_aborts_header(self, session: Session, round_trip: float) -> None:
-        """Detected in the first messages; acknowledgements stop too, or PX4 would ignore STOP during the header."""
+        """The header is aborted early; acknowledgements end as well, or PX4 would ignore STOP during the header."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         began = session.now
@@ -382,7 +382,7 @@ class TestHeader:
         assert session.states[-1] == ("refused", "slow_link")
 
     def test_lost_messages_do_not_abort_header(self, session: Session) -> None:
-        """A lost message delays the header by 50 ms; one in twenty does not count as a long round trip."""
+        """A lost message delays the header by 50 ms; one loss in twenty does not count as a long round trip."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         for number in range(410):
@@ -458,7 +458,7 @@ class TestSilence:
         assert session.client.status.state == "header"
 
     def test_longest_silence_means_another_client_owns_stream(self, session: Session) -> None:
-        """If PX4 keeps rejecting START, another client has the stream: the client's own is never silent for 15 s."""
+        """If PX4 rejects START for 15 s without sending data, another client owns the stream."""
         session.start()
         for _ in range(18):
             session.wait(1)
@@ -647,14 +647,14 @@ class TestRecordedSessions:
         assert replay.states[1:] == [*self.STARTED, ("ended", "stopped_elsewhere")]
         assert replay.client.header_seconds == pytest.approx(1.1, abs=0.01)
 
-    def test_second_start_is_rejected_and_foreign_stop_detected(self) -> None:
+    def test_second_start_is_rejected_and_foreign_stop_is_detected(self) -> None:
         """A second START and one by another client are rejected; then the other client sends STOP."""
         replay = Replay("session", 4.0, 15.0, (245, 190))
         assert replay.states[1:] == [*self.STARTED, ("ended", "stopped_elsewhere")]
         assert replay.acknowledged == replay.recorded
 
-    def test_stream_continues_after_client_stops_reading(self) -> None:
-        """Pauses of 5 s and 12 s without reading lose 615 and 3,433 messages, and the stream continues."""
+    def test_stream_continues_after_client_pauses_reading(self) -> None:
+        """Reading pauses of 5 s and 12 s lose 615 and 3,433 messages, and the stream continues."""
         replay = Replay("session", 26.2, 52.0, (245, 190))
         outage: list[StateAndReason] = [("ended", "link_lost"), ("streaming", None)]
         assert replay.states[1:] == [*self.STARTED, *outage, *outage]
@@ -672,7 +672,7 @@ class TestRecordedSessions:
         assert replay.states[1:] == [*self.STARTED, ("ended", "silent")]
 
     def test_restarted_vehicle_begins_new_stream(self) -> None:
-        """After a kill and a restart, time_boot_ms is near 0 again, and a new header follows START."""
+        """After the vehicle restarts, time_boot_ms is near 0 again, and a new header follows START."""
         replay = Replay("session", 95.0, 110.5, (247, 190))
         assert replay.states[1:] == [*self.STARTED, ("idle", None), *self.STARTED]
 

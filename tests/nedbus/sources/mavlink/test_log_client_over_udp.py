@@ -52,7 +52,7 @@ class Link:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.05)
-        self._vehicle: Any = None  # its address
+        self._vehicle: Any = None  # address of the vehicle
         self._boot = 0
 
     @contextmanager
@@ -76,7 +76,7 @@ class Link:
                 self.states.append(client.status[:2])
 
     def expect_states(self, *states: StateAndReason) -> None:
-        """Receive until the state has changed this often, and compare the changes."""
+        """Receive until the state has changed as often as expected, and compare the changes."""
         self.run(lambda: len(self.states) > len(states))
         assert self.states[1:] == [*states]
 
@@ -116,7 +116,7 @@ class Link:
 
 
 def test_recorded_stream_arrives_completely() -> None:
-    """At full speed all bytes of the recording arrive; only its own 11 lost messages are missing."""
+    """At full speed all bytes of the recording arrive; only the 11 messages that it lacks count as lost."""
     with Link("armed").play("default_topics", speed=None) as link:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
@@ -140,13 +140,13 @@ def test_loss_count_equals_dropped_and_late_messages(impairment: dict[str, float
 
 
 def test_denied_start_is_reported() -> None:
-    """PX4 denies the stream on a link that is too slow."""
+    """A START that PX4 denies because the link is too slow is reported as a lack of bandwidth."""
     with Link().play("default_topics", refusal=dialect.MAV_RESULT_DENIED) as link:
         link.expect_states(("starting", None), ("refused", "bandwidth"))
 
 
 def test_stream_of_another_client_is_rejected() -> None:
-    """Its data is rejected even if it arrives on the same link."""
+    """Another client's data is rejected even if it arrives on the same link."""
     with Link().play("default_topics", owner=OTHERS, is_owner_on_link=True) as link:
         link.run(lambda: link.rejected > 20)
     assert link.states[1:] == [("starting", None), ("refused", "taken")]
@@ -158,14 +158,14 @@ class TestAbnormalStreams:
     """Streams with failures, in real time."""
 
     def test_unacknowledged_message_stalls_stream(self) -> None:
-        """PX4 sends the message 50 times, and then nothing."""
+        """PX4 sends an unacknowledged message 50 times, and then nothing."""
         with Link(acknowledges=False).play("flight1") as link:
             link.expect_states(("starting", None), ("header", None), ("ended", "stalled"))
-            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last ones may arrive later
+            link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last duplicates may arrive later
         assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
     def test_start_without_data_is_repeated(self) -> None:
-        """The logger gives up after 2.5 s, and accepts the next START."""
+        """PX4's logger gives up after 2.5 s, and accepts the next START."""
         with Link().play("flight1", unsent=1) as link:
             link.expect_states(*STARTED)
         assert [each for each in link.peer.commands if each == START] == [START, START]
@@ -179,7 +179,7 @@ class TestAbnormalStreams:
         assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
 
     def test_stream_of_earlier_process_is_restarted(self) -> None:
-        """It has the same ids, so its data arrives, but without definitions."""
+        """The earlier process had the same ids, so its data arrives, but without definitions."""
         with Link().play("flight1", owner=OURS, is_owner_on_link=True) as link:
             link.expect_states(("starting", None), ("refused", "taken"), *STARTED)
         assert link.reassembly.counts["no_definitions"]
@@ -212,7 +212,7 @@ class TestAbnormalStreams:
         assert link.peer.commands == [START]
 
     def test_long_round_trip_aborts_header(self) -> None:
-        """At 80 ms the header would take half a minute."""
+        """With a round trip of 80 ms the header would take half a minute."""
         with Link().play("flight1", round_trip=0.08) as link:
             link.expect_states(("starting", None), ("header", None), ("refused", "slow_link"))
             measured = re.search(r"at (\d+) ms for each", link.client.status.text)

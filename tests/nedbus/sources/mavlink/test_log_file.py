@@ -20,10 +20,10 @@ from tests.nedbus.ulog.test_parser import small_log
 from tests.peers.processes import without_coverage
 
 BEGIN: Final = 1500
-"""Bytes that hold the definitions and some messages of the small log."""
+"""Length of a first write that contains the definitions and some messages of the small log."""
 KILLS: Final = 50
 CHUNK_SIZE: Final = 249
-"""Bytes of a LOGGING_DATA."""
+"""Data bytes per LOGGING_DATA."""
 SAVE: Final = f"""
 import os, sys, time
 from pathlib import Path
@@ -43,7 +43,7 @@ for folder in sys.stdin:
 
 
 def test_file_is_valid_after_each_write(tmp_path: Path) -> None:
-    """However the stream is split, the file has only complete records after each write, as after SIGKILL."""
+    """After each write the file contains only complete records, however the stream is split."""
     log, file = small_log(), LogFile(tmp_path, "1")
     file.write(log[:BEGIN])
     counts = []
@@ -59,7 +59,7 @@ def test_file_is_valid_after_each_write(tmp_path: Path) -> None:
 
 
 def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
-    """A gap discards the record that it cut, and becomes a dropout of its duration."""
+    """The record cut by a gap is discarded, and a dropout with the duration of the gap is saved."""
     log, file = small_log(), LogFile(tmp_path, "1")
     file.write(log[: len(log) - 100])
     file.mark_gap(0.25)
@@ -70,7 +70,7 @@ def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
 
 
 def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:
-    """A file is never overwritten; a folder that cannot be created raises an error that names it."""
+    """Existing files are never overwritten. The error for a folder that cannot be created names the folder."""
     files = [LogFile(tmp_path / "logs", "1") for _ in range(3)]
     for each in files:
         each.close()
@@ -84,7 +84,7 @@ def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:
 @pytest.mark.process
 @pytest.mark.timeout(300)
 def test_killed_process_leaves_valid_log(tmp_path: Path) -> None:
-    """After SIGKILL at any of 50 random moments the file has exactly the complete records."""
+    """After SIGKILL at any of 50 random moments the file contains only complete records of the log."""
     path = write_log(tmp_path / "flight.ulg", range(0, 20_000_000, 10_000))
     log, chance = path.read_bytes(), random.Random(1)
     command = [sys.executable, "-c", SAVE, os.fspath(path)]
@@ -98,7 +98,7 @@ def test_killed_process_leaves_valid_log(tmp_path: Path) -> None:
             pid, count = int(process.stdout.readline()), chance.randrange(1, len(log) // CHUNK_SIZE)
             written = [int(process.stdout.readline()) for _ in range(count)][-1]
             os.kill(pid, signal.SIGKILL)
-            while not process.stdout.readline().endswith("killed\n"):  # may follow a partial line
+            while not process.stdout.readline().endswith("killed\n"):  # may follow an unfinished line
                 pass
             (saved,) = (tmp_path / f"{number}").iterdir()
             content = saved.read_bytes()

@@ -61,7 +61,7 @@ def test_retransmitted_first_message_does_not_begin_new_stream() -> None:
 
 
 def test_same_first_message_begins_new_stream_after_reboot() -> None:
-    """After a reboot, a header with the same bytes begins a new stream; without one it is a retransmission."""
+    """After a reboot, a header with the same bytes begins a new stream; without a reboot it is a retransmission."""
     ids, port, encoder = (245, 191), free_port(), dialect.MAVLink(None, 1, 1)
     header = dialect.MAVLink_logging_data_acked_message(*ids, 0, SIZE, 0, [*HEADER.ljust(SIZE, b"\0")])
     heartbeat = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
@@ -149,7 +149,7 @@ def test_sequence_wraps_without_loss() -> None:
 
 
 def test_largest_loss_is_half_of_sequence_range() -> None:
-    """A step of 32,768 is the largest loss; a larger one is a late message, unless the next ones continue it."""
+    """A step of 32,768 is the largest one that counts as a loss; a larger step indicates a late message."""
     reassembly = CountingReassembly()
     begin(reassembly)
     assert add(reassembly, plain(2**15)).lost == 2**15 - 1
@@ -159,7 +159,7 @@ def test_largest_loss_is_half_of_sequence_range() -> None:
 
 
 def test_stream_resumes_after_loss_of_over_half_the_sequence_range() -> None:
-    """A long run of consecutive old sequence numbers continues the stream: all messages in between were lost."""
+    """A long run of consecutive old sequence numbers resumes the stream, and all skipped messages count as lost."""
     reassembly = CountingReassembly()
     begin(reassembly)
     chunks = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
@@ -277,7 +277,7 @@ def logged(name: str) -> list[bytes]:
 
 
 class Comparison(NamedTuple):
-    """Numbers of data messages: in both stream and log, in the stream only, and missing in each gap."""
+    """Numbers of data messages: in both stream and log, in the stream only, and missing at each gap."""
 
     common: int
     invented: int
@@ -325,7 +325,7 @@ class TestRecordings:
             lost,
         )
         assert (compared.common, compared.invented) == (common, 0)
-        assert len(compared.missing) <= lost  # lost messages next to each other leave one gap
+        assert len(compared.missing) <= lost  # consecutive lost messages leave one gap
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from .test_log_reassembly import compare as compare_records
 from .test_log_reassembly import deliver, recorded
 
 MESSAGES: Final = 47_708
-"""Messages of all topics in the stream of the flight."""
+"""Number of messages of all topics in the stream of the flight."""
 
 FLIGHT: Final = STREAMS / "ulog_stream_flight1.bin.gz"
 
@@ -256,7 +256,7 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
             message: Any = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
             mav.srcSystem = 66
             if (number := sent["frames"]) % 50:
-                mav.srcSystem = rng.choice((66, 66, 67))  # 67 received no request
+                mav.srcSystem = rng.choice((66, 66, 67))  # no request was sent to 67
                 content = HOSTILE[number % 3] if number > 100 else HOSTILE[1]
                 sequence = rng.choice((0, 1, number % 2**16, rng.randrange(2**16)))
                 target = rng.choice(((245, 191), (245, 191), (1, 1)))
@@ -285,7 +285,7 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
 
 
 def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
-    """Fields of another type are converted as in a log, and the message after a dropout has its duration."""
+    """Fields of another type are converted as in a log, and the message after a dropout has the dropout's duration."""
     fields = "uint64_t timestamp;int32_t cell_count;"
     rows = [("battery_status", (number, count)) for number, count in enumerate((6, 300, -1, 7))]
     path = write_raw_log(tmp_path / "a.ulg", {"battery_status": (fields, "Qi")}, rows)

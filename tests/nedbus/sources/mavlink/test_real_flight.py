@@ -24,7 +24,7 @@ from tests.peers.px4_log_stream import STREAMS, datagrams
 
 LOG: Final = PX4 / "twelve_messages.ulg"
 TOPICS: Final = {topic for _, _, topics in REQUESTED.values() for topic in topics.split()} - {VLP}
-UNTIMED_AGE: Final = 2.0  # s: maximum age of the logged values that a message without a timestamp may have
+UNTIMED_AGE: Final = 2.0  # s: maximum age of the logged value that equals a message without a timestamp
 STATUS_AGE: Final = 1.2  # s: ESTIMATOR_STATUS is sent once a second
 RESOLUTION: Final = {
     "lat": 1e-7, "lon": 1e-7, "latitude_deg": 1e-7, "longitude_deg": 1e-7,
@@ -33,7 +33,7 @@ RESOLUTION: Final = {
     "voltage_v": 1e-3, "remaining": 0.01, "current_a": 0.01,
 }  # fmt: skip
 NOT_IN_THE_LOG: Final = {"time_utc_usec", *(f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health"))}
-FIELDS: Final = {  # converted, by topic
+FIELDS: Final = {  # converted fields by topic
     "vehicle_attitude": "q",
     "vehicle_odometry": "angular_velocity orientation_variance pose_frame position position_variance q quality"
     " reset_counter velocity velocity_frame velocity_variance",
@@ -95,7 +95,7 @@ def test_converted_messages_equal_log() -> None:
             for name in fields.keys() - NOT_IN_THE_LOG - {"timestamp"}:
                 of_status = topic == "vehicle_global_position" and name not in ("lat", "lon", "alt")
                 if of_status and name in ("eph", "epv"):
-                    continue  # of times that are not in the log
+                    continue  # values from times that are not in the log
                 age = STATUS_AGE if of_status else 0.0 if has_time else UNTIMED_AGE
                 since = min(until - 1, bisect(times[topic, instance], now - age * 1e6))
                 candidates = [getattr(row, name) for row in of_topic[since:until]]
@@ -126,7 +126,7 @@ def test_gps_time_comes_from_system_time() -> None:
 
 @pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")
 def test_statustexts_appear_in_log() -> None:
-    """Each STATUSTEXT of a flight is a logged string without its module name, or an event with a trailing tab."""
+    """The text of each STATUSTEXT of a flight is a logged string without its module name and trailing tab."""
     vehicle, parser = Vehicle("1", MavlinkOptions(topics=("log_message",))), new_parser()
     texts = [
         (each.fields["timestamp"], str(each.fields["text"]))

@@ -1,4 +1,4 @@
-"""MAVLink vehicles encoded by pymavlink; one of them runs in a subprocess."""
+"""MAVLink source: vehicles are simulated with pymavlink, one of them in a subprocess."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_validity_without_estimator_status_is_unknown(
 def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int) -> None:
     """All positions that were not dropped are published, at 10 % packet loss and with a reboot.
 
-    The whole flight fits into the receive buffer of the link, because the service may be late.
+    The whole flight fits into the link's receive buffer, so a service that reads late loses no messages.
     """
     source = f"mavlink:udpin:127.0.0.1:{port}?rate=50&topics={VLP}"
     service = run_nedbus("serve", "--connect", *bus.routers, "-s", source)
@@ -193,7 +193,7 @@ def test_positions_of_flight_reach_readers(run_nedbus: Start, fly: Fly, bus: ned
     assert "7/vehicle_local_position: the vehicle rebooted" in service.err
 
 
-def test_position_has_the_fields_of_mavlink(listener: Listener, port: int) -> None:
+def test_position_has_only_fields_that_mavlink_provides(listener: Listener, port: int) -> None:
     """The estimate has the values of MAVLink's messages in PX4's units, and no other fields."""
     names = ("origin", "estimator", "global_position", "altitude", "odometry", "attitude", "local_position")
     with Autopilot(port) as vehicle:
@@ -243,7 +243,7 @@ def test_messages_are_converted_to_chosen_topics(port: int) -> None:
 
 
 def test_vehicles_share_a_port(timings: Timings, listener: Listener, port: int) -> None:
-    """Each system id is a vehicle, and receives its requests at its own address."""
+    """Each system id on a port is a separate vehicle, and receives its requests at its own address."""
     timings.source_tick = 0.01
     expected = {32: 20_000, **dict.fromkeys([33, 141, 230, 331], 119_974.875), ORIGIN: 0}
     with Autopilot(port, system=3) as one, Autopilot(port, system=250) as other:
@@ -259,7 +259,7 @@ def test_vehicles_share_a_port(timings: Timings, listener: Listener, port: int) 
 
 
 def test_receive_buffer_holds_a_burst(port: int) -> None:
-    """400 messages that arrive before the service reads are all received, even within Linux's default limit."""
+    """400 messages that arrive before the service reads are all received, even with Linux's default buffer limit."""
     with closing(open_link(f"udpin:127.0.0.1:{port}", baud=57600)) as link, Autopilot(port) as vehicle:
         vehicle.send(*map(local_position, range(400)))
         received: list[object] = []
@@ -303,7 +303,7 @@ def test_late_and_foreign_messages_are_ignored(listener: Listener, port: int) ->
 
 
 def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
-    """Two senders with one system id are logged once, with both addresses; a sender that reconnects twice is not."""
+    """Two senders with one system id are logged once, with both addresses; two changes of address are not logged."""
     with Autopilot(port) as one, Autopilot(port) as other, Autopilot(port) as third:
         for ms, sender in enumerate((one, one, other, other, third, third), start=1000):
             sender.send(local_position(ms))
@@ -339,12 +339,12 @@ def test_closed_tcp_link_raises_and_can_be_reopened() -> None:
         Listener(f"mavlink:{link}")
 
 
-def test_serial_port_is_received_until_it_disappears() -> None:
-    """A telemetry radio on a serial port is received; a port that disappears raises."""
+def test_serial_port_is_read_until_it_disappears() -> None:
+    """Messages of a telemetry radio on a serial port are received; a port that disappears raises."""
     radio, port = os.openpty()
     tty.setraw(port)
     with Listener(f"mavlink:serial:{os.ttyname(port)}?baud=115200") as listener:
-        listener.step()  # it sends a heartbeat
+        listener.step()  # sends a heartbeat
         assert os.read(radio, 1)[0] == dialect.PROTOCOL_MARKER_V2
         os.write(radio, local_position(1000).pack(dialect.MAVLink(None, 9, 1)))
         assert listener.receive()[0].fields["y"] == 1.0

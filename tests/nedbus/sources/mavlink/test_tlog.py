@@ -45,7 +45,7 @@ def frames(system: int, count: int, *, signed: bool = False, version: int = 2) -
 
 @pytest.mark.parametrize("form", [{}, {"signed": True}, {"version": 1}])
 def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> None:
-    """Arrays, replay, events and recording have all positions of the vehicle, at the host's UTC."""
+    """Arrays, replay, events and recording contain all positions of the vehicle, with the host's UTC."""
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"".join(frames(7, 100, **form)))
     positions = nedbus.read(path)

@@ -26,7 +26,7 @@ def new_vehicle(topics: str) -> Vehicle:
 
 @pytest.fixture
 def vehicle() -> Vehicle:
-    """Return a vehicle that has sent nothing, with 30 positions per second over a telemetry radio."""
+    """Return a vehicle before its first message, to be asked for 30 positions per second over a telemetry radio."""
     return new_vehicle(VLP)
 
 
@@ -57,7 +57,7 @@ def estimate(vehicle: Vehicle, ms: int, now: float) -> dict[str, object]:
     ],
 )
 def test_constant_position_mode_invalidates_only_without_velocity(vehicle: Vehicle, flags: int, expected: bool) -> None:
-    """The bit of constant position mode counts only without valid horizontal velocity; see PX4's 48f1687d3a."""
+    """Constant position mode invalidates xy only without valid horizontal velocity; see PX4's commit 48f1687d3a."""
     vehicle.handle(dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0), 100.0)
     assert estimate(vehicle, 1, 100.0)["xy_valid"] is expected
 
@@ -180,7 +180,7 @@ def test_reordered_and_duplicate_messages_are_not_lost(vehicle: Vehicle) -> None
 
 
 def test_stopped_positions_are_requested_again(vehicle: Vehicle) -> None:
-    """Messages of a vehicle that sends others, but no positions, are requested again."""
+    """If positions stop while other messages arrive, positions are requested again."""
     requested = []
     for second in range(100, 140):
         if second < 120:
@@ -289,7 +289,7 @@ def test_statustext_chunks_are_joined() -> None:
 
 
 def test_flood_of_statustexts_is_limited() -> None:
-    """Of 10,000 texts within a second, 100 are published and the rest are rejected."""
+    """If 10,000 texts arrive within a second, 100 are published and the rest are rejected."""
     vehicle = new_vehicle("log_message")
     vehicle.handle(position(1000), 0.0)
     found = [vehicle.handle(chunk(b"flood", 0), 50.0 + number / 11_000) for number in range(10_000)]

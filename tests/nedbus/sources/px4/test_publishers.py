@@ -65,7 +65,7 @@ def test_invalid_token_raises(text: str) -> None:
 def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRegistry) -> None:
     """Both publishers of a key are rejected while they have the same gid.
 
-    Afterwards the sequence of the other one may start anywhere: that is neither a loss nor a reboot.
+    The remaining publisher's sequence may then start anywhere, which counts as neither a loss nor a reboot.
     """
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
@@ -84,7 +84,7 @@ def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRe
 def test_queued_messages_of_vanished_vehicles_are_rejected(streams: StreamRegistry) -> None:
     """After two vehicles with the same gid lose their link, queued messages are rejected for a second.
 
-    The key is free at once.
+    The key has no publishers as soon as both tokens are gone.
     """
     stream = streams.on_message(str(key()), 0.0)
     for session in ("a", "b"):
@@ -106,7 +106,7 @@ def test_topics_of_one_vehicle_may_share_a_gid(streams: StreamRegistry) -> None:
 
 
 def test_reconnected_vehicle_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """A publisher silent for 3 s does not block its successor: a router detects a dead link only after 10 s."""
+    """A publisher silent for 3 s does not block its successor, because a router detects a dead link only after 10 s."""
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)
@@ -117,7 +117,7 @@ def test_reconnected_vehicle_is_accepted_at_once(streams: StreamRegistry) -> Non
 
 
 def test_ros_2_nodes_of_same_name_are_distinguished_by_gid(streams: StreamRegistry) -> None:
-    """The first one is published; messages of the second are rejected while both exist."""
+    """Messages of the first node are published; the second node's are rejected while both exist."""
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     assert send(streams, stream, 1, 100.0, b"a" * 16) == (0, False)
@@ -128,7 +128,7 @@ def test_ros_2_nodes_of_same_name_are_distinguished_by_gid(streams: StreamRegist
 
 
 def test_restarted_ros_2_publisher_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """The new token shows that the old publisher has gone, which is a reboot without losses."""
+    """The new token shows that the old publisher has gone, which counts as a reboot without losses."""
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)

@@ -129,7 +129,7 @@ class Px4:
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
 
     def send(self, sent: Sent) -> None:
-        """Send what this PX4 sent."""
+        """Publish a recorded message of this PX4, or declare or undeclare its token."""
         if sent.payload:
             if sent.key not in self._publishers:
                 drop = zenoh.CongestionControl.DROP
@@ -276,8 +276,8 @@ def is_equal(value: object, logged: object) -> bool:
 def test_all_topics_of_flight_equal_log(where: str) -> None:
     """All 69,605 messages of 21 topics are published and read; the 46,457 that are in the log equal it in all fields.
 
-    11 that PX4 counted are missing in the recording. The five types that are not built in are supplied, one of
-    them with nested messages. A reader gets the definitions with the first messages, and loses none.
+    The recording lacks 11 messages that PX4 counted. The five types that are not built in are supplied, one of them
+    with nested messages. A reader gets the definitions with the first messages, and loses no message.
     """
     logged = read_log(TWELVE.with_suffix(".ulg"))
     equal: Counter[bool] = Counter()
@@ -314,11 +314,11 @@ def test_all_topics_of_flight_equal_log(where: str) -> None:
 
 
 @pytest.mark.slow
-def test_topics_lost_with_default_pub_csv_are_reported_as_silent(where: str) -> None:
-    """With PX4's default pub.csv, topics that stop or never arrive are silent, and the doctor suggests the remedy.
+def test_silent_topics_are_reported_with_default_pub_csv(where: str) -> None:
+    """Topics that stop or never arrive with PX4's default pub.csv are silent, and the doctor suggests a remedy.
 
-    In the recording all reliable topics stop after 3.4 s, and only the others continue, for 4.3 s; it is played at half
-    that speed.
+    All reliable topics in the recording stop after 3.4 s; the others continue up to 7.7 s. The recording is played at
+    half speed.
     """
     ended = [
         "battery_status/0",
@@ -418,7 +418,7 @@ def is_position(datagram: bytes) -> bool:
 
 
 def count_late_flags(name: str, rate: float) -> int:
-    """Return how many positions that a real PX4 sent in a flight get a flag that differs from the logged one.
+    """Return the number of positions in a real flight that are converted with a flag other than the logged one.
 
     ESTIMATOR_STATUS is simulated at this rate [Hz], with the flags logged at its time.
     """
@@ -454,7 +454,7 @@ def count_late_flags(name: str, rate: float) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
 def test_requested_status_rate_reduces_late_flags(name: str) -> None:
-    """At 57,600 baud, at most a third as many positions have late flags as with two statuses per second."""
+    """At most a third as many positions have late flags at the rate requested for 57,600 baud as at 2 Hz."""
     requested, slow = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
     assert 0 < 3 * requested <= slow
 
@@ -464,7 +464,7 @@ def test_converted_positions_equal_log(port: int) -> None:
     """Position and velocity equal the log bit by bit, and so do the flags, except changes since the last status.
 
     ESTIMATOR_STATUS arrives once a second, so a flag is up to a second late: here at the first status (after 1.15 s),
-    and when GPS is used (3.15 s), lost (28.15 s) and back (30.15 s).
+    and when GPS is first used (3.15 s), lost (28.15 s) and regained (30.15 s).
     """
     names = ("timestamp", "x", "y", "z", "vx", "vy", "vz")
     logged = {}
@@ -485,7 +485,7 @@ def test_converted_positions_equal_log(port: int) -> None:
             fields = upgrade(received.fields).__dict__
             row = logged.get(fields["timestamp"])
             if row is None:
-                continue  # the last one, sent after the log was closed
+                continue  # the last position, sent after the log was closed
             compared += 1
             assert [fields[name] for name in names] == [row[name] for name in names]
             for flag in FLAGS:

@@ -49,7 +49,7 @@ def is_read(publisher: zenoh.Publisher) -> bool:
 
 
 class Px4:
-    """Zenoh module of a PX4: publishes like zenoh-pico, with a sequence per topic and trailing garbage."""
+    """Zenoh module of a PX4 that publishes like zenoh-pico, with a sequence per topic and trailing garbage."""
 
     def __init__(self, session: Session, *, domain: int = 0, namespace: str = "", layout: str = "1.16") -> None:
         self._session = session
@@ -178,7 +178,7 @@ def test_topic_names_map_to_addresses(listener: Listener, zenoh_session: Session
 def test_vehicles_are_named_by_domain_and_namespace(
     listen: Listen, zenoh_session: Session, options: str, expected: list[str]
 ) -> None:
-    """All vehicles in SITL have one gid; `vehicles=` renames them, and `domain=` ignores other domains."""
+    """All vehicles in SITL have the same gid; `vehicles=` renames them, and `domain=` ignores other domains."""
     listener = listen(options)
     places = ((0, ""), (5, ""), (5, "px4_1"), (0, "px4_2"), (3, "swarm/px4_3"))
     expected_places = [place for place in places if options != "?domain=5" or place[0] == 5]
@@ -213,7 +213,7 @@ def test_loss_and_reboot_are_counted(
 
 
 def test_key_without_type_hash_needs_layout(listen: Listen, zenoh_session: Session) -> None:
-    """A build without type hashes is rejected with a hint, and received once the layout is configured."""
+    """Messages without type hashes are rejected with a hint, and received once the layout is configured."""
     px4 = Px4(zenoh_session, layout="1.14")
     px4.type_hash = NO_HASH
     first, second = listen(), listen("?layout=1.14")
@@ -229,7 +229,7 @@ WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuin
 def test_user_definition_adds_a_message(
     run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
-    """With msg= the message is published, range-checked, and readable without the file; without, it is listed."""
+    """With msg= the message is published, range-checked, and readable without the file; otherwise it is listed."""
     (tmp_path / "WheelEncoders.msg").write_text(WHEELS)
     definition = define_msg("WheelEncoders", WHEELS)
     name = ros2_type(definition)
@@ -284,7 +284,7 @@ def test_user_definition_decodes_newer_layout(
 
 
 def test_only_selected_topics_are_received(listen: Listen, zenoh_session: Session) -> None:
-    """Others are ignored silently; a selected topic whose message is unknown is rejected with a hint."""
+    """Other topics are ignored silently; a selected topic whose message is unknown is rejected with a hint."""
     listener = listen("?topics=vehicle_local_position,wheel_encoders")
     px4 = Px4(zenoh_session)
     px4.put(1, topic="estimator_local_position")
@@ -382,7 +382,7 @@ def test_invalid_values_are_reported(
 
 
 def test_two_publishers_of_one_key_are_not_mixed(listener: Listener, zenoh_session: Session) -> None:
-    """Two ROS 2 nodes on one topic have different gids: the first one is received; its sequence starts at 0."""
+    """Two ROS 2 nodes on one topic have different gids: only the first one is received."""
     px4 = Px4(zenoh_session)
     for sequence in range(10):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
@@ -452,7 +452,7 @@ def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: P
 
 
 def test_unreachable_router_is_retried(run_nedbus: Start) -> None:
-    """A router that does not answer is an error in the status, and retried; other sources continue."""
+    """A router that does not answer is logged and retried, while other sources continue."""
     endpoint, other = free_endpoint(), free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", f"px4-zenoh:{other}", "-s", "sim:")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(vehicle="7") as subscription:
