@@ -123,7 +123,7 @@ class Counts:
     `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
-    `forgotten`: least recently active keys, evicted as there were more than 10,000; their next gap is not in `lost`.
+    `forgotten`: least recently active keys, evicted because of the limit of 10,000; `lost` omits their next gap.
     """
 
     received: int = 0

@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
 _MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
-_MAX_ENCODING: Final = 512  # characters kept of an encoding; those of nedbus are at most 250 long
+_MAX_ENCODING: Final = 512  # characters kept of an encoding; nedbus's own encodings have at most 250
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 

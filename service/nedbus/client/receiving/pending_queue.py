@@ -77,7 +77,7 @@ class PendingQueue:
 
     It owns the state of all streams: key states, writer proxies, counters and unread messages, guarded by one lock.
     In mode `every`, messages behind a gap are held back until it is filled; in mode `latest` a gap is lost at once.
-    `name`: its key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
+    `name`: the key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
     def __init__(
@@ -424,7 +424,7 @@ class PendingQueue:
     # Unread messages
 
     def _queue(self) -> int:
-        """Queue the delivered messages, dropping superseded and, beyond the capacity, old ones; return their number."""
+        """Queue delivered messages and return their count; drop superseded ones and, above the capacity, the oldest."""
         arrivals, self.counters.delivered = self.counters.delivered, []
         self._arrived += len(arrivals)
         if self.newest_only:

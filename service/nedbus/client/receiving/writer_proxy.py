@@ -19,7 +19,7 @@ MAX_GAP: Final = 2**30
 """Largest gap; a larger step means that the publisher restarted or the message is late."""
 
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
-_MAX_REORDERED: Final = 2**16  # a number lower by up to this is late or a duplicate, else the publisher restarted
+_MAX_REORDERED: Final = 2**16  # a step back up to this size is a late message or a duplicate; a larger one is a restart
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
 
 
