@@ -104,7 +104,7 @@ class PublisherToken:
 
     @property
     def gid(self) -> bytes | None:
-        """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same."""
+        """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same gid."""
         found = _PX4_NODE.fullmatch(self.node)
         return bytes.fromhex(found[1]) if found else None
 
