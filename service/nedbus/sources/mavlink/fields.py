@@ -17,7 +17,7 @@ _MAX_DELAY: Final = 1000  # ms by which a late datagram may be older; more means
 
 
 def is_reboot(time_boot_ms: int, newest: int | None) -> bool:
-    """Return whether the vehicle rebooted since its newest time."""
+    """Return whether a message's time shows a reboot since the vehicle's newest time so far."""
     return newest is not None and time_boot_ms < newest - _MAX_DELAY
 
 

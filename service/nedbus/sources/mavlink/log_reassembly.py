@@ -13,8 +13,8 @@ _OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of mor
 Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
 """Classification of a message.
 
-`delivered`: its bytes are part of the stream; after a gap, those from its first record on.
-`duplicate`: retransmitted or late; a late one was counted as lost, and its bytes are discarded.
+`delivered`: its bytes are part of the stream; after a gap, only the bytes from its first record on.
+`duplicate`: retransmitted or late; a late message was counted as lost, and its bytes are discarded.
 `malformed`: `length` is above 249, or first_message_offset beyond the data; the gap that it leaves is counted as lost.
 `unsynchronised`: no record begins in it, after a gap.
 `no_definitions`: the stream was joined midway, so it cannot be decoded; its losses are not counted.
@@ -25,7 +25,7 @@ class Chunk(NamedTuple):
     """Result of one LOGGING_DATA or LOGGING_DATA_ACKED.
 
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
-    `begins`: a new stream begins with `data`: it needs a new parser.
+    `begins`: a new stream, which needs a new parser, begins with `data`.
     `lost`: number of messages lost before this one, exact for gaps of less than 65,536, and a lower bound otherwise.
     After a loss the parser must discard its partial record before `data`.
     """
@@ -39,7 +39,7 @@ class Chunk(NamedTuple):
 class Reassembly:
     """Reassembles the successive ULog streams of one vehicle since its boot.
 
-    After a reboot use a new one: the header may have the same bytes as before.
+    After a reboot create a new instance, because the header may have the same bytes as before.
     A lost message contains at most 249 bytes; each gap loses at least one ULog record.
     """
 
