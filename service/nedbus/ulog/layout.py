@@ -20,7 +20,7 @@ FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
 _MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
-_MAX_ALL_FIELDS: Final = 8192  # of all messages, including rejected ones, as each costs 45 us; a real log has 1,500
+_MAX_ALL_FIELDS: Final = 8192  # of all messages, even rejected ones, because each costs 45 us; a real log has 1,500
 _MAX_FIELDS: Final = 1000  # of one message, including nested fields and padding; a real one has 100
 _MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one

@@ -227,12 +227,12 @@ class UlogParser:
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
         stop = content + int.from_bytes(buffer[at : at + 2], "little")
         is_partial = stop > len(buffer) or not kind
-        # Record types are printable characters, in later versions too; without `verify` the length is right anyway.
+        # Record types are printable characters, also in later versions; without `verify` the length is trusted.
         if kind and not b"!" <= kind <= b"~" and (self._verify or not is_partial):
             return _Inspection(_Validity.INVALID, stop)
         if is_partial:
             return _Inspection(_Validity.INCOMPLETE, stop)
-        if known is not None:  # a sync message inside it means that bytes are missing
+        if known is not None:  # a sync message inside the record means that bytes are missing
             return _Inspection(_Validity.UNKNOWN if self._verify and SYNC in buffer[at:stop] else _Validity.VALID, stop)
         try:
             record = READERS[kind[0]](buffer[content:stop])

@@ -47,7 +47,7 @@ class Information(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """Parameter; after the first subscription, a changed one."""
+    """Parameter: an initial value or, after the first subscription, a changed value."""
 
     key: str
     value: Value
@@ -191,7 +191,7 @@ READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
 A subscription is returned without its layout.
 """
 EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC)}
-"""Sizes of records of fixed size; a longer one is read, but not considered valid."""
+"""Sizes of fixed-size records; a longer record is read, but not considered valid."""
 
 
 class LoggedStream:
