@@ -139,7 +139,7 @@ class Bus(AbstractContextManager["Bus"]):
             sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
             samples.append(sample)
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
-        newest = {sample.address: sample for sample in samples}  # the last one of each address wins
+        newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
         return [newest[address] for address in sorted(newest)]
 
     def vehicles(self, *, timeout: float = 2.0) -> Vehicles:
@@ -246,7 +246,7 @@ class Bus(AbstractContextManager["Bus"]):
         else:
             receiver = Receiver(self._session, pending_queue)
         self._receivers.add(receiver)
-        if self.closed:  # by another thread, in the meantime
+        if self.closed:  # closed by another thread in the meantime
             receiver.close()
             raise ClosedError
         return receiver

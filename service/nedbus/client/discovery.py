@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
-_MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
+_MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
 _POLL: Final = 0.002  # s between polls for tokens
 
 
@@ -316,7 +316,7 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     free, oversized, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
-        # Upper bound of its memory when parsed, measured with CPython 3.11.
+        # Upper bound of the memory of a parsed reply, measured with CPython 3.11.
         size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
         if len(text) > MAX_REPLY_BYTES or size > free:
             oversized += 1

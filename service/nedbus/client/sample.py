@@ -58,7 +58,7 @@ class Sample(Generic[M_co]):
     provenance: Provenance = _UNKNOWN
     retained: bool = False
     stored: bool = False
-    _sent: int | None = None  # in copies, because Zenoh's timestamp cannot be pickled
+    _sent: int | None = None  # set in copies, because Zenoh's timestamp cannot be pickled
 
     @property
     def sent(self) -> int | None:

@@ -208,7 +208,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
             return
         if opening is None or opening.done():
             opening = self._opening = loop.create_task(self._open_in(loop))
-            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may never be awaited
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # may never be awaited
         await asyncio.shield(opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:

@@ -42,7 +42,7 @@ class SharedWindow:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key; replaced as a whole
 
     def share(self, key: str, unread: int, *, now: float) -> int:
-        """Return the share of a publisher with `unread` messages; it expires after a second without a call."""
+        """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
         recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
         self._unread = unread_by_key = recent | {key: (unread, now)}
         others = sum(number for number, _ in unread_by_key.values()) - unread

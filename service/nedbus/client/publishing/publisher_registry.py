@@ -60,7 +60,7 @@ class PublisherRegistry:
         source: str | None = None,
         owner: object = None,
     ) -> Publisher:
-        """Return a new publisher for an address; it keeps `owner` alive.
+        """Return a new publisher for an address; the publisher keeps `owner` alive.
 
         `definition`: required for a topic that is not in BY_TOPIC.
 

@@ -53,7 +53,7 @@ MAX_ACK_REQUESTS: Final = 1000
 
 _MAX_BATCH: Final = 4096  # messages per batch
 _MAX_FRESH: Final = 1024  # samples queued with Zenoh's receive buffer; later ones are detached from it
-_MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
+_MAX_WRITERS_OF_KEY: Final = 8  # beyond that the oldest writer without a gap is evicted
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
 _PAYLOAD: Final = itemgetter(1)
@@ -368,7 +368,7 @@ class PendingQueue:
             info, writer = raw.source_info, stream.writer
             if info is not None:
                 source = info.source_id
-                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than by name
+                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than names
                     name = entity_name(source)
                     writer = stream.writers.get(name)
                     if writer is None:
