@@ -190,7 +190,7 @@ def _parse_config(path: Path) -> zenoh.Config:
 
 @dataclass(frozen=True, slots=True)
 class RouterState:
-    """State of a router: Zenoh id, number of open sessions, including those to other routers, and session limit.
+    """State of a router: Zenoh id, number of open sessions, including sessions to other routers, and session limit.
 
     `max_sessions`: None unless the router's configuration has it in `metadata`; Zenoh does not report its limit.
     """
