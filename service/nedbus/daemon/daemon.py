@@ -88,7 +88,7 @@ class Daemon:
         self.event_log = EventLog()
         # Random, because services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
-        self.max_sessions: int | None = None  # of the embedded router, once it is open
+        self.max_sessions: int | None = None  # session limit of the embedded router, once open
         self.ready, self.closing = threading.Event(), threading.Event()  # closing: only the session is still open
         self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints

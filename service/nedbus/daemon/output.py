@@ -19,7 +19,7 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
 _log = logging.getLogger(__name__)
 
-_MAX_ADDRESSES: Final = 1000  # of one live source
+_MAX_ADDRESSES: Final = 1000  # addresses of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one per `where`
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # logged invalid messages of a source
@@ -224,7 +224,7 @@ class SourceOutput:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, unavailable: UnavailableTopics) -> None:
-        """Store the absent topics of a live source; log each silent address once."""
+        """Store the unavailable topics of a live source; log each silent address once."""
         self.unavailable = unavailable
         if new := [address for address in unavailable.silent if address not in self._silent]:
             self._silent.update(new)

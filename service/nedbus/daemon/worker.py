@@ -24,7 +24,7 @@ _MIN_RUN: Final = 0.1  # s per run of a loop: a log of one message must not be r
 _MAX_DELAY: Final = 1.0  # s; a replay that falls further behind shifts its schedule instead of catching up
 _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
-_MAX_STREAMS: Final = 100  # in a status, which must fit into one reply
+_MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
 
 _Item = SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
@@ -84,7 +84,7 @@ class Worker:
         self.planned, self.source = planned, planned.source
         self.text = planned.text.encode(errors="backslashreplace").decode()  # file names may be invalid UTF-8
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
-        self._name = self.text.rstrip(":")  # in the log
+        self._name = self.text.rstrip(":")  # name in the log
         self._registry = registry
         self._router = router
         self._clock = clock or Clock()
