@@ -6,7 +6,7 @@ from typing import Final, Literal, NamedTuple
 _MAGIC: Final = b"ULog\x01\x12\x35"  # the first bytes of a ULog file
 _MAX_LENGTH: Final = 249  # bytes of `data` in a message
 _NO_RECORD_BEGINS: Final = 255  # first_message_offset
-_MODULUS: Final = 2**16  # of the sequence
+_MODULUS: Final = 2**16  # modulus of the sequence
 _MAX_STEP: Final = 2**15  # a larger sequence step means a duplicate
 _OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _MAX_STEP
 
@@ -46,7 +46,7 @@ class Reassembly:
     def __init__(self) -> None:
         self._old_next = self._old_run = 0
         self._first = b""  # data of the first message, to distinguish its retransmission from a new stream
-        self._last: int | None = None  # sequence; None before the first stream
+        self._last: int | None = None  # last sequence; None before the first stream
         self._synchronised = False
 
     def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:

@@ -50,7 +50,7 @@ STREAMS: Final = {
 """Messages to request, in order: bytes per message (MAVLink 2, from PX4), Hz (0 for `rate`), topics that need it."""
 
 _MIN_RATE: Final = 2.0  # Hz, on a saturated link
-_USABLE_SHARE: Final = 0.9  # of a link's bandwidth; the rest is for heartbeats and answers
+_USABLE_SHARE: Final = 0.9  # share of a link's bandwidth; the rest is for heartbeats and answers
 _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bits
 
 
@@ -107,7 +107,7 @@ class Vehicle:
             self._reset(now)
         self._last_message = now
         step = 1 if self._sequence is None else (sequence - self._sequence) % 256
-        if step > 128:  # out of order: it was counted as lost
+        if step > 128:  # out of order: the message was counted as lost
             self.lost = max(0, self.lost - 1)
         elif step:  # else a duplicate
             self.lost = max(0, self.lost + step - 1 - counted)
@@ -178,7 +178,7 @@ class Vehicle:
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
                 self._store("origin", math.inf, xy_global=True, z_global=True, **known)
-                self._arrivals[ORIGIN] = math.inf  # it is sent once for each request
+                self._arrivals[ORIGIN] = math.inf  # the vehicle sends the origin once per request
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance) and message.bottom_clearance >= 0
                 bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
