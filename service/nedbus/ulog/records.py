@@ -198,7 +198,7 @@ class LoggedStream:
     """Address, message definition and decoder of one subscription.
 
     The definition is nedbus's own, or else made from the log's format. For a topic without a definition in nedbus, the
-    first instance has no instance number: a stream does not announce whether others will follow.
+    first instance has no instance number: a stream does not announce whether more instances will follow.
 
     Raises ValueError for a format that cannot be a message, AddressError for an invalid vehicle or topic.
     """
@@ -206,7 +206,7 @@ class LoggedStream:
     def __init__(self, vehicle: str, subscription: Subscription) -> None:
         topic, layout = subscription.name, subscription.layout
         self.subscription = subscription
-        self.names = tuple(field.name for field in layout.fields)  # in the log
+        self.names = tuple(field.name for field in layout.fields)  # names in the log
         self.definition = BY_TOPIC.get(topic) or _define(
             "".join(part.capitalize() for part in topic.split("_")),
             tuple((field.name, field.kind) for field in layout.fields),
