@@ -281,7 +281,7 @@ def _read_toml(path: Path) -> dict[str, object]:
     except tomllib.TOMLDecodeError as exc:
         position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
         reason = re.sub(r" \(at .*\)", "", str(exc))
-        if position is None:  # "at end of document"
+        if position is None:  # the error is "at end of document"
             lines = text.splitlines() or [""]
             raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
         raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
