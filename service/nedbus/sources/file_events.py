@@ -49,7 +49,7 @@ class _EventOptions(RecordedOptions):
 class Flights:
     """The messages of one file, or of several files merged by UTC.
 
-    A vehicle that occurs in several files gets one name per file. `ended`: vehicles whose file has ended.
+    In each file, a vehicle that is in several files is named after the file. `ended`: vehicles whose file has ended.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
