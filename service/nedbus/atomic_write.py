@@ -43,7 +43,7 @@ def atomic_write(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def sync_folder(path: Path) -> None:
-    """Sync the folder of a new or renamed file to disk: until then a power cut may undo its name."""
+    """Sync the folder of a new or renamed file to disk: until then a power cut may undo the creation or renaming."""
     with suppress(PermissionError):  # a folder that can be written but not read
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:

@@ -10,7 +10,7 @@ from typing import Final
 _START: Final = time.time() - time.monotonic()
 
 utc_ns = time.time_ns
-"""Unix time of the host's clock [ns]; an alias, not a wrapper, as it is called for every sample."""
+"""Unix time of the host's clock [ns]; an alias, not a wrapper, because it is called for every sample."""
 
 
 def steady() -> float:

@@ -52,7 +52,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "rebooted": Event("a vehicle rebooted"),
     "log_stream": Event("the ULog stream of a vehicle starts, ends or is refused, or its file is opened or abandoned"),
     "unsupported": Event("a vehicle, a publisher or ROS 2 does not support a requested message or rate"),
-    "bridge_loop": Event("a topic published by `nedbus ros2` is ignored, as it would loop back"),
+    "bridge_loop": Event("a topic published by `nedbus ros2` is ignored, because it would loop back"),
     # a reader
     "invalid": Event("a received message or reply cannot be decoded"),
     "newer_layout": Event("messages have a newer layout than this version of nedbus supports"),

@@ -101,7 +101,7 @@ class Settings(BaseSettings):
 
     @property
     def routers(self) -> tuple[str, ...]:
-        """Endpoints that a client dials: `connect`, else those of the embedded router of these settings."""
+        """Endpoints that a client dials: `connect`, else the endpoints of the embedded router."""
         return self.connect or tuple(map(dial_endpoint, self.router_endpoints))
 
     @property
@@ -120,7 +120,7 @@ class Settings(BaseSettings):
 
     @property
     def left_out(self) -> frozenset[str]:
-        """Settings that `find_mistakes` dropped, in whole or in part, as invalid or unreadable."""
+        """Settings that `find_mistakes` dropped, in whole or in part, because they are invalid or unreadable."""
         return self._left_out
 
     @property
@@ -225,7 +225,7 @@ def _from_environment(name: str) -> str | None:
 
 
 def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
-    """Return the values with invalid settings replaced by their defaults; of a list, only invalid items are dropped."""
+    """Return the values with invalid settings replaced by their defaults; a list loses only its invalid items."""
     wrong: dict[str, set[int | str]] = defaultdict(set)
     for detail in details:
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
@@ -281,7 +281,7 @@ def _read_toml(path: Path) -> dict[str, object]:
     except tomllib.TOMLDecodeError as exc:
         position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
         reason = re.sub(r" \(at .*\)", "", str(exc))
-        if position is None:  # "at end of document"
+        if position is None:  # the error is "at end of document"
             lines = text.splitlines() or [""]
             raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
         raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc

@@ -11,11 +11,11 @@ class Timings:
     lease: float = 5.0  # without data until a link is closed, as with a frozen host or a cut cable
     router_lease: float = 8.0  # longer: a router must drop a client before that client joins the next router
     tokens_retry: float = 10.0  # before tokens beyond the limit are listed again
-    retransmit_timeout: float = 20.0  # until a sequence gap counts as lost; publishers cache messages as long
+    retransmit_timeout: float = 20.0  # until a sequence gap counts as lost; publishers cache messages for as long
     downsampled_timeout: float = 10.0  # from a liveliness token to the warning that no downsampled message arrives
     definition_timeout: float = 3.0  # for a busy publisher to send the definition of a message
-    return_wait: float = 5.0  # for a reader to return that disconnected without closing, while a router is connected
-    frozen_wait: float = 90.0  # for a reader to return whose lease expired: its process may be suspended
+    return_wait: float = 5.0  # for the return of a reader that disconnected without closing, if a router is connected
+    frozen_wait: float = 90.0  # for the return of a reader whose lease expired: its process may be suspended
     credit_polls: tuple[float, float] = (0.0005, 0.005)  # between polls for credit: first and longest pause
     stale: float = 3.0  # without a message until a stream is stale: it has no rate, and sources stop publishing it
     forgotten: float = 3600.0  # until a vehicle that is gone or silent counts as switched off, and its state is deleted
@@ -29,7 +29,7 @@ class Timings:
     log_retry: float = 30.0  # after a temporary refusal
     log_slow_retry: float = 300.0  # after a refusal caused by the configuration or the link
     log_header: float = 10.0  # for the header, which blocks PX4's logger and so leaves a gap in its own log
-    probe_first: tuple[float, float] = (1.0, 5.0)  # random, as a fleet reconnects all at once after a restart
+    probe_first: tuple[float, float] = (1.0, 5.0)  # random, because a fleet reconnects all at once after a restart
     probe_confirm: float = 1.0  # before a denial is checked again
     probe_unsure: float = 60.0  # before the next check while a vehicle is refused or unknown
     probe_pause: float = 600.0  # before the next check if all vehicles are allowed

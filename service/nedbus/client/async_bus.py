@@ -89,7 +89,7 @@ class AsyncBus:
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
-        return Bus.subscribe(cast("Bus", self), *message, **options)  # only calls `self.subscribe_to`
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # uses no attribute of `self` but `subscribe_to`
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
@@ -131,8 +131,8 @@ class AsyncBus:
         return AsyncPublisher(await self._in_thread(call, lossless=lossless, source=source))
 
     async def close(self, timeout: float = FLUSH_TIMEOUT) -> None:
-        """Close the bus; see `Bus.close`. If cancelled, it closes at once, without waiting for readers."""
-        if (bus := self._bus) is not None:  # in a new thread: those of the pool may be blocked
+        """Close the bus; see `Bus.close`. Cancellation closes the bus at once, without waiting for readers."""
+        if (bus := self._bus) is not None:  # in a new thread: the pool's threads may be blocked
             thread = ThreadPoolExecutor(1, "nedbus-close")
             await _run_cancellable(thread, partial(bus.close, timeout), cancel=partial(_stop_waiting, bus))
 
@@ -162,7 +162,7 @@ def _stop_waiting(bus: Bus) -> None:
 
 
 async def _run_cancellable(thread: ThreadPoolExecutor, call: Callable[[], _T], *, cancel: Callable[[], object]) -> _T:
-    """Run a call in a thread; on cancellation, call `cancel`, which must end it soon."""
+    """Run a call in a thread; on cancellation, call `cancel`, which must end the call soon."""
     running = asyncio.get_running_loop().run_in_executor(thread, call)
     try:
         return await asyncio.shield(running)
@@ -188,10 +188,10 @@ def connect_async(
 class AsyncPublisher(AbstractAsyncContextManager["AsyncPublisher"]):
     """The asyncio version of Publisher; get one from `await bus.publisher(...)`.
 
-    Attributes and errors are those of Publisher; all methods are coroutines.
+    Attributes and errors are the same as in Publisher; all methods are coroutines.
     Methods that may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) run in a thread of this
-    publisher and do not block the event loop. Cancelling one, for example by a timeout, ends its wait: `published` then
-    holds the number of messages sent, and a cancelled `close` closes without waiting. Await each call before the next.
+    publisher and do not block the event loop. Cancelling a call, for example by a timeout, ends its wait: `published`
+    then holds the number of messages sent, and a cancelled `close` closes at once. Await each call before the next.
     """
 
     def __init__(self, publisher: Publisher) -> None:

@@ -86,12 +86,12 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Subscription[Any]:
         """Return a subscription to iterate over, which starts with the last message of each key.
 
-        `message`: a message class such as VehicleAttitude, for its first topic or the one in `topic`, such as
-        "estimator_attitude"; samples are typed then. Or the name of a topic, or "*" for all topics.
+        `message`: a message class such as VehicleAttitude, for typed samples of its first topic or of `topic`, such as
+        "estimator_attitude"; or the name of a topic; or "*" for all topics.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
         about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
-        In both modes `counts` has the samples lost, dropped or invalid, and a slow reader does not delay other readers.
+        In both modes `counts` reports lost, dropped and invalid samples, and a slow reader never delays other readers.
         `max_rate`: maximum number of messages per second of each stream, downsampled by its publisher, for slow links.
         The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`; rates below 1 are
         downsampled further by the reader. Messages left out by downsampling count as neither lost nor dropped.
@@ -124,7 +124,7 @@ class Bus(AbstractContextManager["Bus"]):
         instance: int | None = None,
         timeout: float = 2.0,
     ) -> list[Sample[Any]]:
-        """Query the last sample of each key, sorted by address; its `latency` is its age. Topics as in `subscribe`.
+        """Query the last sample of each key, sorted by address; `latency` is a sample's age. Topics as in `subscribe`.
 
         Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and omitted.
         A sample from a storage has `stored` set; it is returned only if the publisher does not reply.
@@ -139,7 +139,7 @@ class Bus(AbstractContextManager["Bus"]):
             sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
             samples.append(sample)
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
-        newest = {sample.address: sample for sample in samples}  # the last one of each address wins
+        newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
         return [newest[address] for address in sorted(newest)]
 
     def vehicles(self, *, timeout: float = 2.0) -> Vehicles:
@@ -156,7 +156,7 @@ class Bus(AbstractContextManager["Bus"]):
         return vehicles
 
     def publishers(self, *, timeout: float = 2.0) -> Publishers:
-        """Return the number of publishers of each address; waits as `vehicles` does. More than one is a conflict."""
+        """Return the number of publishers of each address: more than one is a conflict. Waits as `vehicles` does."""
         publishers = self._directory.publishers(self._session, timeout=timeout)
         publishers.complete = publishers.complete and self.connected
         return publishers
@@ -186,11 +186,11 @@ class Bus(AbstractContextManager["Bus"]):
         """Return a publisher for one address.
 
         It returns once the router has processed its declarations: later subscribers receive the last message.
-        `lossless`: flow control for replays as fast as the readers. `publish` slows down to 10 messages per second
+        `lossless`: flow control for replays at the readers' pace. `publish` slows down to 10 messages per second
         while a reader in mode "every" has more than 2,000 unread messages; `close` waits until the readers have all
         messages.
         `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
-        `definition`: of a custom message, from `define_msg`; readers query it from the publisher.
+        `definition`: the definition of a custom message, from `define_msg`; readers query it from the publisher.
 
         Raises AddressInUseError if this bus already has a publisher for the address.
         """
@@ -246,7 +246,7 @@ class Bus(AbstractContextManager["Bus"]):
         else:
             receiver = Receiver(self._session, pending_queue)
         self._receivers.add(receiver)
-        if self.closed:  # by another thread, in the meantime
+        if self.closed:  # closed by another thread in the meantime
             receiver.close()
             raise ClosedError
         return receiver
@@ -265,7 +265,7 @@ def connect(
     `endpoint`: a Zenoh endpoint such as tcp/192.168.1.5:7447, or several; the first one that answers is used.
     The default is NEDBUS_CONNECT, then `connect` in nedbus.toml, then the router of `nedbus serve` on this host.
     `timeout`: seconds to wait for a router; None waits until Ctrl-C. A broken link is reconnected automatically.
-    `tls`: for tls/ endpoints, by default from the settings. `config`: path of a file to read instead of nedbus.toml.
+    `tls`: files for tls/ endpoints, by default from the settings. `config`: a file to read instead of nedbus.toml.
     With `endpoint`, only `prefix` and the TLS files are read from the file, unless passed as arguments.
 
     Raises ConnectError if no router answers, ConfigError for an invalid setting.

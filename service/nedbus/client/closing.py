@@ -13,7 +13,7 @@ from nedbus.transport import is_forked
 
 from .io_thread import CallThread
 
-_DRAIN: Final = 2.0  # s that process exit waits for pending closes
+_DRAIN: Final = 2.0  # s for which process exit waits for pending closes
 _START_PAUSE: Final = 0.005  # s between checks whether a thread has started
 _closer = CallThread("nedbus-closer")
 _owners: weakref.WeakSet[object] = weakref.WeakSet()

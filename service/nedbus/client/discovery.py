@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
-_MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
+_MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
 _POLL: Final = 0.002  # s between polls for tokens
 
 
@@ -43,7 +43,7 @@ class Publishers(Counter[Address]):
 class Vehicles(dict[str, list[Address]]):
     """The published addresses by vehicle.
 
-    `complete`: False without a router, until the router has listed all addresses, and above 10,000 of them.
+    `complete`: False without a router, until the router has listed all addresses, and if there are over 10,000.
     """
 
     complete = True
@@ -122,8 +122,8 @@ class LogStreamStatus(_UntrustedReply):
     `received`: bytes so far. `rate`: bytes per second over the last second. `delay`: mean age of messages on arrival,
     by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
     `header_time`: duration of the header [s]; the vehicle's own log has a gap of this length.
-    `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds of the number of
-    ULog messages in them, which MAVLink does not report. `undecodable`: data without a usable definition.
+    `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds on the number of
+    ULog messages lost, which MAVLink does not report. `undecodable`: data messages without a usable definition.
     `saved`: the path of the saved log.
     """
 
@@ -165,10 +165,10 @@ class SourceStatus(_UntrustedReply):
     `state`: starting, waiting, running, retrying, done or failed; empty if not reported.
     `published`, `rejected`: messages since the service started. `done`, `total`: progress of this run,
     in messages, or in bytes of a log.
-    `lost`: messages lost before they reached a live source, if it can detect them. `reboots`: reboots of vehicles.
+    `lost`: messages lost before they reached a live source that detects losses. `reboots`: reboots of vehicles.
     `stale`: addresses of a live source without a message for 3 s.
-    `not_carried`: messages of vehicles that this source has no definition for. `silent`: addresses that vehicles
-    announce but do not send, while others arrive.
+    `not_carried`: names of vehicles' messages for which this source has no definition. `silent`: addresses that a
+    vehicle announces without sending messages, while messages of its other topics arrive.
     `rejections`: the number of rejected messages by rule.
     `retries`: restarts after a failure. `error`: the reason of the last failure.
     `streams`: the health of each published stream, 100 at most. `log_streams`: the ULog stream of each vehicle.
@@ -221,7 +221,7 @@ class ServiceStatus(_UntrustedReply):
     sources: tuple[SourceStatus, ...] = ()
 
     def split(self, _: int) -> list[ServiceStatus]:
-        """Split into one status per source; omit the stream health of a single source; return [] if it has none."""
+        """Split into one status per source; omit the stream health of a single source; return [] without sources."""
         if len(self.sources) > 1:
             return [replace(self, sources=(each,)) for each in self.sources]
         return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
@@ -316,7 +316,7 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
     free, oversized, invalid = _MAX_MEMORY, 0, ""
     for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
-        # Upper bound of its memory when parsed, measured with CPython 3.11.
+        # Upper bound of the memory of a parsed reply, measured with CPython 3.11.
         size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
         if len(text) > MAX_REPLY_BYTES or size > free:
             oversized += 1

@@ -26,7 +26,7 @@ StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"] 
 
 _log = logging.getLogger(__name__)
 
-_REBOOT_STEP: Final = 1_000_000  # us by which PX4's time steps back in a reboot; less is a message out of order
+_REBOOT_STEP: Final = 1_000_000  # us by which PX4's time steps back in a reboot; below it, a message is out of order
 _GAP_FACTOR: Final = 3.0  # multiple of the usual interval between PX4's timestamps
 _MIN_STEPS: Final = 5  # intervals before gaps are counted
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual interval and the usual rate
@@ -38,7 +38,7 @@ _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5,
 _MAX_STREAMS: Final = 4096  # per monitor
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
 _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
-_ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token is gone
+_ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token counts as gone
 _FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
 
 
@@ -223,7 +223,7 @@ class StreamHealth:
         )
 
     def _add_time(self, timestamp: int) -> bool:
-        """Track PX4's time; return True if it is the first one or stepped back in a reboot."""
+        """Track PX4's time; return True for the first time, and for a step back in a reboot."""
         step = None if self._time is None else timestamp - self._time
         if step is None or step < -_REBOOT_STEP:
             self._reboots += step is not None

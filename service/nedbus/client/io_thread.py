@@ -19,7 +19,7 @@ from nedbus.log_event import about
 _log = logging.getLogger(__name__)
 
 TICK: Final = 0.06
-"""Pauses of at least this length [s] are cut to end at a multiple of it, common to all jobs."""
+"""Pauses of at least this length [s] are shortened to end at a multiple of it, so jobs are due at common times."""
 
 _MIN_PAUSE: Final = 0.002  # s between two calls of a job
 _RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
@@ -34,8 +34,8 @@ _sleeps_until = math.inf
 class Job:
     """A function that the I/O thread calls repeatedly until `end`.
 
-    It gets the monotonic time [s] and returns the seconds until its next call. It must not block: that would delay all
-    sessions of the process.
+    The function receives the monotonic time [s] and returns the seconds until its next call. It must not block, because
+    a blocked job delays all sessions of the process.
     """
 
     def __init__(self, call: Callable[[float], float]) -> None:

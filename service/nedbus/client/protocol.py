@@ -7,4 +7,4 @@ A lossless publisher requests acknowledgements from readers in mode `every` with
 from typing import Final
 
 LIVE: Final = b"live"  # attachment of a publisher's reply with its last message; a storage's reply has none
-CLOSED: Final = b"closed"  # acknowledgement of a closed reader; others are empty
+CLOSED: Final = b"closed"  # payload of an acknowledgement from a closed reader; other acknowledgements are empty

@@ -58,7 +58,7 @@ class Sample(Generic[M_co]):
     provenance: Provenance = _UNKNOWN
     retained: bool = False
     stored: bool = False
-    _sent: int | None = None  # in copies, because Zenoh's timestamp cannot be pickled
+    _sent: int | None = None  # set in copies, because Zenoh's timestamp cannot be pickled
 
     @property
     def sent(self) -> int | None:
@@ -123,7 +123,7 @@ class Counts:
     `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
-    `forgotten`: least recently active keys, evicted as there were more than 10,000; their next gap is not in `lost`.
+    `forgotten`: least recently active keys, evicted because of the limit of 10,000; `lost` omits their next gap.
     """
 
     received: int = 0

@@ -76,7 +76,7 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
         return self._next(self._queue.pop_batch, timeout)
 
     def rows(self) -> Iterator[Sample[M_co]]:
-        """Iterate over samples with a Row, a named tuple, as `message`: faster, with the same validation."""
+        """Iterate over samples whose `message` is a Row, a named tuple: faster, with the same validation."""
         return self._each(self._pop_row)
 
     def batches(self) -> Iterator[Batch]:
@@ -156,7 +156,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         if self._opening is not None:
             await asyncio.wait([self._opening])
         if self._finalizer is not None:
-            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new one: those of the pool may be blocked
+            thread = ThreadPoolExecutor(1, "nedbus-close")  # a new thread: the pool's threads may be blocked
             await asyncio.get_running_loop().run_in_executor(thread, self._finalizer.close_now)
 
     def __aiter__(self) -> AsyncIterator[Sample[M_co]]:
@@ -208,7 +208,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
             return
         if opening is None or opening.done():
             opening = self._opening = loop.create_task(self._open_in(loop))
-            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may never be awaited
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # may never be awaited
         await asyncio.shield(opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:

@@ -86,9 +86,9 @@ class Daemon:
         self._session: Session | None = None
         self._permission: WritePermission | None = None
         self.event_log = EventLog()
-        # Random, as services in containers may all be PID 1 on hosts of the same name.
+        # Random, because services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
-        self.max_sessions: int | None = None  # of the embedded router, once it is open
+        self.max_sessions: int | None = None  # session limit of the embedded router, once open
         self.ready, self.closing = threading.Event(), threading.Event()  # closing: only the session is still open
         self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
@@ -121,7 +121,7 @@ class Daemon:
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """Known write permission at the router by published vehicle: True if access rules deny it."""
+        """Whether access rules deny each published vehicle; vehicles of unknown permission are omitted."""
         return {} if self._permission is None else self._permission.refused
 
     @property
@@ -136,7 +136,7 @@ class Daemon:
 
     @property
     def sessions(self) -> int:
-        """Number of sessions connected to the embedded router, or of links of a client to its router."""
+        """Number of sessions connected to the embedded router, or of a client's links to its router."""
         return 0 if self._session is None else len(self._session.info.transports())
 
     def update_events(self, measures: Sequence[SourceMeasures] | None = None) -> EventLog:
@@ -174,8 +174,8 @@ class Daemon:
     def reload(self, settings: Settings) -> str:
         """Start new sources, stop removed ones and leave all others running; return a summary for the log.
 
-        Raises ConfigError, and changes nothing, if a source is invalid or any setting other than source and vehicle
-        differs.
+        Raises ConfigError, and changes nothing, if a source is invalid, or a setting other than source and vehicle has
+        changed.
         """
         for name in type(settings).model_fields:
             if name not in _RELOADABLE and getattr(settings, name) != getattr(self._settings, name):
@@ -233,7 +233,7 @@ class Daemon:
             if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
                 text = "%s: still stopping after %.0f s, possibly because of a slow reader"
                 _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
-        for worker in new:  # after the removed ones have stopped, as they may use the same addresses
+        for worker in new:  # after the removed workers have stopped, because both may use the same addresses
             worker.thread.start()
         self._workers = ordered
         return len(ordered) - len(new)

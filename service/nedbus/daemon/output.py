@@ -19,7 +19,7 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
 _log = logging.getLogger(__name__)
 
-_MAX_ADDRESSES: Final = 1000  # of one live source
+_MAX_ADDRESSES: Final = 1000  # addresses of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one per `where`
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # logged invalid messages of a source
@@ -33,7 +33,7 @@ _DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2,
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """State of one address: health, publisher while published, and the last message of a live source."""
+    """State of one address: health, open publisher if any, and the last message of a live source."""
 
     health: StreamHealth
     publisher: Publisher | None = None
@@ -42,14 +42,14 @@ class _Stream:
 
 
 class SourceOutput:
-    """Publish the messages of a source, called `name` in the log and configured as `text`; `now`: monotonic [s]."""
+    """Publish the messages of a source, called `name` in the log and configured as `text`; `now`: monotonic clock."""
 
     def __init__(
         self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], event_log: EventLog
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()  # messages by violated rule
-        self.unavailable = UnavailableTopics()  # topics that vehicles publish and a live source does not deliver now
+        self.unavailable = UnavailableTopics()  # topics that vehicles publish but a live source does not deliver now
         self.log_streams: dict[str, LogStreamStatus] = {}  # by vehicle of a live source
         self.durations = Histogram(_DURATIONS)  # s to validate, encode and send a message
         self._name = name
@@ -97,7 +97,7 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher, unless open with this definition; raise AddressInUseError if another source has it."""
+        """Open a publisher, or keep one with this definition; raise AddressInUseError if another source has one."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
@@ -203,7 +203,7 @@ class SourceOutput:
         return bool(fresh)
 
     def _evict_stale(self) -> bool:
-        """Delete the address that has been stale longest; return False if all are published."""
+        """Delete the address that has been stale the longest; return False if all are published."""
         stale = () if self._is_full else {*self._streams}.difference(self.addresses)
         if stale:
             del self._streams[min(stale, key=lambda each: self._streams[each].last_received or 0.0)]
@@ -224,7 +224,7 @@ class SourceOutput:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, unavailable: UnavailableTopics) -> None:
-        """Store the absent topics of a live source; log each silent address once."""
+        """Store the unavailable topics of a live source; log each silent address once."""
         self.unavailable = unavailable
         if new := [address for address in unavailable.silent if address not in self._silent]:
             self._silent.update(new)

@@ -21,10 +21,10 @@ from .output import SourceOutput
 _log = logging.getLogger(__name__)
 
 _MIN_RUN: Final = 0.1  # s per run of a loop: a log of one message must not be read thousands of times a second
-_MAX_DELAY: Final = 1.0  # s; a replay that is later shifts its schedule instead of catching up
+_MAX_DELAY: Final = 1.0  # s; a replay that falls further behind shifts its schedule instead of catching up
 _STALE_POLL: Final = 0.5  # s between checks for stale streams
 _READER_POLL: Final = 0.05  # s between checks for a subscriber
-_MAX_STREAMS: Final = 100  # in a status, which must fit into one reply
+_MAX_STREAMS: Final = 100  # streams in a status, which must fit into one reply
 
 _Item = SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
@@ -33,7 +33,7 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 
 @dataclass(frozen=True, slots=True)
 class PlannedSource:
-    """A configured source, number `index` in the settings; a reload keeps it running if text and vehicle are equal."""
+    """A configured source, number `index` in the settings; a reload keeps it if text and vehicle are unchanged."""
 
     index: int = field(compare=False)
     text: str
@@ -66,7 +66,7 @@ class Clock(threading.Event):
 class Worker:
     """Run one source in a thread until the worker is stopped; publishers stay open after the source has ended.
 
-    `retry`: restart a failed replay with exponential backoff, as is always done with a live source.
+    `retry`: restart a failed replay with exponential backoff; a failed live source is always restarted.
     `router`: the embedded router, for live sources; `on_end`: called when the source has ended.
     """
 
@@ -84,7 +84,7 @@ class Worker:
         self.planned, self.source = planned, planned.source
         self.text = planned.text.encode(errors="backslashreplace").decode()  # file names may be invalid UTF-8
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
-        self._name = self.text.rstrip(":")  # in the log
+        self._name = self.text.rstrip(":")  # name in the log
         self._registry = registry
         self._router = router
         self._clock = clock or Clock()
@@ -95,7 +95,7 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._message_start: float | None = None  # of publishing the current one; None while waiting
+        self._message_start: float | None = None  # when publishing of the current message began; None while waiting
         self._release = False
         self._warned: set[str] = set()
 
@@ -155,7 +155,7 @@ class Worker:
         self._clock.wait(None)
         if self._release:
             self._output.release()
-            _log.info("%s: stopped, as it is no longer configured", self.text, extra=about("reload"))
+            _log.info("%s: stopped, because it is no longer configured", self.text, extra=about("reload"))
 
     def _run_until_done(self) -> None:
         failures = 0
@@ -197,7 +197,7 @@ class Worker:
             _log.info("%s: %s", self._name, run.summary, extra=about("replay_opened", source=self._name))
             self._warned.clear()
         else:
-            run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that start later
+            run.addresses.update(last.addresses)  # so a loop keeps the publishers of streams that start later
         self._warn(run)
         self._run, self._done = run, 0
         if source.options.wait and last is None:
@@ -269,7 +269,7 @@ class Worker:
             _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
     def _fail(self, reason: str) -> None:
-        """Store the reason and release all addresses, as another source may use them during the backoff."""
+        """Store the reason and release all addresses, because another source may use them during the backoff."""
         self._state, self._error = "retrying", reason
         self._retries += 1
         event = "retrying" if self._retry else "failed"

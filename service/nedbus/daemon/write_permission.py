@@ -1,7 +1,7 @@
 """Write permission at the router, whose access rules drop messages without an error at the sender.
 
 Only services with a certificate are checked, because access rules refer to certificates. Each check briefly opens a
-second session: soon after the link is up or a vehicle appears, then rarely, as rules change only at a router restart.
+second session: soon after the link comes up or a vehicle appears, later rarely: rules change at router restarts only.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class WritePermission:
 
     @property
     def refused(self) -> dict[str, bool]:
-        """Known write permission at the router by vehicle: True if access rules deny it."""
+        """Whether access rules deny each vehicle; vehicles of unknown permission are omitted."""
         known = self._denials.copy().items()
         return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _CONFIRMED}
 
@@ -100,7 +100,7 @@ class WritePermission:
                 self._denials[vehicle] = 0
             elif verdict == "denied":
                 self._denials[vehicle] = number + 1
-            elif not number:  # else the router was slow, as rules do not change while a link is up
+            elif not number:  # else the router was slow: rules do not change while a link is up
                 self._denials.pop(vehicle, None)
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
@@ -119,7 +119,7 @@ class WritePermission:
         return TIMINGS.probe_pause if are_allowed else TIMINGS.probe_unsure
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
-        """Return the verdict for each vehicle; empty if the two sessions share no router."""
+        """Return the verdict for each vehicle, or no verdicts if the two sessions share no router."""
         routers = _routers_of(self._session)
         for endpoint in self._endpoints if vehicles else ():
             try:
@@ -130,7 +130,7 @@ class WritePermission:
                 if not (shared := _routers_of(reader)) or not shared <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
-                # A missing probe message only counts if no link was lost during the check.
+                # A missing probe message counts only if no link was lost during the check.
                 return verdicts if _routers_of(reader) == shared and _routers_of(self._session) == routers else {}
         return {}
 

@@ -67,7 +67,7 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
         ]
         subjects.append(f'{{ id: "{name}", cert_common_names: ["{name}"] }},')
         policies.append(f'{{ rules: ["{name}-in"], subjects: ["{name}"] }},')
-    sections = iter((rules, subjects, policies))  # in the order of the file
+    sections = iter((rules, subjects, policies))  # in the order of the marked blocks in the file
 
     def fill(block: re.Match[str]) -> str:
         return "".join([block["begin"], *(f"{block['indent']}{line}\n" for line in next(sections)), block["end"]])

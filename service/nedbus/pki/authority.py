@@ -101,10 +101,10 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
 
 
 def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None) -> list[Path]:
-    """Replace a certificate by one with the same name and hosts and a later expiry, and return the new files.
+    """Replace a certificate with one of the same name and hosts and a later expiry, and return the new files.
 
-    The old certificate stays valid until it expires; with `replace_key`, together with its old key.
-    A CA keeps its key, which keeps all certificates valid that it signed.
+    The old certificate and its key stay valid until the certificate expires, even with `replace_key`.
+    A CA keeps its key, so all certificates that it signed stay valid.
 
     Raises PkiError for a certificate of another CA, and if a file cannot be read or written.
     """

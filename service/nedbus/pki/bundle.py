@@ -36,7 +36,7 @@ def make_bundle(
 ) -> list[Path]:
     """Atomically create a folder with all files that a vehicle needs to join these routers, and return the files.
 
-    `folder`: the CA, which keeps a copy of the certificate to list and renew it; the key is only in the bundle.
+    `folder`: the CA's folder, which keeps a copy of the certificate for renewal; the key is only in the bundle.
     `target`: folder of the files on the vehicle, by default /etc/nedbus.
 
     Raises PkiError if the output folder, or a key or certificate of this vehicle, already exists; ConfigError for an

@@ -13,7 +13,7 @@ from nedbus_msgs import AddressError, check_vehicle
 DAYS: Final = 825  # default validity of a certificate [days]
 RENEW_WITHIN: Final = 30  # days before expiry when a certificate becomes due for renewal
 CERTIFICATE_PREFIX: Final = "vehicle-"
-"""Prefix of the vehicle id in common names, which prevents a vehicle named like a reader or router."""
+"""Prefix of the vehicle id in common names, so no vehicle has the common name of a reader or router."""
 
 MAX_NAME: Final = 64  # limit of X.509 for a common name [characters]
 
@@ -39,9 +39,9 @@ class Certificate:
 
     @classmethod
     def decode(cls, data: bytes, *, pem: bool = False) -> Certificate:
-        """Decode a certificate in DER, or with `pem` the first one of a PEM text, from an untrusted peer.
+        """Decode an untrusted peer's certificate in DER or, with `pem`, the first one in a PEM text.
 
-        Uses the optional package `cryptography`, as Python's `ssl` decodes only verified certificates.
+        Uses the optional package `cryptography`, because Python's `ssl` decodes only verified certificates.
 
         Raises ValueError for malformed data, ConfigError (also a ValueError) without the extra `pki`.
         """
@@ -61,7 +61,7 @@ class Certificate:
         return cls.decode(Path(path).read_bytes(), pem=True)
 
     def days_left(self, now: dt.datetime) -> float:
-        """Return the days until expiry, negative after it."""
+        """Return the days until expiry; negative for an expired certificate."""
         return (self.ends - now) / dt.timedelta(days=1)
 
     def is_due(self, now: dt.datetime, within: float = RENEW_WITHIN) -> bool:

@@ -26,7 +26,7 @@ _MAX_LOGGED: Final = 5  # rejected messages logged per file
 def convert(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
     """Write the messages of a replay to a new MCAP file and return a summary; leave no file behind on failure.
 
-    The publish time of a message is its PX4 timestamp, its log time that of the first message plus `due`.
+    The publish time of a message is its PX4 timestamp; its log time is the first message's timestamp plus `due`.
     `source`: the kind of source, such as `ulog`. `on_progress`: called with the number of messages handled so far.
 
     Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.

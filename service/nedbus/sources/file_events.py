@@ -21,7 +21,7 @@ from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
 from .source import ReplayRun, ReplaySource, SourceMessage
 
-MAX_FILE_EVENTS: Final = 100_000  # the oldest ones are discarded
+MAX_FILE_EVENTS: Final = 100_000  # beyond that the oldest are discarded
 _LOOKAHEAD: Final = 1000  # messages read to determine the start time of a file
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
@@ -38,7 +38,7 @@ class FileEvents:
 
 
 class _EventOptions(RecordedOptions):
-    """Replay options for event detection: all built-in topics, and two others."""
+    """Replay options for event detection: all built-in topics, and two other topics."""
 
     @property
     def chosen_topics(self) -> Collection[str]:
@@ -49,7 +49,7 @@ class _EventOptions(RecordedOptions):
 class Flights:
     """The messages of one file, or of several files merged by UTC.
 
-    A vehicle that is in several files is named after the file in each. `ended`: vehicles whose file has ended.
+    In each file, a vehicle that is in several files is named after the file. `ended`: vehicles whose file has ended.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
@@ -124,7 +124,7 @@ def follow(
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
     """Detect events in a replay; yield each message with its rejection reason or its payload.
 
-    `ended`: vehicles that send no more messages, which do not count as silent.
+    `ended`: vehicles without further messages, which do not count as silent.
     """
     checked = due = 0.0
 

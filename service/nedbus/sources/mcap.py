@@ -74,7 +74,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
-    """Sort messages by log time, because writers batch them by stream; flush when it goes back by over _MAX_GAP."""
+    """Sort messages by log time, because writers batch them by stream; flush if it steps back by over _MAX_GAP."""
     waiting: list[tuple[int, int, RecordedMessage]] = []
     newest = 0
     for number, recorded in messages:

@@ -114,7 +114,7 @@ class Estimator:
         self._noise, self._aided = noise, aided
         self._phases = [random.uniform(0.0, math.tau) for _ in range(3)]
         direction = random.uniform(-math.pi, math.pi)
-        self._north, self._east = math.cos(direction), math.sin(direction)  # of the drift
+        self._north, self._east = math.cos(direction), math.sin(direction)  # direction of the drift
         self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
 
     def xy_valid(self, time: float) -> bool:

@@ -63,7 +63,7 @@ class ReplayRun:
     """One run of a replay; its attributes are updated while the messages are iterated.
 
     `messages`: in order of `due`; can be iterated once.
-    `addresses`: those of the messages so far, each with its definition, or None for the default of its topic.
+    `addresses`: addresses of the messages so far, each with its definition, or None for the topic's default.
     `total`: number of messages, or of bytes if there is a `position`; None if endless.
     `summary`: description for the log; `warnings`: damage and skipped parts.
     `damage`: description of messages lost to damage, which make the run fail; None without damage.

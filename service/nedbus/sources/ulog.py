@@ -16,7 +16,7 @@ from .source import ReplayRun, SourceMessage
 _LOOKAHEAD: Final = 1000  # messages read when a log is opened, for the initial list of addresses
 _MAX_STEP: Final = 1_000_000  # us; a longer step must be confirmed by the next message
 _MAX_GAP: Final = 60_000_000  # us; a longer step is skipped
-_MAX_BEHIND: Final = 1000  # consecutive messages older than the clock by more than _MAX_GAP, which then set it back
+_MAX_BEHIND: Final = 1000  # consecutive messages more than _MAX_GAP behind the clock, after which the clock is set back
 
 
 def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:

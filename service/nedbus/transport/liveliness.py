@@ -17,7 +17,7 @@ from .session import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
 
-_MAX_PENDING: Final = 131_072  # replies; large, as Zenoh holds its session lock while it waits for a free slot
+_MAX_PENDING: Final = 131_072  # replies; large, because Zenoh holds its session lock while it waits for a free slot
 _MAX_CHANGES: Final = 16_384  # queued changes; more than the tokens stored
 _MAX_KEY_LENGTH: Final = MAX_QUERY_BYTES // MAX_REPLIES
 _PROBE_TIMEOUT: Final = 60.0  # s for a router to list its tokens, before the probe is repeated
@@ -32,17 +32,17 @@ def token_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 class LivelinessTokens:
     """The liveliness tokens that match a key expression. Not thread-safe.
 
-    A router sends a new subscriber all tokens at once, then each change. The time for the list grows with the square of
-    its length: a second for 4,000 tokens. A query on a key without a token (the probe) marks the end of the list, as
-    its reply follows the tokens. If the queue of changes overflows, the tokens are subscribed again. At most 10,000 are
-    stored; a warning is logged if there are more.
+    A router sends a new subscriber all tokens at once, then each change. Listing takes time quadratic in the number of
+    tokens: one second for 4,000. The reply to a query on a key without a token (the probe) follows all tokens, and so
+    marks the end of the list. If the queue of changes overflows, the subscription is declared again. At most 10,000
+    tokens are stored; a warning is logged if there are more.
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
         self._session, self._key_expr = session, key_expr
         self._keys: set[str] = set()
-        self._unseen: set[str] = set()  # tokens of the previous subscription, not yet listed by this one
-        self._retry = math.inf  # monotonic time from which tokens beyond the limit are listed [s]
+        self._unseen: set[str] = set()  # tokens of the previous subscription that the current one has not listed yet
+        self._retry = math.inf  # monotonic time of the next attempt to list tokens beyond the limit [s]
         self._probe: Replies | None = None
         self._subscribe()
 
@@ -63,7 +63,7 @@ class LivelinessTokens:
     def poll(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, in order: the key of a token, and True if it was declared."""
         is_listed = False
-        if self._probe is not None:  # read before the changes, as its reply follows all tokens
+        if self._probe is not None:  # read before the changes, because its reply follows all tokens
             self._probe.poll()
             is_listed = self._probe.ended and not self._probe.failed
             if self._probe.ended:
@@ -73,7 +73,7 @@ class LivelinessTokens:
             while len(changes) < _MAX_CHANGES and (sample := self._subscriber.handler.try_recv()) is not None:
                 changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
         is_retry_due = len(self._keys) < MAX_REPLIES and time.monotonic() >= self._retry
-        if len(changes) == _MAX_CHANGES or is_retry_due:  # changes were dropped
+        if len(changes) == _MAX_CHANGES or is_retry_due:  # changes were dropped, or there is room again
             self.undeclare()
             self._subscribe()
             return []
@@ -89,7 +89,7 @@ class LivelinessTokens:
         self._probe, self._unseen, self._retry = self._send_probe(), self._keys.copy(), math.inf
 
     def _send_probe(self) -> Replies:
-        key = re.sub(r"\*\*|\$?\*", "-", self._key_expr)  # access rules that allow the expression allow this key
+        key = re.sub(r"\*\*|\$?\*", "-", self._key_expr)  # access rules that allow the key expression allow this key
         return _query_tokens(self._session, key, _PROBE_TIMEOUT)
 
     def _apply(self, key: str, alive: bool) -> bool:

@@ -1,8 +1,8 @@
 """Zenoh queries and their replies.
 
 Replies are queued in Rust channels until a nedbus thread polls them. A Python callback, or its destructor, would
-wait for the GIL on a Zenoh thread. During a liveliness query that thread holds the session lock: a deadlock as soon as
-another thread waits for the lock with the GIL held.
+wait for the GIL on a Zenoh thread. During a liveliness query that thread holds the session lock, and so would deadlock
+with any thread that holds the GIL while it waits for this lock.
 """
 
 import logging

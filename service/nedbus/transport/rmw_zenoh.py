@@ -17,7 +17,7 @@ import xxhash
 
 from nedbus_msgs import DecodeError
 
-NO_HASH: Final = "TypeHashNotSupported"  # in place of a hash, in keys of ROS 2 Humble and of PX4 built for it
+NO_HASH: Final = "TypeHashNotSupported"  # replaces the hash in keys of ROS 2 Humble, and of PX4 built for Humble
 BRIDGED_ENCODING: Final = "application/cdr;nedbus"  # marks messages from nedbus, to prevent loops; ROS 2 ignores it
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10, as PX4 publishes
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
@@ -47,7 +47,7 @@ class TopicKey:
         return cls(int(found[1]), found[2], found[3], found[4])
 
     def token(self, kind: Literal["MP", "MS"], session: str, node: str, entity: int) -> str:
-        """Return the liveliness token of a publisher (MP), which ROS 2 lists, or of a subscription (MS) of a node."""
+        """Return the liveliness token of a node's publisher (MP), which ROS 2 lists, or of its subscription (MS)."""
         topic, end = self.topic.replace("/", "%"), f"{self.dds_type}/{self.type_hash}/{_QOS}"
         return f"@ros2_lv/{self.domain}/{session}/0/{entity}/{kind}/%/%/{node}/%{topic}/{end}"
 
@@ -104,13 +104,13 @@ class PublisherToken:
 
     @property
     def gid(self) -> bytes | None:
-        """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same."""
+        """The gid in PX4's node name, None for other nodes; all simulated PX4s have the same gid."""
         found = _PX4_NODE.fullmatch(self.node)
         return bytes.fromhex(found[1]) if found else None
 
 
 def gid_of_token(token: str) -> bytes:
-    """Return the gid of the owner of a token, as shown by ROS 2 and sent in the attachments of its messages.
+    """Return the gid of a token's owner, which ROS 2 shows and the attachments of the owner's messages carry.
 
     Source: rmw_zenoh, liveliness_utils.cpp: the 128-bit XXH3 of the token, lower half first.
     """

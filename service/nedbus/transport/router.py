@@ -29,7 +29,7 @@ _OTHER_FILES: Final = 100  # open files other than sessions: 21 of a router, plu
 _ADMIN_KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
 _MAX_STATE_BYTES: Final = 2**20  # a reply with about 5,700 sessions
 _MAX_SESSIONS: Final = 2**32  # largest limit accepted from a router
-_MAX_ROUTERS: Final = 1000  # routers returned, as any peer may claim to be one
+_MAX_ROUTERS: Final = 1000  # routers returned, because any peer may claim to be one
 
 
 def open_router(
@@ -60,7 +60,7 @@ def open_router(
             # Longer than the lease of clients, so a router drops a silent client before it joins another router: if two
             # routers have the same client, Zenoh 1.10.2 loses its queryables on a third router that joins later.
             "transport/link/tx/lease": round(1000 * TIMINGS.router_lease),
-            "scouting/delay": 0,  # do not wait 0.5 s for scouting replies, as scouting is off
+            "scouting/delay": 0,  # do not wait 0.5 s for scouting replies: scouting is off
             "listen/endpoints": list(router_endpoints(listen)),
             "connect/endpoints": list(connect),
             "connect/retry": random_backoff(),
@@ -73,7 +73,7 @@ def open_router(
         if plugins := _get(config, "plugins"):
             text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
             _log.warning(text, config_file, _plugin_names(plugins), extra=about("router"))
-        for name, file in _tls_files(config).items():  # as Zenoh does not name the file in its error
+        for name, file in _tls_files(config).items():  # because Zenoh's error does not name the file
             if not os.access(file, os.R_OK):
                 reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
                 raise ConfigError.in_file(config_file, reason)
@@ -190,9 +190,9 @@ def _parse_config(path: Path) -> zenoh.Config:
 
 @dataclass(frozen=True, slots=True)
 class RouterState:
-    """State of a router: Zenoh id, number of open sessions, including those to other routers, and session limit.
+    """State of a router: Zenoh id, number of open sessions, including sessions to other routers, and session limit.
 
-    `max_sessions`: None unless `metadata` of the router's configuration has it; Zenoh does not report the limit itself.
+    `max_sessions`: None unless the router's configuration has it in `metadata`; Zenoh does not report its limit.
     """
 
     zid: str
@@ -219,7 +219,7 @@ def query_routers(session: Session, *, timeout: float) -> list[RouterState]:
 
 
 def parse_state(key: str, payload: bytes) -> RouterState | None:
-    """Parse a reply of the admin space; return None if it is malformed, as any peer may reply."""
+    """Parse a reply of the admin space; return None if it is malformed, because any peer may reply."""
     found = _ADMIN_KEY.fullmatch(key)
     try:
         state = json.loads(payload)

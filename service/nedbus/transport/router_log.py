@@ -100,7 +100,7 @@ class Uplinks:
 
 
 def log_refusals() -> None:
-    """Log each client that a router of this process refuses from now on; Zenoh does not report its address.
+    """Log each client that a router of this process refuses from now on; Zenoh does not report the client's address.
 
     Redirects stdout through a pipe, extracts refusals from Zenoh's log, and forwards all other lines.
     """

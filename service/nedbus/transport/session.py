@@ -94,8 +94,8 @@ def open_client(
     stop = stop or threading.Event()
     reason = ""
     for pause in chain(_PAUSES, repeat(1.0)):
-        # Short, as an endpoint may accept and then send nothing; but at least 1 s, as reconnects over a slow link use
-        # the same timeout.
+        # Short, because an endpoint may accept and then send nothing; at least 1 s, because reconnects over a slow link
+        # use the same timeout.
         open_timeout = min(3.0, max(1.0, end - time.monotonic()))
         settings["transport/unicast/open_timeout"] = round(1000 * open_timeout)
         try:
@@ -145,7 +145,7 @@ def translate_zenoh_errors() -> Iterator[None]:
 def translate_error(error: zenoh.ZError) -> NedbusError:
     """Return the error that `translate_zenoh_errors` raises for a Zenoh error.
 
-    Decides by the text, as `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
+    The text decides, because `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
     """
     return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
 

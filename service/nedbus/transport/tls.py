@@ -13,7 +13,7 @@ from nedbus.errors import ConfigError
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
 UNKNOWN_CA: Final = (7, 18, 19, 20, 21)
 """OpenSSL's verification codes for a certificate that was signed by another CA."""
-_VERIFY_REASONS: Final = {  # by verification code of OpenSSL
+_VERIFY_REASONS: Final = {  # reasons by OpenSSL's verification code
     9: "or its CA is not valid yet: check the clock of this host",
     10: "or its CA has expired",
     **dict.fromkeys(UNKNOWN_CA, "is not signed by the CA in tls_ca"),

@@ -1,7 +1,7 @@
-"""Probe for write permission, as Zenoh drops forbidden messages without an error at the sender.
+"""Probe for write permission: Zenoh drops forbidden messages without an error at the sender.
 
-One session subscribes to keys of the vehicles that are not topics, and another session publishes on them. The publisher
-has a matching subscriber once the router has announced it; if no message arrives then, the router denies it.
+One session subscribes to vehicles' keys that are not topics, and another session publishes on them. If no message
+arrives although the router has announced the subscriber to the publisher, the router denies the write.
 """
 
 import secrets
@@ -18,7 +18,7 @@ from .session import Session, translate_zenoh_errors
 Verdict = Literal["allowed", "denied", "unknown"]
 
 _POLL: Final = 0.02  # s
-_RETRY: Final = 0.2  # s before a probe is sent again, as declarations may still be in flight
+_RETRY: Final = 0.2  # s before a probe is sent again, because declarations may still be in flight
 _SPARE: Final = 16  # slots in the channel beyond one probe per vehicle
 
 
@@ -41,9 +41,9 @@ def probe_writes(
     with translate_zenoh_errors():
         capacity = len(keys) + _SPARE
         subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(capacity))
-        # Deleted rather than undeclared, as `undeclare` waits without releasing the GIL.
+        # Deleted rather than undeclared, because `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))
-        # Zenoh's stubs declare a bool, but it is an object, which is always true.
+        # Zenoh's stubs declare a bool, but the status is an object, which is always true.
         matched = _wait(lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, timeout)
         for _ in range(round(timeout / _RETRY)):
             for key in missing:

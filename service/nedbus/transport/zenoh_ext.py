@@ -1,6 +1,6 @@
 """Heartbeats and cache queries of zenoh-ext's advanced publishers.
 
-Source: the code of zenoh-ext 1.10.2, as Zenoh does not document the formats as stable. With them, advanced subscribers
+Source: the code of zenoh-ext 1.10.2; Zenoh does not document the formats as stable. With them, advanced subscribers
 in any language recover samples from nedbus publishers, and nedbus recovers samples from any advanced publisher.
 """
 
@@ -18,9 +18,9 @@ from .session import RawSample, Session, entity_name, translate_zenoh_errors
 
 Heartbeats = dict[tuple[str, str], int]  # newest sequence number by key and publisher
 
-_MAX_HEARTBEATS: Final = 16_384  # in the channel
+_MAX_HEARTBEATS: Final = 16_384  # heartbeats in the channel
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
-_MAX_KEY: Final = 1024  # characters of a heartbeat key; longer keys are ignored, as keys are cached
+_MAX_KEY: Final = 1024  # characters of a heartbeat key; longer keys are ignored, because keys are cached
 _PAYLOAD_BYTES: Final = 4
 _SPARE: Final = 64  # slots for unexpected replies of other publishers
 

@@ -20,8 +20,8 @@ FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
 _MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
-_MAX_ALL_FIELDS: Final = 8192  # of all messages, including rejected ones, as each costs 45 us; a real log has 1,500
-_MAX_FIELDS: Final = 1000  # of one message, including nested fields and padding; a real one has 100
+_MAX_ALL_FIELDS: Final = 8192  # fields of all messages, even rejected ones: each costs 45 us; a real log has 1,500
+_MAX_FIELDS: Final = 1000  # fields of one message, including nested fields and padding; a real message has 100
 _MAX_SIZE: Final = 65_533  # bytes of one message: msg_size is a uint16, and two bytes are msg_id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
 _BOOLS: Final = (False, True, *range(2, 256))  # a byte other than 0 and 1 is left for the model to reject
@@ -42,7 +42,7 @@ class PayloadLayout:
         self.fields, self.size, self.padding = fields, size, padding
         self._bools = [name for name, kind, _ in fields if kind.base == "bool"]
         self._texts = [name for name, kind, _ in fields if kind.is_text]
-        self._indices: list[tuple[str, int | slice]] = []  # of each field among the unpacked values
+        self._indices: list[tuple[str, int | slice]] = []  # index of each field among the unpacked values
         code, end, count = "<", 0, 0
         for name, kind, offset in fields:
             self._indices.append((name, slice(count, count + kind.values) if kind.is_array else count))

@@ -1,6 +1,6 @@
 """PX4's logged strings and events as `log_message` messages, without duplicates.
 
-A log has event metadata, which turns the id and the arguments of an event into a sentence; it is untrusted.
+The untrusted event metadata of a log turns the id and the arguments of an event into a sentence.
 Its format: https://github.com/mavlink/libevents
 """
 
@@ -32,7 +32,7 @@ _ALL_MODES: Final = 2**32 - 1
 _WINDOW: Final = 50_000  # us between an event and its logged string; 4 ms was observed
 _MAX_PER_SECOND: Final = 100  # messages; PX4 logs 20 at boot
 _MAX_BYTES: Final = 127
-_MAX_CHARACTERS: Final = 1000  # read, including colour codes
+_MAX_CHARACTERS: Final = 1000  # characters read, including colour codes
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
 _MAX_PACKED: Final = 2**18  # bytes; PX4's take 17,000

@@ -26,7 +26,7 @@ _START: Final = 16  # bytes before the first record
 _HEADER: Final = 3  # bytes of a record: size and type
 _DATA_HEADER: Final = 5  # bytes: size, type and message id
 _MAX_PADDING: Final = 8  # bytes of trailing padding in a message; PX4 aligns to 8
-_MAX_SUBSCRIPTIONS: Final = 1000  # at a time; a real log has 170
+_MAX_SUBSCRIPTIONS: Final = 1000  # simultaneous subscriptions; a real log has 170
 _MAX_SKIPPED: Final = 16  # consecutive records of unknown content
 _WINDOW: Final = 2**16  # bytes; damage of up to twice this length is searched completely
 _SAMPLE: Final = 2**12  # bytes searched of each further window
@@ -69,7 +69,7 @@ class UlogParser:
         self._known: dict[bytes, tuple[Subscription, int, int]] = {}
         """By the first five bytes of a data message: its subscription, its length, and the length without padding."""
         self._buffer = b""
-        self._offset = 0  # of the buffer in the log
+        self._offset = 0  # offset of the buffer in the log
         self._boundaries: list[int] | None = None  # offsets of appended data; None before the first record
         self._damage: int | None = None  # offset at which the search for records began
         self._records: list[Record] = []
@@ -227,12 +227,12 @@ class UlogParser:
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
         stop = content + int.from_bytes(buffer[at : at + 2], "little")
         is_partial = stop > len(buffer) or not kind
-        # Record types are printable characters, in later versions too; without `verify` the length is right anyway.
+        # Record types are printable characters, also in later versions; without `verify` the length is trusted.
         if kind and not b"!" <= kind <= b"~" and (self._verify or not is_partial):
             return _Inspection(_Validity.INVALID, stop)
         if is_partial:
             return _Inspection(_Validity.INCOMPLETE, stop)
-        if known is not None:  # a sync message inside it means that bytes are missing
+        if known is not None:  # a sync message inside the record means that bytes are missing
             return _Inspection(_Validity.UNKNOWN if self._verify and SYNC in buffer[at:stop] else _Validity.VALID, stop)
         try:
             record = READERS[kind[0]](buffer[content:stop])

@@ -47,7 +47,7 @@ class Information(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """Parameter; after the first subscription, a changed one."""
+    """Parameter: an initial value or, after the first subscription, a changed value."""
 
     key: str
     value: Value
@@ -191,14 +191,14 @@ READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
 A subscription is returned without its layout.
 """
 EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC)}
-"""Sizes of records of fixed size; a longer one is read, but not considered valid."""
+"""Sizes of fixed-size records; a longer record is read, but not considered valid."""
 
 
 class LoggedStream:
     """Address, message definition and decoder of one subscription.
 
     The definition is nedbus's own, or else made from the log's format. For a topic without a definition in nedbus, the
-    first instance has no instance number: a stream does not announce whether others will follow.
+    first instance has no instance number: a stream does not announce whether more instances will follow.
 
     Raises ValueError for a format that cannot be a message, AddressError for an invalid vehicle or topic.
     """
@@ -206,7 +206,7 @@ class LoggedStream:
     def __init__(self, vehicle: str, subscription: Subscription) -> None:
         topic, layout = subscription.name, subscription.layout
         self.subscription = subscription
-        self.names = tuple(field.name for field in layout.fields)  # in the log
+        self.names = tuple(field.name for field in layout.fields)  # names in the log
         self.definition = BY_TOPIC.get(topic) or _define(
             "".join(part.capitalize() for part in topic.split("_")),
             tuple((field.name, field.kind) for field in layout.fields),

@@ -1,7 +1,7 @@
 """Downsampled copies of a stream, one per rate in RATES, published while they have subscribers.
 
 `<key>/@rate/5` carries up to 5 messages per second of `<key>`, with its own sequence numbers and history cache.
-Each vehicle declares one matching listener for all rates; its streams declare theirs once that one is matched.
+Each vehicle has one matching listener for all rates; once it is matched, each stream declares its own listeners.
 """
 
 import threading
@@ -19,7 +19,7 @@ from nedbus_msgs import ANY, Address, Topic, get_topic
 from .writer import Heartbeats, Writer
 
 _CACHE: Final = 20  # s of messages in the history cache
-_LINGER: Final = 60_000_000_000  # ns that an unmatched writer is kept for readers that reconnect and recover messages
+_LINGER: Final = 60_000_000_000  # ns for which an unmatched writer is kept, so returning readers can recover messages
 
 
 class MatchingListener:
@@ -87,7 +87,7 @@ class Downsampler:
 
 
 class _Stream:
-    """The stream of one rate; its writer exists while it is matched and for one minute after."""
+    """The stream of one rate; its writer exists while the stream has subscribers, and for one minute afterwards."""
 
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, topic: Topic) -> None:
         self.writer: Writer | None = None

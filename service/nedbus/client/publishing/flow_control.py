@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 WINDOW: Final = 2000  # unacknowledged messages of a session; this fits into the queues of a link and of a reader
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
 _MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; at this limit even the trickle stops
-_MIN_WINDOW: Final = 100  # messages per publisher, however many there are
+_MIN_WINDOW: Final = 100  # messages per publisher, however many publishers share the window
 _REQUESTS_PER_WINDOW: Final = 8
 _TRICKLE_PERIOD: Final = 0.1  # s between messages sent beyond the window, for the other readers
 _RETRY_PAUSE: Final = 0.5  # s until a request, which a full queue may have dropped, is repeated; doubles each time
@@ -42,7 +42,7 @@ class SharedWindow:
         self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key; replaced as a whole
 
     def share(self, key: str, unread: int, *, now: float) -> int:
-        """Return the share of a publisher with `unread` messages; it expires after a second without a call."""
+        """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
         recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
         self._unread = unread_by_key = recent | {key: (unread, now)}
         others = sum(number for number, _ in unread_by_key.values()) - unread
@@ -58,7 +58,7 @@ class ReaderProxies:
         self._suspects: set[str] = set()  # readers that replied to the last request, in which an unknown reader froze
 
     def update(self, replies: Mapping[str, bool], *, froze: bool, now: float) -> None:
-        """Update from all replies to a request; `replies`: by reader, True if it is closed. `now` in seconds.
+        """Update from all replies to a request. `replies`: whether each reader is closed. `now` in seconds.
 
         `froze`: the request ended long after its last reply, when the lease of a silent reader expired.
         """
@@ -76,7 +76,7 @@ class ReaderProxies:
         self.away |= dict.fromkeys(gone, until)
 
     def wait_for_link(self, now: float) -> None:
-        """Extend all deadlines; called while the publisher has no router or a new one. `now` in seconds."""
+        """Extend all deadlines while the publisher has no router, or after its routers change. `now` in seconds."""
         if not self._matched and not self.away:
             self.away[_UNKNOWN] = now
         self.away = {reader: max(until, now + TIMINGS.return_wait) for reader, until in self.away.items()}
@@ -88,8 +88,8 @@ class _Request:
     def __init__(self, number: int, routers: list[str], *, read: bool, now: float) -> None:
         self.number, self.read, self.routers = number, read, routers
         self.sent = self.last_reply = now
-        self.queries: set[Replies] = set()  # those that have not timed out
-        self.replies: dict[str, bool] = {}  # by reader, True if it is closed
+        self.queries: set[Replies] = set()  # queries that have not timed out
+        self.replies: dict[str, bool] = {}  # whether each reader is closed
 
     def poll(self, now: float) -> bool:
         """Receive replies; return True once all readers have replied or left."""
@@ -125,7 +125,7 @@ class FlowControl:
     def wait_for_credit(self, published: int) -> None:
         """Wait while readers have more than a window of unread messages; raise ClosedError once closed.
 
-        Call it after each message. Up to _MAX_UNACKNOWLEDGED unread messages it returns after a trickle period.
+        Call it after each message. Below _MAX_UNACKNOWLEDGED unread messages, it returns after one trickle period.
         """
         has_credit = published < self._due and published - self._acknowledged[True] < self._window
         if has_credit and published % _POLL_EVERY:

@@ -59,7 +59,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         self._codec = codec_of(definition)
         self._all = definition.all_fields
         self._encoding = self._declared = encoding_of(definition, source)
-        self._partial: tuple[Set[str], str] = self._all, self._encoding  # fields of the last message with missing ones
+        self._partial: tuple[Set[str], str] = self._all, self._encoding  # of the last message with missing fields
         topic = get_topic(address.topic)
         with translate_zenoh_errors():
             token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
@@ -115,7 +115,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def publish_many(self, messages: MessageArray) -> None:
         """Validate a structured array of shape (n,) and dtype DTYPE, then publish its messages in order.
 
-        Publishes nothing if a message is invalid. If the bus closes during the call, `published` has the number sent.
+        Publishes nothing if a message is invalid. If the bus closes during the call, `published` counts messages sent.
 
         Raises TypeError for another dtype, InvalidMessageError for the first invalid message, with its `index`,
         ClosedError once the publisher or its bus is closed.

@@ -60,7 +60,7 @@ class PublisherRegistry:
         source: str | None = None,
         owner: object = None,
     ) -> Publisher:
-        """Return a new publisher for an address; it keeps `owner` alive.
+        """Return a new publisher for an address; the publisher keeps `owner` alive.
 
         `definition`: required for a topic that is not in BY_TOPIC.
 
@@ -123,7 +123,7 @@ class PublisherRegistry:
         with ExitStack() as opened:
             keys = (address.key(prefix=self.prefix) for address in addresses)
             probes = [opened.enter_context(self._session.declare_publisher(key)) for key in keys]
-            # Zenoh's stubs declare the status as a bool, but it is an object, which is always true.
+            # Zenoh's stubs declare the status as a bool, but the status is an object, which is always true.
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
 
     def flush(

@@ -23,7 +23,7 @@ JSON: Final = "application/json"
 
 _replies = CallThread("nedbus-replies")  # a report on many vehicles would block the I/O thread for too long
 
-# Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close.
+# Replies to a query. It must not reference the owner of the server, which may be garbage-collected while it is open.
 Reply = Callable[[zenoh.Query], object]
 
 

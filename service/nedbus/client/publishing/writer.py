@@ -115,7 +115,7 @@ class Heartbeats:
             left -= 1
             payload, drop = heartbeat_payload(writer.published), zenoh.CongestionControl.DROP
             with suppress(zenoh.ZError):  # the session is closed
-                # Not from a publisher: Zenoh keeps a few kB for each that was declared, until the session closes.
+                # Not from a publisher: Zenoh keeps a few kB per declared publisher until the session closes.
                 key = heartbeat_key(writer.key, writer.name)
                 self.session.put(key, payload, congestion_control=drop, priority=writer.priority)
             writer.sent_heartbeats += 1

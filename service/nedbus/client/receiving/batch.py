@@ -20,7 +20,7 @@ class Batch:
     `messages`: structured array of shape (n,), one column per field: `messages["x"]`.
     `message`: type of the messages.
     `addresses`: distinct addresses. `address_index`: index into `addresses` for each message.
-    `lost`: messages lost in transit before these, over all addresses.
+    `lost`: messages lost in transit before this batch, over all addresses.
     """
 
     messages: MessageArray

@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
 _MAX_LOGGED_KEYS: Final = 100  # keys with a logged warning about invalid messages
-_MAX_ENCODING: Final = 512  # characters kept of an encoding; those of nedbus are at most 250 long
+_MAX_ENCODING: Final = 512  # characters kept of an encoding; nedbus's own encodings have at most 250
 _MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 
@@ -42,15 +42,15 @@ class KeyState:
     wire_key: str  # key on which messages arrive, perhaps downsampled
     address: Address
     codec: Codec[Any] | None = None  # None for messages not built in: each encoding identifies a definition
-    size: int = -1  # bytes of its payload with all fields
-    encoding: tuple[object, str] = None, ""  # the last one, Zenoh's object and its text; accessed by two threads
-    provenance: tuple[str, Provenance] = "", Provenance()  # the last one, with its encoding
+    size: int = -1  # bytes of a payload with all fields
+    encoding: tuple[object, str] = None, ""  # last encoding: Zenoh's object and its text; accessed by two threads
+    provenance: tuple[str, Provenance] = "", Provenance()  # last provenance, with its encoding
     writers: dict[str, WriterProxy] = field(default_factory=dict)  # by name
-    writer: WriterProxy | None = None  # of the last message
+    writer: WriterProxy | None = None  # publisher of the last message
     last_active: float = 0.0  # monotonic time of the last message or heartbeat [s]
     gap: int = 0  # messages lost before the next delivery
     unreported: int = 0  # messages lost before one that was dropped or invalid; the next sample read reports them
-    gate: RateGate | None = None  # with a maximum rate, once a downsampled message has arrived
+    gate: RateGate | None = None  # set with a maximum rate, once a downsampled message has arrived
     last_sent: float = -math.inf  # with a maximum rate, time of sending of the retained message [ns]
 
 

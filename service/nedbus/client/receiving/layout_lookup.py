@@ -33,7 +33,7 @@ _QUERY_PAUSE: Final = 0.2  # s between a query without a result and the next one
 _MAX_REPLY_FIELDS: Final = 256  # per layout
 _MAX_REPLY_LAYOUTS: Final = 32  # per reply; five exist
 _MAX_TEXT: Final = 300  # logged characters of names sent by a publisher
-_BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait for longer
+_BUDGET_RATE: Final = 0.1  # s of wait budget regained per second; peers cannot make readers wait longer
 
 # Message name, and number of a newer layout or, for a message that is not built in, hash of its definition.
 SchemaId = tuple[str, int | str]
@@ -59,7 +59,7 @@ class LayoutLookup:
         self._changed = threading.Condition()  # guards all below
         self._thread: threading.Thread | None = None
         self._closed = False
-        self._open: dict[SchemaId, object] = {}  # with the publisher; the queried ones first
+        self._open: dict[SchemaId, object] = {}  # publisher of each open lookup, queried lookups first
         self._failed: dict[SchemaId, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
         self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last futile wait
 
@@ -70,7 +70,7 @@ class LayoutLookup:
     def codec(self, name: str, identity: str, *, publisher: object = None, wait: bool = False) -> Codec[Any] | None:
         """Return the codec of a message that is not built in; None if unknown, which starts a lookup.
 
-        `publisher`: after a failed lookup, one for another publisher starts at once, without backoff.
+        `publisher`: after a failed lookup, a lookup for another publisher starts at once, without backoff.
         `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
         """
         schema_id = name, identity
@@ -90,7 +90,7 @@ class LayoutLookup:
         try:
             codec.decode(payload, newer=self._newer.get(name))
         except UnknownLayoutError as exc:
-            if MESSAGES.get(name) is codec.definition:  # others have a single layout
+            if MESSAGES.get(name) is codec.definition:  # other messages have a single layout
                 self._request((name, exc.layout))
             raise
 
@@ -217,7 +217,7 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 
 
 def find_schemas(ids: Collection[SchemaId], *, session: Session, prefix: str) -> Schemas:
-    """Query publishers for the fields of these layouts and definitions; the first reply that has one wins.
+    """Query publishers for the fields of these layouts and definitions; the first reply for each one wins.
 
     Returns once all are found, without waiting for stopped publishers or bad links.
     """

@@ -33,7 +33,7 @@ _MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake 
 
 
 class MaxRateQueue(PendingQueue):
-    """Queue at most `max_rate` messages per second and stream, a finite number above 0, else raise ArgumentError.
+    """Queue at most `max_rate` messages per second and stream; raise ArgumentError unless it is finite and above 0.
 
     Messages omitted to keep the rate count neither as lost nor as dropped.
     """

@@ -53,7 +53,7 @@ MAX_ACK_REQUESTS: Final = 1000
 
 _MAX_BATCH: Final = 4096  # messages per batch
 _MAX_FRESH: Final = 1024  # samples queued with Zenoh's receive buffer; later ones are detached from it
-_MAX_WRITERS_OF_KEY: Final = 8  # the oldest one without a gap is evicted
+_MAX_WRITERS_OF_KEY: Final = 8  # beyond that the oldest writer without a gap is evicted
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
 _PAYLOAD: Final = itemgetter(1)
@@ -77,7 +77,7 @@ class PendingQueue:
 
     It owns the state of all streams: key states, writer proxies, counters and unread messages, guarded by one lock.
     In mode `every`, messages behind a gap are held back until it is filled; in mode `latest` a gap is lost at once.
-    `name`: its key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
+    `name`: the key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
     def __init__(
@@ -368,7 +368,7 @@ class PendingQueue:
             info, writer = raw.source_info, stream.writer
             if info is not None:
                 source = info.source_id
-                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than by name
+                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than names
                     name = entity_name(source)
                     writer = stream.writers.get(name)
                     if writer is None:
@@ -424,7 +424,7 @@ class PendingQueue:
     # Unread messages
 
     def _queue(self) -> int:
-        """Queue the delivered messages, dropping superseded and, beyond the capacity, old ones; return their number."""
+        """Queue delivered messages and return their count; drop superseded ones and, above the capacity, the oldest."""
         arrivals, self.counters.delivered = self.counters.delivered, []
         self._arrived += len(arrivals)
         if self.newest_only:

@@ -36,13 +36,13 @@ _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledge
 _ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
 _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
 _BUSY_PAUSE: Final = 0.001  # s
-_MAX_DIGITS: Final = 10  # of a sequence number
+_MAX_DIGITS: Final = 10  # digits of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
 _T = TypeVar("_T")
 
 
 class Receiver:
-    """Declare an advanced subscriber on the name of a PendingQueue, and put its samples there until closed.
+    """Declare an advanced subscriber on a PendingQueue's key expression, and put samples into the queue until closed.
 
     In mode `every` it also requests retransmissions and answers acknowledgement requests.
     With `history` the first samples are the last message of each publisher.
@@ -98,7 +98,7 @@ class Receiver:
             return self._queue.wait(timeout)
         if self._busy:
             time.sleep(_BUSY_PAUSE)
-        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds it for less
+        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # the I/O thread holds the lock for a shorter time
             return self._queue.wait(None)
         try:
             self._receive(if_empty=True)

@@ -23,8 +23,8 @@ from .writer_proxy import WriterProxy
 _log = logging.getLogger(__name__)
 
 _MAX_OPEN: Final = 64  # requests in flight
-_MAX_OPEN_HISTORY: Final = 16  # of these, requests to publishers that have delivered no message yet
-_MAX_OPEN_OF_KEY: Final = 4  # of these, requests on one key, whose publishers may never answer
+_MAX_OPEN_HISTORY: Final = 16  # requests in flight to publishers that have delivered no message yet
+_MAX_OPEN_OF_KEY: Final = 4  # requests in flight on one key, whose publishers may never answer
 _MAX_WAITING: Final = CAPACITY // 2  # unread messages; above this, requests pause: answers would displace messages
 _TIMEOUT: Final = 3.0  # s
 _POLL: Final = 2 * TICK  # s between polls of heartbeats and due requests

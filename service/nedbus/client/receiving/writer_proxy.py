@@ -19,7 +19,7 @@ MAX_GAP: Final = 2**30
 """Largest gap; a larger step means that the publisher restarted or the message is late."""
 
 _LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
-_MAX_REORDERED: Final = 2**16  # a number lower by up to this is late or a duplicate, else the publisher restarted
+_MAX_REORDERED: Final = 2**16  # a step back up to this size is a late message or a duplicate; a larger one is a restart
 _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
 
 
@@ -28,13 +28,13 @@ class LossCounters:
     """Loss counters and open gaps of a subscription, which its queue owns and its writer proxies update."""
 
     lost: int = 0
-    dropped: int = 0  # by a full ring or queue
+    dropped: int = 0  # messages dropped by a full ring or queue
     discarded: int = 0  # duplicates and late messages
-    forgotten: int = 0  # keys beyond the limit
+    forgotten: int = 0  # keys evicted beyond the limit
     held: int = 0  # messages held back behind gaps
     opened: int = 0  # gaps so far
-    delivered: list[Arrival] = field(default_factory=list)  # to be queued, in order
-    requesting: dict[WriterProxy, None] = field(default_factory=dict)  # with a gap, least recently requested first
+    delivered: list[Arrival] = field(default_factory=list)  # messages to be queued, in order
+    requesting: dict[WriterProxy, None] = field(default_factory=dict)  # proxies with a gap, oldest request first
 
 
 @dataclass(slots=True, eq=False)
@@ -60,7 +60,7 @@ class WriterProxy:
     name: str  # `zid` and `eid` combined
     expected: int  # the next number
     counters: LossCounters
-    zid: object = None  # this and the next are set by the first message
+    zid: object = None  # `zid` and `eid` are set by the first message
     eid: int | None = None
     history_end: int = 0  # lower numbers may predate the subscription, and are not lost; 0 after the first delivery
     unresponsive: bool = False  # it left a request unanswered; later gaps get a single attempt

@@ -11,13 +11,13 @@ _U16: Final = 2**16 - 1  # "unknown" in most fields of this type
 _WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # MAV_BATTERY_CHARGE_STATE to `warning`
 _FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: standby, active, critical
 _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
-_VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # body FRD
+_VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # 12: body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
 _MAX_DELAY: Final = 1000  # ms by which a late datagram may be older; more means a reboot
 
 
 def is_reboot(time_boot_ms: int, newest: int | None) -> bool:
-    """Return whether the vehicle rebooted since its newest time."""
+    """Return whether a message's time shows a reboot since the vehicle's newest time so far."""
     return newest is not None and time_boot_ms < newest - _MAX_DELAY
 
 

@@ -14,7 +14,7 @@ from nedbus.errors import ConfigError, SourceError
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 Peer = Any  # remote address, as returned by the socket
 
-_CHANGES: Final = 5  # of the address within the window: two senders. A reconnect is one, a reordered packet two more
+_CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect is one, a reordered packet two more
 _WINDOW: Final = 5.0  # s
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
@@ -53,7 +53,7 @@ class _UdpLink:
 
     def send(self, data: bytes, peer: Peer) -> None:
         """Send without blocking; drop the data if that fails."""
-        with suppress(OSError):  # temporary, or the vehicle times out
+        with suppress(OSError):  # a temporary failure, or the vehicle times out
             self._socket.sendto(data, peer)
 
 

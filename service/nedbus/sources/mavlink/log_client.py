@@ -99,7 +99,7 @@ class LogStreamClient:
         self._has_header = False  # definitions of the current stream have arrived, at least in part
         self._header_messages = self._acked_in_row = 0
         self._header_start = self._interval = 0.0  # `_interval`: longest recent one between messages
-        self._header_pause = 0.0  # longest in the header; not in the round trip, because it may be a burst of losses
+        self._header_pause = 0.0  # longest pause in the header; not in the round trip: it may be a burst of losses
         self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 

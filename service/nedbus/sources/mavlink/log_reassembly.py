@@ -6,15 +6,15 @@ from typing import Final, Literal, NamedTuple
 _MAGIC: Final = b"ULog\x01\x12\x35"  # the first bytes of a ULog file
 _MAX_LENGTH: Final = 249  # bytes of `data` in a message
 _NO_RECORD_BEGINS: Final = 255  # first_message_offset
-_MODULUS: Final = 2**16  # of the sequence
+_MODULUS: Final = 2**16  # modulus of the sequence
 _MAX_STEP: Final = 2**15  # a larger sequence step means a duplicate
 _OLD_RUN: Final = 256  # consecutive old sequence numbers that mean a gap of more than _MAX_STEP
 
 Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
 """Classification of a message.
 
-`delivered`: its bytes are part of the stream; after a gap, those from its first record on.
-`duplicate`: retransmitted or late; a late one was counted as lost, and its bytes are discarded.
+`delivered`: its bytes are part of the stream; after a gap, only the bytes from its first record on.
+`duplicate`: retransmitted or late; a late message was counted as lost, and its bytes are discarded.
 `malformed`: `length` is above 249, or first_message_offset beyond the data; the gap that it leaves is counted as lost.
 `unsynchronised`: no record begins in it, after a gap.
 `no_definitions`: the stream was joined midway, so it cannot be decoded; its losses are not counted.
@@ -25,7 +25,7 @@ class Chunk(NamedTuple):
     """Result of one LOGGING_DATA or LOGGING_DATA_ACKED.
 
     `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
-    `begins`: a new stream begins with `data`: it needs a new parser.
+    `begins`: a new stream, which needs a new parser, begins with `data`.
     `lost`: number of messages lost before this one, exact for gaps of less than 65,536, and a lower bound otherwise.
     After a loss the parser must discard its partial record before `data`.
     """
@@ -39,14 +39,14 @@ class Chunk(NamedTuple):
 class Reassembly:
     """Reassembles the successive ULog streams of one vehicle since its boot.
 
-    After a reboot use a new one: the header may have the same bytes as before.
+    After a reboot create a new instance, because the header may have the same bytes as before.
     A lost message contains at most 249 bytes; each gap loses at least one ULog record.
     """
 
     def __init__(self) -> None:
         self._old_next = self._old_run = 0
         self._first = b""  # data of the first message, to distinguish its retransmission from a new stream
-        self._last: int | None = None  # sequence; None before the first stream
+        self._last: int | None = None  # last sequence; None before the first stream
         self._synchronised = False
 
     def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:

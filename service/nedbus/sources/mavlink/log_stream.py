@@ -21,7 +21,7 @@ from .log_reassembly import Chunk
 
 _log = logging.getLogger(__name__)
 
-_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted ones have `mavlink`
+_SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; converted messages have `mavlink`
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
@@ -46,7 +46,7 @@ class LogStream:
         self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
-        self._clock: tuple[float, float] | None = None  # vehicle's minus host's [s], and time of measurement
+        self._clock: tuple[float, float] | None = None  # vehicle clock minus host clock [s], and time of measurement
         self._round_trip = math.inf
         self._window_start = self._rate = self._delays = 0.0
         self._window_bytes = self._delayed = 0
@@ -66,7 +66,7 @@ class LogStream:
         return self._client.status.state == "streaming"
 
     def delivers(self, address: Address) -> bool:
-        """Return whether the stream has messages of an address, which replace converted ones."""
+        """Return whether the stream has messages of an address, which replace the converted messages."""
         return self.is_streaming and (address in self._streamed or address.topic == ulog.LOG_MESSAGE.name)
 
     def add(self, chunk: Chunk, now: float) -> Iterator[SourceMessage | Rejection]:

@@ -148,7 +148,7 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
     def _process(self, received: Received, *, is_full: bool) -> Received | Rejection:
-        """Acknowledge a message and reassemble its data; if the queue is full, drop it like a lost message."""
+        """Acknowledge a message and reassemble its data; if the queue is full, drop the message like a lost one."""
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self.vehicles.get(received.system)
         if kind.startswith("LOGGING_DATA"):

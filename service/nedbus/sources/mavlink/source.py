@@ -39,7 +39,7 @@ class MavlinkSource:
 
     Fields that MAVLink does not transmit are left out, not derived from others: resets, variances of heading and tilt,
     accelerations and limits of VehicleLocalPosition, and the mode of VehicleStatus.
-    Validity is approximated from ESTIMATOR_STATUS, as LOCAL_POSITION_NED is sent even while it is invalid.
+    Validity is approximated from ESTIMATOR_STATUS, because vehicles send LOCAL_POSITION_NED even while it is invalid.
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:

@@ -21,14 +21,14 @@ _log = logging.getLogger(__name__)
 _VALUE_TIMEOUT: Final = 2.0  # s for which a received value is merged into the estimate
 _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS once a second
 _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
-_FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose some
+_FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose messages
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
-_CHUNK: Final = 50  # bytes; a shorter one is the last
+_CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
-_MAX_BYTES: Final = 500  # of a log message
+_MAX_BYTES: Final = 500  # bytes of a log message
 _DEBUG: Final = 7
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -50,7 +50,7 @@ STREAMS: Final = {
 """Messages to request, in order: bytes per message (MAVLink 2, from PX4), Hz (0 for `rate`), topics that need it."""
 
 _MIN_RATE: Final = 2.0  # Hz, on a saturated link
-_USABLE_SHARE: Final = 0.9  # of a link's bandwidth; the rest is for heartbeats and answers
+_USABLE_SHARE: Final = 0.9  # share of a link's bandwidth; the rest is for heartbeats and answers
 _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bits
 
 
@@ -97,7 +97,7 @@ class Vehicle:
         self._sequence: int | None = None
         self._texts = _StatusTexts()
         self._started = now
-        self._arrivals: dict[int, float] = {}  # of requested messages
+        self._arrivals: dict[int, float] = {}  # last arrival of each requested message
         self._pending = [*self._rates] * _FIRST_ROUNDS
         self._next_round = now + _REQUEST_INTERVAL
 
@@ -107,7 +107,7 @@ class Vehicle:
             self._reset(now)
         self._last_message = now
         step = 1 if self._sequence is None else (sequence - self._sequence) % 256
-        if step > 128:  # out of order: it was counted as lost
+        if step > 128:  # out of order: the message was counted as lost
             self.lost = max(0, self.lost - 1)
         elif step:  # else a duplicate
             self.lost = max(0, self.lost + step - 1 - counted)
@@ -123,7 +123,7 @@ class Vehicle:
         if not self._pending and now >= self._next_round:
             self._next_round = now + _REQUEST_INTERVAL
             self._pending = [each for each in self._rates if now - self._arrivals.get(each, 0.0) > _SILENCE_TIMEOUT]
-            # The origin needs a global position first.
+            # No report for the origin, which the vehicle sends only once it has a global position.
             for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
                 self._reported.add(number)
                 name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
@@ -178,7 +178,7 @@ class Vehicle:
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
                 self._store("origin", math.inf, xy_global=True, z_global=True, **known)
-                self._arrivals[ORIGIN] = math.inf  # it is sent once for each request
+                self._arrivals[ORIGIN] = math.inf  # the vehicle sends the origin once per request
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance) and message.bottom_clearance >= 0
                 bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}

@@ -40,10 +40,10 @@ from .streams import Definitions, NotAcceptedError, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
-_CONNECT_TIMEOUT: Final = 0.5  # s; the service must be able to stop within 1 s, and it retries
+_CONNECT_TIMEOUT: Final = 0.5  # s; short, because the service must stop within 1 s, and it retries
 _REPORT_INTERVAL: Final = 1.0  # s between reports of unavailable topics
 _MAX_PENDING: Final = 4096  # samples waiting to be decoded
-_MAX_PENDING_BYTES: Final = 4096  # per payload
+_MAX_PENDING_BYTES: Final = 4096  # bytes per payload
 _RING_SIZE: Final = 16_384  # samples waiting for the receiving thread
 _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
@@ -53,7 +53,7 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohSource:
-    """All publishers of px4_msgs on the router at `endpoint`, or by default on that of the service, at `routers`."""
+    """All publishers of px4_msgs on the router at `endpoint`, by default the service's own router at `routers`."""
 
     def __init__(
         self, endpoint: str, options: Px4ZenohOptions, vehicle: str, routers: tuple[str, ...], tls: Tls | None
@@ -123,7 +123,7 @@ class Px4ZenohNode:
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=TIMINGS.source_tick)
-            for token, alive in self._tokens.poll():  # declared before the sample was sent
+            for token, alive in self._tokens.poll():  # tokens are declared before the sample is sent
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
             if (now := time.monotonic()) >= next_report:
@@ -149,7 +149,7 @@ class Px4ZenohNode:
         try:
             stream = self._streams.on_message(key, now)
             if stream.unsupported is not None:
-                is_unannounced = stream.unsupported and not stream.tokens  # announced ones are in the report
+                is_unannounced = stream.unsupported and not stream.tokens  # announced streams are in the report
                 reason = f"{stream.unsupported}: not selected by topics= or msg="
                 return Rejection(key, reason) if is_unannounced and not is_bridged else None
             if (form := stream.wire_format) is None:

@@ -57,8 +57,8 @@ class Px4Stream:
     `wire_format`: None until the first message.
     `tokens`: announced publishers by token text; `since`: time of the first one.
     `ambiguous_until`: time until which messages of two publishers may be indistinguishable.
-    `last_message`, `last_accepted`: arrival times.
-    `restarted`: another publisher took over, whose first message is still to come.
+    `last_message`, `last_accepted`: arrival times of the last message, and of the last accepted one.
+    `restarted`: another publisher took over, and its first message is still to come.
     `reboots`: number of its vehicle's reboots seen on this key.
     `is_bridged`: messages from `nedbus ros2` have arrived.
     `is_input`: its messages go to the vehicle, from a node that does not reboot with it.
