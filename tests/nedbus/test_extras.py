@@ -15,7 +15,7 @@ from nedbus.extras import import_optional
     [("mcap", "in a clone of nedbus, pip install '.[mcap]'"), ("polars", "pip install polars")],
 )
 def test_missing_package_raises_with_install_command(extra: str, command: str) -> None:
-    """The error suggests an extra of a clone, because another project owns the name nedbus on PyPI."""
+    """The error suggests installing from a clone, because another project owns the name nedbus on PyPI."""
     with pytest.raises(ConfigError) as caught:
         import_optional(extra, "gone")
     assert str(caught.value) == f"gone: not installed: {command}"

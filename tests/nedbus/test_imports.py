@@ -6,7 +6,7 @@ from tests.peers.processes import Start
 
 
 def test_unused_packages_are_not_imported(start: Start) -> None:
-    """Commands start fast because they import only the packages they use.
+    """Commands import only the packages they use, for a fast start.
 
     `dir(nedbus)` lists all public names without importing Zenoh, for tab completion.
     """

@@ -22,9 +22,9 @@ from tests.waits import wait_for
 
 
 def test_flag_overrides_environment_overrides_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flag of None is ignored; without any setting a client connects to loopback.
+    """A flag overrides an environment variable, which overrides the file; a flag of None is ignored.
 
-    An error in a variable names the variable.
+    Without any setting a client connects to loopback. The error for an invalid variable names the variable.
     """
     settings = load_settings()
     assert settings.routers == ("tcp/127.0.0.1:7447",)
@@ -104,7 +104,7 @@ def test_error_in_a_file_has_line_and_column(tmp_path: Path, text: str, position
 
 
 def test_missing_or_unreadable_settings_file_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A given file must exist and be a regular file; a read error is reported as one."""
+    """A missing file, a folder and an unreadable file raise ConfigError with the reason."""
     (tmp_path / "folder.toml").mkdir()
     for name in ("no.toml", "folder.toml"):
         with pytest.raises(ConfigError, match=rf"{name}: there is no such file"):
@@ -139,7 +139,7 @@ def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
         ("NEDBUS_TLS_CERT", "NEDBUS_TLS_CERTIFICATE"),
         ("NEDBUS_TLS_K", "NEDBUS_TLS_KEY"),
         ("NEDBUS_TLS", "NEDBUS_TLS_CA or NEDBUS_TLS_CERTIFICATE or NEDBUS_TLS_KEY"),
-        *((f"NEDBUS_{name}", None) for name in ("PUBLISH", "ROUTER_IMAGE", "PKI")),  # of the compose files
+        *((f"NEDBUS_{name}", None) for name in ("PUBLISH", "ROUTER_IMAGE", "PKI")),  # variables of the compose files
     ],
 )
 def test_misspelled_variable_is_reported(
@@ -179,7 +179,7 @@ def test_unresolvable_host_name_is_reported() -> None:
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Create a CA, two client certificates, an expired one, and files without a valid certificate."""
+    """Create a CA, two valid and one expired client certificate, and files without a valid certificate."""
     folder = tmp_path_factory.mktemp("keys")
     make_authority(folder)
     for name, days in (("wing", 100), ("tail", 100), ("old", 0)):
@@ -241,7 +241,7 @@ def test_missing_router_file_or_unknown_suffix_raises(tmp_path: Path) -> None:
 
 
 def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Ignored plugins are logged, because Zenoh's Python library ignores them silently; a required one raises."""
+    """Ignored plugins are logged, because Zenoh's Python library ignores them silently; a required plugin raises."""
     file = tmp_path / "router.json5"
     file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
     open_router(listen=(free_endpoint(),), config_file=file).close()

@@ -21,7 +21,7 @@ MS = 1_000_000  # ns
 
 
 class Link:
-    """A TCP proxy to a router; `carried`: bytes forwarded. It pauses while `flows` is not set."""
+    """A TCP proxy to a router, which forwards only while `flows` is set; `carried` counts the forwarded bytes."""
 
     def __init__(self, endpoint: str) -> None:
         self.carried = 0
@@ -95,7 +95,7 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 def has_downsampling_reader(publisher: nedbus.Publisher) -> bool:
     """Return True if a reader has requested downsampled streams of the publisher's vehicle."""
-    return publisher._downsampler.vehicle_listener.is_matched()  # visible otherwise only once it publishes
+    return publisher._downsampler.vehicle_listener.is_matched()  # otherwise visible only after a publish
 
 
 def wait_for_downsampling_reader(publisher: nedbus.Publisher) -> None:
@@ -106,7 +106,7 @@ def wait_for_downsampling_reader(publisher: nedbus.Publisher) -> None:
 def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any]) -> None:
     """Receive message 0, published earlier, and wait until the publisher is matched.
 
-    The reply with the last message may overtake messages published before it arrives.
+    Messages published before the reply with message 0 arrives may be overtaken by that reply.
     """
     assert receive_timestamps(subscription, 1) == [0]
     wait_for_downsampling_reader(publisher)

@@ -29,14 +29,14 @@ def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
 
 def has_subscriber(publisher: nedbus.Publisher) -> bool:
     """Return True if a publisher has a matching subscriber."""
-    probe = publisher._writer.session.declare_publisher(publisher.key)  # other sessions have another matching status
+    probe = publisher._writer.session.declare_publisher(publisher.key)  # the status depends on the session
     status = cast("zenoh.MatchingStatus", probe.matching_status)
     probe.undeclare()
     return status.matching
 
 
 def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher has a matching subscriber, which would not receive earlier messages."""
+    """Wait until a publisher has a matching subscriber, which would miss messages published earlier."""
     wait_for(partial(has_subscriber, publisher), what=f"a subscriber of {publisher.key}")
 
 

@@ -57,10 +57,10 @@ def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, mode: Mo
 
 @pytest.mark.parametrize("max_rate", [None, 50])
 @pytest.mark.parametrize("mode", BOTH)
-def test_sample_from_before_the_subscription_is_retained(
+def test_sample_published_before_the_subscription_is_retained(
     client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_rate: float | None
 ) -> None:
-    """A sample from before the subscription is retained, even after pickling and from `latest`; the next one is not."""
+    """A sample published before the subscription or read by `latest` is retained, even once pickled; others are not."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     subscription = client.subscribe(mode=mode, max_rate=max_rate)
@@ -92,7 +92,7 @@ def test_latency_does_not_include_the_time_until_reading(
 
 
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
-    """A publisher is declared at the router before its first message; otherwise a new reader misses one in 300."""
+    """A publisher is declared at the router before its first message; otherwise one new reader in 300 misses it."""
     with nedbus.connect(endpoint) as other:
         for vehicle in range(100):
             publish(bus.publisher(VLP, vehicle=vehicle), 1)
@@ -102,7 +102,7 @@ def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: s
 def test_topic_vehicle_and_instance_select_streams(client: nedbus.Bus, bus: nedbus.Bus) -> None:
     """Topic, vehicle (name or MAVLink system id) and instance select streams; the default is the position estimate.
 
-    The estimate is mixed neither with the ground truth nor with single EKFs. A subscription starts with the last
+    The default excludes the ground truth and the estimates of single EKFs. A subscription starts with the last
     message of each key, even if publishing has stopped.
     """
     for vehicle in ("1", "2"):
@@ -138,7 +138,7 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
 def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Vehicles appear when their liveliness tokens are declared, and disappear when closed.
 
-    No query for all tokens is sent: it would load all clients of the router.
+    The bus never queries all tokens, because such a query would load all clients of the router.
     """
     queried: list[str] = []
 
@@ -246,7 +246,7 @@ def test_two_processes_of_one_vehicle_both_reply(bus: nedbus.Bus, endpoint: str,
 def test_exception_in_a_reply_does_not_end_the_reply_thread(
     bus: nedbus.Bus, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After an exception in one reply, the reply thread answers the next query."""
+    """After an exception while replying to one query, the reply thread still answers the next query."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     wait_for(partial(count_replies, zenoh_session, publisher.key), what="a reply")
@@ -256,8 +256,10 @@ def test_exception_in_a_reply_does_not_end_the_reply_thread(
     assert count_replies(zenoh_session, publisher.key) == 1
 
 
-def test_live_message_replaces_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """`latest` prefers the message of a live publisher, even if a storage has one with a later timestamp."""
+def test_latest_prefers_a_live_message_to_a_stored_one(
+    client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
+    """`latest` returns the message of a live publisher, even if a storage has one with a later timestamp."""
     later = zenoh.Timestamp(dt.datetime.now(dt.UTC) + dt.timedelta(hours=1), b"\x07")
     stored = {f"nedbus/{vehicle}/{VLP}": encode(message(99)) for vehicle in "12"}
     publish(bus.publisher(VLP, vehicle="1"), 1)
@@ -354,7 +356,7 @@ def test_published_fields_are_validated(client: nedbus.Bus, bus: nedbus.Bus) -> 
 
 
 def test_default_timestamp_is_the_time_since_boot(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Fields without a timestamp get the time since boot [us], like PX4's messages; it does not count as missing."""
+    """The default timestamp is the time since boot [us], as in PX4's messages, and does not count as missing."""
     publisher, before = client.publisher(VLP, vehicle="1"), time.monotonic_ns() // 1000
     publisher.publish({"x": 2.0})
     wait_for(bus.latest, what="the message")
@@ -372,7 +374,7 @@ def test_second_publisher_of_an_address_raises(client: nedbus.Bus) -> None:
 
 
 def test_concurrent_publishers_of_an_address_raise(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If two threads open a publisher for the same address at once, one of them raises."""
+    """If two threads open a publisher for the same address at the same time, exactly one of them raises."""
     both = threading.Barrier(2)
 
     def create_together(*arguments: object, **options: object) -> nedbus.Publisher:
@@ -387,7 +389,7 @@ def test_concurrent_publishers_of_an_address_raise(bus: nedbus.Bus, monkeypatch:
 
 
 def test_invalid_topic_vehicle_instance_or_mode_raises(client: nedbus.Bus) -> None:
-    """An invalid topic, vehicle, instance or mode raises a ValueError at once, instead of subscribing to nothing."""
+    """An invalid topic, vehicle, instance or mode raises ValueError immediately, instead of subscribing to nothing."""
     with pytest.raises(nedbus.AddressError, match="vehicle_local_positon"):
         client.subscribe("vehicle_local_positon")
     with pytest.raises(nedbus.ArgumentError, match="mode 'newest' is not valid: expected one of latest, ev") as error:
@@ -414,7 +416,7 @@ def test_prefixes_separate_fleets(endpoint: str) -> None:
 
 
 def test_receive_raises_no_data_error_on_timeout(client: nedbus.Bus) -> None:
-    """NoDataError is a TimeoutError; its text names the key and a remedy."""
+    """On timeout `receive` raises NoDataError, a TimeoutError whose text names the key and a remedy."""
     subscription = client.subscribe(VLP, vehicle="9")
     with pytest.raises(TimeoutError, match=rf"nedbus/9/{VLP} within 0\.05 s.*nedbus list") as info:
         subscription.receive(0.05)
@@ -423,7 +425,7 @@ def test_receive_raises_no_data_error_on_timeout(client: nedbus.Bus) -> None:
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf")])
 def test_zero_negative_and_infinite_timeouts_are_valid(bus: nedbus.Bus, timeout: float) -> None:
-    """Zero, negative and infinite timeouts work for queries and `receive`."""
+    """Queries and `receive` accept zero, negative and infinite timeouts."""
     publish(bus.publisher(VLP, vehicle="1"), 1)
     bus.latest("*", timeout=timeout)
     bus.vehicles(timeout=timeout)

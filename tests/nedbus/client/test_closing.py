@@ -121,7 +121,7 @@ def test_cancelled_connect_leaves_no_thread() -> None:
 
 
 def test_connect_uses_first_answering_endpoint_or_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first of several endpoints that answers is used; NEDBUS_CONNECT is used by scripts without an endpoint."""
+    """`connect` uses the first endpoint that answers; a script without an endpoint uses NEDBUS_CONNECT."""
     with nedbus.connect([free_endpoint(), endpoint]) as bus:
         assert bus.connected
     monkeypatch.setenv("NEDBUS_CONNECT", endpoint)
@@ -166,7 +166,7 @@ def test_cancelled_receives_open_one_subscriber(endpoint: str, bus: nedbus.Bus) 
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, mode: Mode) -> None:
-    """`close` ends an iteration without an error, even in another thread; `receive` raises; `close` is idempotent."""
+    """`close` ends an iteration without an error, even in another thread, and is idempotent. `receive` then raises."""
     with nedbus.connect(endpoint) as bus:
         waiting = bus.subscribe(VLP, mode=mode)
         reader = threading.Thread(target=list, args=(waiting,), daemon=True)
@@ -275,7 +275,7 @@ def test_calls_on_a_closed_bus_raise(client: nedbus.Bus) -> None:
 
 
 def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
-    """A bus stays open while one of its publishers or subscriptions is referenced, and closes after that."""
+    """A bus closes once neither the bus nor any of its publishers and subscriptions is referenced."""
     unreferenced = nedbus.connect(endpoint)
     reference = weakref.ref(unreferenced)
     publisher, subscription = unreferenced.publisher(VLP, vehicle="1"), unreferenced.subscribe(mode="every")
@@ -292,7 +292,7 @@ def test_unreferenced_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_garbage_collection_closes_on_the_closer_thread() -> None:
-    """Garbage collection may run on a thread that holds a lock, so it leaves closing to the closer thread."""
+    """Garbage collection leaves closing to the closer thread, because it may run on a thread that holds a lock."""
     lock = threading.Lock()
     closed: list[threading.Thread] = []
 
@@ -303,7 +303,7 @@ def test_garbage_collection_closes_on_the_closer_thread() -> None:
 
     queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
     subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, owner=None)
-    with lock:  # a thread may hold it during any call
+    with lock:  # garbage collection may run while this thread holds it
         del subscription
         gc.collect()  # closing on this thread would be a deadlock
     wait_for(lambda: closed, what="the subscription to be closed")
@@ -322,7 +322,7 @@ def test_ctrl_c_ends_a_query_without_a_reply(start: Start, endpoint: str, zenoh_
 
 
 def test_ctrl_c_during_thread_start_is_raised(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C during the start of the pump thread is raised, and `close` waits for the thread, which still runs."""
+    """Ctrl-C during the start of the pump thread is raised, and `close` waits for the thread, which starts anyway."""
     start, late = threading.Thread.start, list[threading.Thread]()
 
     def interrupted(thread: threading.Thread) -> None:

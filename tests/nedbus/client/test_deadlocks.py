@@ -1,4 +1,4 @@
-"""Deadlocks between Python and Zenoh while a process opens and closes publishers, queries and subscribes."""
+"""Deadlocks between Python and Zenoh in a process that subscribes, queries, and opens and closes publishers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.peers.processes import Start
 
 @pytest.mark.slow
 def test_opening_and_closing_publishers_does_not_deadlock(start: Start) -> None:
-    """No Python code runs on Zenoh's threads, and none holds the GIL while waiting for Zenoh.
+    """Python code neither runs on Zenoh's threads nor holds the GIL while it waits for Zenoh.
 
     A deadlock lasts 10 s or forever; the limit of 5 s tolerates a busy machine.
     """

@@ -55,7 +55,7 @@ SCRIPTS = {
     "async raises": ASYNC.replace("END", 'raise RuntimeError("on purpose")'),
 }
 CODES = {"raises": 1, "async raises": 1, "exits": 3}
-MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]  # "every" has all threads of "latest", and more
+MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]  # "every" starts all threads of "latest", and more
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_script_without_close_exits(start: Start, flood: str, script: str, mode:
 def test_signal_ends_a_reading_script(
     start: Start, flood: str, number: signal.Signals, vehicle: str, mode: str
 ) -> None:
-    """Ctrl-C and SIGTERM end a loop over samples, with and without arriving samples."""
+    """Ctrl-C and SIGTERM end a loop over samples, whether or not samples arrive."""
     code = f"""
 import nedbus
 bus = nedbus.connect()
@@ -119,7 +119,7 @@ def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, ti
 
 
 def test_signal_missed_by_asyncio_ends_the_wait_for_a_router(start: Start) -> None:
-    """A signal that does not wake the event loop, such as one delivered to another thread, ends the wait as well."""
+    """A signal that does not wake the event loop, for example one delivered to another thread, also ends the wait."""
     code = """
 import asyncio, nedbus, signal, socket, threading
 server = socket.create_server(("127.0.0.1", 0))
@@ -148,7 +148,7 @@ time.sleep(600)
 
 
 def test_close_waits_for_threads_inside_zenoh(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread that returns from Zenoh during interpreter exit aborts the process: 'FATAL: exception not rethrown'."""
+    """`close` waits for threads inside Zenoh, because one that returns during interpreter exit aborts the process."""
     joined: list[str] = []
     join = threading.Thread.join
 
@@ -181,7 +181,7 @@ def test_close_waits_for_threads_inside_zenoh(bus: nedbus.Bus, monkeypatch: pyte
 
 
 def test_ten_subscriptions_need_at_most_twelve_threads(endpoint: str) -> None:
-    """Each subscription that is read with a timeout has a thread; the process has an I/O thread and a closer thread."""
+    """Ten subscriptions read with a timeout need one thread each, plus the I/O thread and the closer thread."""
     before = set(threading.enumerate())
     with nedbus.connect(endpoint) as bus:
         subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(10)]

@@ -54,12 +54,12 @@ def test_rate_and_jitter_cover_the_last_second() -> None:
 
 
 def test_concurrent_add_does_not_break_a_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A message may be added while another thread computes the jitter."""
+    """A snapshot computes the jitter correctly even if another thread adds a message meanwhile."""
     stream = stream_at(0.0, 0.01, 0.02)
     mean = vars(_Window)["mean"].fget
 
     class LateMean(float):
-        """A mean that adds a message when it is used."""
+        """A mean that adds a message to the stream when the jitter is computed from it."""
 
         def __rsub__(self, other: float) -> float:
             stream.add(message(30_000), received=SECOND // 50)
@@ -89,10 +89,10 @@ def test_silent_stream_has_age_but_no_rate() -> None:
         ("battery_status", 2.0, "slow"),
     ],
 )
-def test_stream_on_change_is_stale_only_below_its_minimum_rate(topic: str, silence: float, state: str) -> None:
-    """A stream published on change is not slow or stale unless it falls below its minimum rate.
+def test_on_change_stream_is_stale_only_below_its_minimum_rate(topic: str, silence: float, state: str) -> None:
+    """A stream published on change is slow or stale only below its minimum rate, and never has gaps.
 
-    It has no gaps. Messages other than positions have neither flags nor resets.
+    Streams of messages other than positions have neither flags nor resets.
     """
     stream = StreamHealth(topic)
     times = [index / 50 for index in range(500)] + [10.0 + index for index in range(3)]
@@ -105,7 +105,7 @@ def test_stream_on_change_is_stale_only_below_its_minimum_rate(topic: str, silen
 
 
 def test_gaps_disorder_and_reboots_are_derived_from_px4_time() -> None:
-    """Steps of PX4's time of more than three usual steps are gaps; steps back are disorder or reboots."""
+    """A step of PX4 time above three usual intervals is a gap; a step back is a message out of order or a reboot."""
     clock = [index * 0.1 for index in range(20)]
     clock += [clock[-1] + 1.0 + index * 0.1 for index in range(5)]
     clock += [clock[-1] + 0.2, clock[-1] + 2.0]
@@ -151,8 +151,8 @@ def test_flag_shares_are_fractions_of_messages() -> None:
     assert health.flags_ever == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 0.5, "dead_reckoning": 0.5}
 
 
-def test_missing_flags_do_not_count() -> None:
-    """The share of a flag is computed from the messages whose source provides it."""
+def test_flag_share_ignores_messages_without_the_flag() -> None:
+    """The share of a flag is computed over the messages whose source provides the flag."""
     stream = StreamHealth(VLP)
     stream.add(message(1, x=0.0, y=0.0, xy_valid=True), received=0, missing={"z_valid", "dead_reckoning"})
     stream.add({"timestamp": 2, "xy_valid": False}, received=1)
@@ -169,7 +169,7 @@ def test_latency_covers_the_last_second_and_lost_is_a_total() -> None:
 
 
 def test_usual_rate_reveals_a_slow_stream() -> None:
-    """After a minute at 100 Hz, 5 Hz is far below the usual rate; a burst of recovered messages hardly changes it."""
+    """After a minute at 100 Hz, 5 Hz is far below the usual rate, which a burst of recovered messages hardly raises."""
     times = [index * 0.01 for index in range(6000)]
     times += [60.0 + index * 0.0001 for index in range(6000)]
     times += [62.0 + index * 0.01 for index in range(200)]
@@ -234,7 +234,7 @@ def test_monitor_is_bounded() -> None:
 
 
 def test_retained_sample_is_not_measured() -> None:
-    """A retained sample may have any age: a stream is measured from its first live sample on."""
+    """Measurement of a stream starts with its first live sample, because a retained one may have any age."""
     monitor, first = Monitor(), sample("1")
     assert not monitor.add(dataclasses.replace(first, retained=True))
     assert monitor.snapshot() == {}
@@ -242,8 +242,8 @@ def test_retained_sample_is_not_measured() -> None:
     assert monitor.snapshot()[first.address].messages == 1
 
 
-def test_states_have_reasons() -> None:
-    """A stream has the worst state that applies, with a reason unless it is "ok"."""
+def test_stream_has_the_worst_state_that_applies() -> None:
+    """The state of a stream is the worst one that applies; each state except "ok" has a reason."""
     second = [index / 100 for index in range(300)]
     fresh, late = (stream_at(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
     stream = stream_at(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
@@ -266,8 +266,8 @@ def test_states_have_reasons() -> None:
     assert stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
 
 
-def test_description_has_state_flags_and_faults() -> None:
-    """The description has the state, flags, gaps, out-of-order messages and reboots; "ok" without any."""
+def test_description_lists_state_flags_and_faults() -> None:
+    """A description lists state, invalid flags, gaps, out-of-order messages and reboots; without faults it is "ok"."""
     health = stream_at(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
     doubtful = stream_at(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)

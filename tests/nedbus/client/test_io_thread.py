@@ -28,7 +28,7 @@ class Calls:
 
 
 def test_pauses_end_at_common_ticks() -> None:
-    """Jobs with different pauses of a tick or more are called in the same rounds, one for each tick."""
+    """Jobs that pause for a tick or longer are called together at common ticks, even if their pauses differ."""
     calls = [Calls(TICK * (1 + number / 50)) for number in range(50)]
     jobs = [Job(call) for call in calls]
     wait_for(lambda: all(len(call.times) > 5 for call in calls), what="a few rounds")
@@ -53,7 +53,7 @@ def test_job_is_called_when_woken() -> None:
 
 
 def test_end_waits_for_a_running_job() -> None:
-    """`end` waits until a running call has returned, and a job may end itself."""
+    """`end` waits until a running call has returned, unless the job itself calls it."""
     inside, proceed = threading.Event(), threading.Event()
 
     def block(_: float) -> float:

@@ -115,7 +115,7 @@ def receive_samples(handler: zenoh.Handler[zenoh.Sample], count: int) -> list[ze
 
 
 def test_message_without_a_timestamp_is_rejected(bus: nedbus.Bus) -> None:
-    """A message of a source never gets the time of this host as timestamp, unlike a message of a script."""
+    """A source's message without a timestamp is rejected; only a script's message gets the time of this host."""
     output = SourceOutput("px4", "px4-zenoh:", bus._publishers, time.monotonic, EventLog())
     output.publish_live(SourceMessage(0.0, Address("1", VLP), {"x": 1.0}))
     assert (output.published, output.rejected) == (0, 1)
@@ -208,7 +208,7 @@ def test_invalid_message_is_rejected_counted_and_reported(
 
 
 def test_failing_source_does_not_affect_others(tmp_path: Path, serve: Serve) -> None:
-    """A failed source is retried with backoff, with its error in the status, and published once it is readable."""
+    """A failed source is retried until it is readable, with its error in the status; other sources stay published."""
     missing = tmp_path / "later.ulg"
     service, bus = serve("-s", f"ulog:{missing}?vehicle=late", "-s", "sim:")
     wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the other source")
@@ -353,7 +353,7 @@ def test_uplink_state_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) ->
 
 
 def test_unreachable_router_on_a_shared_port_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    """If two routers share a port number, the one that does not answer is reported, even with host names."""
+    """If routers share a port number, only the unreachable router is reported, even if endpoints have host names."""
     port, now = free_endpoint().rpartition(":")[2], 0.0
     live, dead, named = (f"tcp/{host}:{port}" for host in ("127.0.0.1", "127.0.0.2", "localhost"))
     router = open_router(listen=(live,))
@@ -374,7 +374,7 @@ def test_unreachable_router_on_a_shared_port_is_reported(caplog: pytest.LogCaptu
 
 
 def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -> None:
-    """The error states the endpoint, the reason and two remedies."""
+    """If the port is in use, the error states the endpoint, the reason and two remedies."""
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:")
     assert service.wait() == 1
     remedy = "choose another endpoint with --listen, or join the router that runs there with --connect"
@@ -409,7 +409,7 @@ def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -
     ],
 )
 def test_invalid_option_is_a_usage_error(arguments: str, text: str) -> None:
-    """An invalid option exits with 2 and one line with the remedy, without a traceback."""
+    """With an invalid option the service exits with 2 and one line with the remedy, without a traceback."""
     os.mkfifo("pipe")  # opening it would block forever
     service = run_command("serve", *arguments.split())
     assert service.exit_code == 2

@@ -83,7 +83,7 @@ def write_recording(path: Path) -> None:
                     continue
                 array = arrays_of(position).of([position.model(timestamp=stamp, **fields)])
                 if vehicle == "echo" and 19.0 <= second < 19.3:
-                    array["x"] = float("nan")  # invalid, as xy_valid is true
+                    array["x"] = float("nan")  # invalid, because xy_valid is true
                 writer.write(
                     array, position, [(Address(vehicle, VLP), Provenance("sim"))], logged=logged, published=logged
                 )
@@ -111,10 +111,10 @@ def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: i
 
 
 def test_each_event_is_reported_once_and_in_order(run_nedbus: Start, browser: Browser, tmp_path: Path) -> None:
-    """A service replays a recording to `nedbus events` and the page, each in a subprocess with a router between them.
+    """`nedbus events` and the page report each event of a replayed recording once and in order.
 
-    GPS is lost, an estimate is reset, one vehicle is silent, one reboots, one sends rejected messages; then the router
-    is restarted, and both readers are frozen for a while.
+    One vehicle loses GPS, one resets its estimate, one is silent, one reboots, and one sends invalid messages. Then the
+    router restarts, and both readers are frozen for a while.
     """
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     write_recording(tmp_path / "fleet.mcap")

@@ -36,7 +36,7 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
     link, endpoint, pages = f"mavlink:udpin:127.0.0.1:{free_port()}", free_endpoint(), HttpClient(free_port())
     port = int(link.rpartition(":")[2])
     source = f"{link}?log=1&save={tmp_path}"
-    slow = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # for a busy host
+    slow = Timings(log_answer=DEADLINE, log_link=DEADLINE, log_header=10 * DEADLINE)  # tolerates a busy host
     service = start_with_timings(start, slow, "serve", "--listen", endpoint, "--http", pages.where, "--source", source)
     with (
         nedbus.connect(endpoint, timeout=DEADLINE) as bus,
@@ -72,7 +72,7 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
 
 @pytest.mark.process
 def test_refused_log_stream_is_explained(run_nedbus: Start) -> None:
-    """If another client has the stream, `info`, doctor and the log report it, and MAVLink positions are converted."""
+    """If another client has the stream, `info`, doctor and the log report it, and MAVLink positions are published."""
     endpoint, port = free_endpoint(), free_port()
     service = run_nedbus("serve", "--listen", endpoint, "--source", f"mavlink:udpin:127.0.0.1:{port}?log=1")
     with (

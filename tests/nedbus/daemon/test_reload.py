@@ -68,7 +68,7 @@ def test_reload_does_not_interrupt_unchanged_sources(run_nedbus: Start, tmp_path
 
 
 def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> None:
-    """A file is applied completely or not at all: one invalid source, or a changed prefix, rejects it."""
+    """A file with an invalid source or a changed prefix is rejected, and none of its changes are applied."""
     endpoint, file = free_endpoint(), tmp_path / "nedbus.toml"
     write_settings(file, ["1"])
     service = run_nedbus("serve", "--listen", endpoint, "--config", str(file))

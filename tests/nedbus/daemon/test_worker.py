@@ -217,7 +217,7 @@ def test_looped_replay_has_a_minimum_duration() -> None:
 
 
 def test_failed_replay_is_retried_with_exponential_backoff() -> None:
-    """The backoff is 1, 2, 4, 8, 16, 30, 30 s, and restarts after a success; the addresses are released during it."""
+    """The backoff is 1, 2, 4, 8, 16, 30, 30 s, and restarts after a success. A source in backoff claims no address."""
     clock = FakeClock()
     failures: list[BaseException] = [SourceError("flight.ulg", "no such file")] * 7
     harness = run(FakeReplay([at(0.0)], failures), clock)
@@ -236,7 +236,7 @@ def test_failed_replay_is_retried_with_exponential_backoff() -> None:
 
 
 class PanicException(BaseException):
-    """The exception that pyo3 raises when Rust panics, as Zenoh does if the clock is before 1970."""
+    """The exception that pyo3 raises when Rust panics; Zenoh panics if the clock is before 1970."""
 
 
 @pytest.mark.parametrize("retry", [True, False])
@@ -310,7 +310,7 @@ def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixtu
     """Invalid messages are counted and reported with reason and fields; only the first five are logged."""
     broken = [at(0.0, z_valid=True), *(at(number, timestamp_sample=10**9) for number in range(7))]
     harness = run(FakeReplay([*broken, at(0.0, z=1.0, z_valid=True)], speed=None))
-    assert list(harness.status.rejections.values()) == [1, 7], "by field and rule, and not by value"
+    assert list(harness.status.rejections.values()) == [1, 7], "rejections are counted by field and rule, not by value"
     assert (harness.status.published, harness.status.rejected) == (1, 8)
     address, report = harness.registry.rejected[0]
     assert (address, len(harness.registry.rejected)) == (ONE, 8)

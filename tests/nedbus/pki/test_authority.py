@@ -219,7 +219,7 @@ def test_each_suggested_source_in_a_bundle_is_valid(pki: Path, tmp_path: Path) -
 
 
 def test_bundle_is_created_completely_or_not_at_all(pki: Path, tmp_path: Path) -> None:
-    """A bundle overwrites no file, and leaves none behind after an error, even in the folder of the CA."""
+    """A new bundle overwrites no file, and an error leaves no new file behind, even in the folder of the CA."""
     routers = ["tls/10.0.0.1:7447", "tls/10.0.0.2:7447"]
     before = sorted(pki.iterdir())
     (tmp_path / "taken").mkdir()
@@ -251,7 +251,7 @@ def test_bundle_is_created_completely_or_not_at_all(pki: Path, tmp_path: Path) -
 
 
 def test_old_and_renewed_certificate_are_both_valid(run_router: RunRouter, file: Path, pki: Path, join: Join) -> None:
-    """A renewal keeps name and key; open links with the old certificate stay, and both certificates can connect."""
+    """A renewal keeps name and key. Open links with the old certificate persist, and both certificates can connect."""
     write_access_rules(file, SAMPLE)
     run_router(file)
     old = Path(shutil.copytree(pki, "old"))
@@ -345,7 +345,7 @@ def test_renewed_authority_keeps_its_certificates_valid(run_router: RunRouter, t
 
 
 def test_expired_authority_is_ignored_if_a_valid_one_is_in_the_file(pki: Path, tmp_path: Path) -> None:
-    """One valid CA certificate in tls_ca is enough; if all have expired, the error states that."""
+    """One valid CA certificate in tls_ca is enough. If all have expired, the error states the expiry."""
     expired, both = make_authority(tmp_path / "old", days=-1)[1], tmp_path / "both.crt"
     both.write_bytes(expired.read_bytes() + (pki / "ca.crt").read_bytes())
     assert nedbus.Tls(expired).explain() == f"{expired} has expired"
@@ -394,7 +394,7 @@ def remove_key_identifiers(path: Path, authority: Path) -> None:
 
 @pytest.mark.parametrize("earlier", [False, True], ids=["this version", "earlier version"])
 def test_certificates_pass_strict_verification(pki: Path, *, earlier: bool) -> None:
-    """Certificates pass Python 3.13's strict verification; older certificates stay valid, and pass once renewed."""
+    """Certificates pass Python 3.13's strict verification. Older ones stay valid, and pass once renewed."""
     router, reader = client_tls(pki, "router"), client_tls(pki, "reader")
     for name in ("ca", "router", "reader") if earlier else ():
         remove_key_identifiers(pki / f"{name}.crt", pki / "ca.key")
@@ -419,7 +419,7 @@ def test_shipped_rules_equal_generated_rules(tmp_path: Path) -> None:
 
 
 def test_rules_command_sets_adds_and_removes_vehicles(file: Path, pki: Path, tmp_path: Path) -> None:
-    """--from replaces all vehicles, --add and --remove change some; errors write nothing, and the file mode is kept."""
+    """--from replaces all vehicles, --add and --remove change some. The file keeps its mode, and errors write nothing."""
     file.chmod(0o640)
     names = tmp_path / "names"
     names.write_text("10\n2   # comment\n\nwing\n")
@@ -486,7 +486,7 @@ def test_running_zenohd_rejects_new_rules(start: Start, file: Path, pki: Path, j
 
 
 def test_rolling_restart_of_two_routers_loses_no_message(run_router: RunRouter, file: Path, join: Join) -> None:
-    """Clients of two routers switch to the other during restarts with new rules; mode `every` loses no message."""
+    """Clients of two routers fail over while each router restarts with new rules; mode `every` loses no message."""
     first, second = endpoint_of(file), secure_endpoint()
     other = file.with_name("second.json5")
     text = file.read_text().replace(f'["{first}"]', f'["{second}"]').replace("router.", "router-2.")

@@ -1,4 +1,4 @@
-"""Access control of config/router-secure.json5, verified by received messages: Zenoh drops denied ones silently."""
+"""Access control of config/router-secure.json5, verified by received messages: Zenoh drops denied messages silently."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_reader_receives_all_data_of_a_vehicle(join: Join) -> None:
 
 
 def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
-    """Vehicles may query acknowledgements of readers, and so wait for a reader that is slow."""
+    """Vehicles may query the acknowledgements of readers, so a lossless publisher waits for a slow reader."""
     publisher = join("vehicle-1").publisher(VLP, vehicle="1", lossless=True)
     publisher.publish(message(1))
     with join("reader").subscribe("*", mode="every") as subscription:
@@ -106,11 +106,11 @@ def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
         assert receive_timestamps(subscription, count - 1)[-1] == count
         sending.join(DEADLINE)
         assert publisher.flush()
-        publisher.close()  # else it waits for the reader to reconnect
+        publisher.close()  # a later close would wait for the reader to reconnect
 
 
 def test_message_without_msg_file_is_decoded(join: Join) -> None:
-    """Readers may query vehicles for definitions, also of messages that are not built in, without a rule per topic."""
+    """Readers may query vehicles for definitions that are not built in, although no rule names the topic."""
     vehicle, reader = join("vehicle-1"), join("reader")
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
@@ -135,7 +135,7 @@ def test_message_without_msg_file_is_decoded(join: Join) -> None:
 
 @pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])
 def test_other_certificates_cannot_publish_a_vehicle(join: Join, intruder: str) -> None:
-    """Messages published as vehicle 1 with another certificate reach no reader: no data, liveliness or last value."""
+    """Readers receive no data, liveliness token or last value of vehicle 1 sent with another certificate."""
     genuine = join("vehicle-1").publisher(VLP, vehicle="1")
     genuine.publish(message(1))
     reader = join("reader")
@@ -199,7 +199,7 @@ def test_incomplete_tls_settings_raise(
 
 
 def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Path, run_nedbus: Start) -> None:
-    """Service and commands accept TLS files as flags or variables; `health` reports a vehicle denied by the router."""
+    """Services and commands take TLS files as flags or variables. `health` reports a vehicle that the router denies."""
     run_nedbus("serve", "-c", secure, *tls_options(pki, "vehicle-1"), "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
     wait_for(
         lambda: run_command("health", "-c", secure, "-v", "1", *tls_options(pki, "reader")).exit_code == 0, what="1"
@@ -219,7 +219,7 @@ def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Pa
 def test_px4_without_tls_is_bridged_to_the_secure_router(
     join: Join, open_as: Open, secure: str, pki: Path, run_nedbus: Start
 ) -> None:
-    """A PX4 without TLS is published by a local service with a certificate; PX4's own keys stay local."""
+    """A local service with a certificate publishes a PX4 without TLS, and keeps PX4's own keys local."""
     local = free_endpoint()
     service = run_nedbus(
         *("serve", "--vehicle", "1", "-s", "px4-zenoh:", "--listen", local),
@@ -243,8 +243,8 @@ def test_px4_without_tls_is_bridged_to_the_secure_router(
     assert "no.crt cannot be read" in invalid.err
 
 
-def test_list_hints_at_access_rules_if_a_service_replies(secure: str, pki: Path, run_nedbus: Start) -> None:
-    """If a service replies but no vehicle is visible, `list` does not suggest to start a source."""
+def test_list_suggests_info_if_a_service_replies(secure: str, pki: Path, run_nedbus: Start) -> None:
+    """If a service replies but no vehicle is visible, `list` suggests `nedbus info` instead of `nedbus serve`."""
 
     def hint() -> str:
         listed = run_command("list", "-c", secure, *tls_options(pki, "reader"))
@@ -276,7 +276,7 @@ def test_pki_commands_never_overwrite_keys(tmp_path: Path) -> None:
 
 
 def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Path) -> None:
-    """A router without its certificates exits with the name of the missing file."""
+    """A router without its certificates exits with an error that names the missing file."""
     file = tmp_path / "secure.json5"
     file.write_text((CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(tmp_path / "nowhere")))
     router = run_nedbus("router", str(file))
@@ -292,7 +292,7 @@ def test_router_names_a_missing_certificate_file(run_nedbus: Start, tmp_path: Pa
 def test_refused_clients_are_logged(
     run_nedbus: Start, pki: Path, configured: tuple[Path, str], *, command: tuple[str, ...], environment: dict[str, str]
 ) -> None:
-    """The client's error names a remedy, the router's log the reason; other Zenoh log lines stay on stdout."""
+    """The client's error names a remedy, and the router's log the reason. Other Zenoh log lines stay on stdout."""
     file, endpoint = configured
     router = run_nedbus(*command, str(file), **environment)
     wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")
@@ -379,7 +379,7 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
     assert json.loads(pages.request("/status")[1])["refused"] == ["2"]
     reader = ("--wait", "-c", endpoint, *tls_options(pki, "reader"))
-    if certificate == "vehicle-1":  # else its status is denied, too
+    if certificate == "vehicle-1":  # a certificate without a rule denies the status, too
         info = run_command("info", *reader)
         assert info.exit_code == 0, info.err
         assert "refused by the router: vehicle 2" in info.out

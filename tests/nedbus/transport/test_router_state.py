@@ -68,7 +68,7 @@ def limited(tmp_path: Path) -> Iterator[str]:
 
 
 def router_finding(endpoint: str, seen: str) -> Finding:
-    """Return the doctor's finding about the only router; wait for it, as closed sessions count for a moment."""
+    """Return the doctor's finding about the only router; wait for it, because closed sessions count for a moment."""
     found: list[Finding] = []
 
     def is_found() -> bool:
@@ -108,7 +108,7 @@ def test_embedded_router_reports_its_actual_limit(limited: str) -> None:
 
 @pytest.mark.parametrize("name", ["router.json5", "router-secure.json5"])
 def test_shipped_metadata_repeats_max_sessions(name: str) -> None:
-    """Both shipped files have the same sections, and repeat max_sessions in `metadata`, as zenohd reports only that."""
+    """Both shipped files have the required sections, and repeat max_sessions in `metadata`, which zenohd reports."""
     config = zenoh.Config.from_file(CONFIG / name)
     limit = json.loads(config.get_json("transport/unicast/max_sessions"))
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
@@ -126,7 +126,7 @@ def test_zenohd_reports_the_limit_of_the_shipped_file(start: Start, tmp_path: Pa
 
 
 def test_malformed_router_file_raises(tmp_path: Path) -> None:
-    """The limit does not fall back to the default."""
+    """A malformed router file raises ConfigError instead of falling back to the default limit."""
     file = tmp_path / "router.json5"
     file.write_text("{ mode: ")
     with pytest.raises(ConfigError):
@@ -179,7 +179,7 @@ def test_large_and_many_state_replies_are_bounded(
 
 
 def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None:
-    """Below 80 % the finding is ok; the session of the doctor counts."""
+    """The doctor warns from 80 % of the session limit, and counts its own session."""
     with ExitStack() as stack:
         for _ in range(6):
             stack.enter_context(open_client([limited], timeout=5.0))
@@ -204,7 +204,7 @@ def test_unknown_session_limit_does_not_warn(tmp_path: Path) -> None:
 
 
 def test_service_metrics_have_the_session_limit_of_its_router(tmp_path: Path) -> None:
-    """/metrics has sessions and limit of an embedded router; a client service has no limit."""
+    """/metrics has the sessions and the limit of an embedded router, but no limit in a client service."""
     where = free_endpoint()
     daemon = Daemon(load_settings(source=("sim:",), router_config=write_config(tmp_path, where)), version="0")
 
@@ -238,7 +238,7 @@ def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
 def test_exporter_metrics_have_sessions_and_limits_of_routers(
     limited: str, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """The exporter queries routers periodically, for a limited number of them."""
+    """The exporter queries routers periodically, and exports the metrics of a limited number of routers."""
     timings.routers_interval = 0.05
     with nedbus.connect(limited) as bus, exporting(bus) as shows:
         (state,) = router_states(limited)
@@ -276,7 +276,7 @@ def test_exporter_retries_at_a_full_router(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_exporter_stops_during_an_unanswered_query(limited: str) -> None:
-    """Stopping does not wait for pending replies, because the exit timeout after a signal is shorter."""
+    """The exporter stops without waiting for pending replies, because the exit timeout after a signal is shorter."""
     queries: list[zenoh.Query] = []
     with open_client([limited], timeout=5.0) as silent, nedbus.connect(limited) as bus:
         silent.declare_queryable(f"@/{ZID}/router", queries.append)
@@ -287,7 +287,7 @@ def test_exporter_stops_during_an_unanswered_query(limited: str) -> None:
 
 
 def test_connect_error_at_a_full_router_names_the_limit(tmp_path: Path) -> None:
-    """The error and the doctor name the session limit; a client can connect once a session closes."""
+    """ConnectError and the doctor name the session limit; a client can connect once another session closes."""
     endpoint = free_endpoint()
     unicast = {"unicast": {"max_sessions": 1}}
     with open_router(config_file=write_config(tmp_path, endpoint, transport=unicast)):
@@ -334,7 +334,7 @@ class FakeResource:
 def test_soft_limit_of_open_files_is_raised(
     fake: FakeResource, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The soft limit is raised to the hard limit; a warning is logged if that is too low."""
+    """The soft limit is raised to the hard limit; a warning is logged if the hard limit is too low."""
     monkeypatch.setattr(router, "resource", fake)
     with caplog.at_level(logging.WARNING):
         raise_file_limit(1000)

@@ -63,14 +63,14 @@ def publisher_of(bus: nedbus.Bus, address: Address, **options: Any) -> nedbus.Pu
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to all topics. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
+    """Subscribe to all topics. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
 
 @BOTH
 def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, address: Address) -> None:
-    """Both clients return a message as its model, bit for bit and with its missing fields; so does `latest`."""
+    """Subscriptions and `latest` return an instance of the model, bit for bit and with its missing fields."""
     publisher, sent = publisher_of(bus, address, source="ins"), make(address, 5)
     publisher.publish(make(address, 4))
     subscription = client.subscribe(address.topic, mode="every")
@@ -89,7 +89,7 @@ def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, address:
 
 @BOTH
 def test_publishing_an_invalid_message_raises(bus: nedbus.Bus, address: Address) -> None:
-    """An invalid field raises an error that names it, another message raises TypeError; nothing is published."""
+    """An invalid field raises an error that names it, a message of another type TypeError; neither is published."""
     publisher = publisher_of(bus, address)
     wrong = {"q": (1.0, 0.0, 0.0)} if address == ATTITUDE else {"cs_in_air": 1}
     with pytest.raises(nedbus.InvalidMessageError, match=next(iter(wrong))):
@@ -143,7 +143,7 @@ def test_batch_has_one_message_type(subscription: nedbus.Subscription[Any], bus:
 
 @BOTH
 def test_max_rate_downsamples(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
-    """`max_rate=10` delivers ten messages of one second at 100 Hz, evenly spaced and unchanged."""
+    """With `max_rate=10`, one second of a 100 Hz stream yields ten messages, evenly spaced and unchanged."""
     publisher = publisher_of(bus, address)
     publisher.publish(make(address, 0))
     subscription = client.subscribe(address.topic, mode="every", max_rate=10)
@@ -211,7 +211,10 @@ def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bu
 
 
 def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
-    """A .msg text defines a message and its ranges, and readers query it; an unknown topic without one raises."""
+    """A message and its ranges are defined by a .msg text, and readers query the definition.
+
+    An unknown topic without a definition raises AddressError.
+    """
     text = "uint64 timestamp\nfloat32 range # [m] [@range 0, 100]\nuint8 beacon\n"
     definition = nedbus.define_msg("RangeBeacon", text)
     with nedbus.connect(endpoint) as reader, reader.subscribe("range_beacon", vehicle="mine") as subscription:

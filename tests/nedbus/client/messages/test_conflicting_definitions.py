@@ -1,4 +1,4 @@
-"""Firmware builds that define a message differently, in one network: each is read with its own fields."""
+"""Conflicting definitions of a message by several firmware builds: readers use the definition of the sender."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def router() -> Iterator[str]:
 
 
 class Reader:
-    """A reader of all vehicles in mode `every`, in one of the three forms."""
+    """A reader of all vehicles in mode `every`; `form`: whether it reads models, rows or batches."""
 
     def __init__(self, endpoint: str, form: str) -> None:
         self.form = form
@@ -94,14 +94,14 @@ class Reader:
 
 
 class Network:
-    """Three readers, and four vehicles: one for each firmware build, and vehicle 1, which changes its firmware."""
+    """Three readers and four vehicles: one vehicle per firmware build, and vehicle 1, which changes its firmware."""
 
     def __init__(self, endpoint: str) -> None:
         self.endpoint = endpoint
         self.stamps = count(1)
         self.buses: dict[str, nedbus.Bus] = {}
         self.publishers: dict[str, tuple[str, nedbus.Publisher]] = {}
-        self.last: dict[str, Sent] = {}  # of each publisher
+        self.last: dict[str, Sent] = {}  # last message of each publisher
         self.slowest = 0.0  # s, the longest time until all readers have read a message
         self.readers = {form: Reader(endpoint, form) for form in FORMS}
         for firmware in FIELDS:
@@ -151,7 +151,7 @@ STEPS: Final = st.lists(
 
 @pytest.mark.router
 def test_restart_with_other_firmware_changes_fields(router: str) -> None:
-    """After a vehicle restarts with another firmware, a new reader reads it with its new fields."""
+    """After a vehicle restarts with another firmware, a new reader gets the fields of the new firmware."""
     before = [(Network.publish, "C"), (Network.restart_reader, "rows")]
     run(router, [*before, (Network.restart, "C"), *before])
 
@@ -181,7 +181,7 @@ def run(router: str, steps: Steps) -> float:
 
 
 def test_unread_samples_keep_their_definition(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Unread samples of a vehicle that changed its firmware are each decoded with their own fields."""
+    """Each unread sample of a vehicle that changed its firmware is decoded with its own definition."""
     with client.subscribe(TOPIC, mode="every") as subscription:
         sent = []
         for number, firmware in enumerate("ABCBA"):
@@ -263,7 +263,7 @@ def test_payload_that_contradicts_its_encoding_is_invalid(bus: nedbus.Bus, zenoh
 
 @pytest.mark.parametrize("distinct", [True, False])
 def test_recording_has_a_schema_per_firmware(bus: nedbus.Bus, tmp_path: Path, distinct: bool) -> None:
-    """Each firmware is recorded with its own schema and read back with its fields, even on one address."""
+    """Each firmware is recorded with its own schema and read back with its fields, even if builds share an address."""
     path, stop = tmp_path / "flight.mcap", threading.Event()
     recorder = Recorder(bus.subscribe(TOPIC, mode="every"), path)
     thread = threading.Thread(target=recorder.run, args=(stop,))
@@ -320,7 +320,7 @@ with nedbus.connect(sys.argv[1]) as bus:
 def test_service_with_several_firmware_builds_replies_with_each_definition(
     tmp_path: Path, run_nedbus: Start, start: Start, endpoint: str
 ) -> None:
-    """If a service replays logs of several firmware builds, a new reader of any of them gets the right fields."""
+    """If a service replays logs of several firmware builds, a new reader gets the fields of each log."""
     logs = [write_log(tmp_path / f"{name}.ulg", name, number) for number, name in enumerate("ABC", 1)]
     sources = [each for log in logs for each in ("--source", f"ulog:{log}?topics=*")]
     run_nedbus("serve", "-c", endpoint, *sources)

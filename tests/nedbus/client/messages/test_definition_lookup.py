@@ -27,7 +27,7 @@ COUNT = 500
 def test_message_with_queried_definition_is_read_completely(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
-    """No message is lost during the lookup of its definition, in any form; the values equal the log's."""
+    """No message is lost during the lookup of its definition; models, rows and batches equal the log."""
     log = write_wheels(tmp_path / "rover.ulg", COUNT)
     with bus.subscribe("wheel_encoders", mode="every") as subscription:
         run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
@@ -71,7 +71,7 @@ def test_hostile_definition_does_not_affect_other_streams(
 ) -> None:
     """If a peer replies with an invalid definition, only its own message is invalid."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
-    with suppress(ValueError):  # the right hash, if the definition has one: it is rejected for another reason
+    with suppress(ValueError):  # use the right hash, if there is one, so that the reply is rejected for another reason
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/peer/Evil"
@@ -106,7 +106,7 @@ def read_once(endpoint: str, topic: str, form: str) -> int:
 
 
 def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.Bus) -> None:
-    """Closing a bus frees the definitions that it looked up, for all forms of reading."""
+    """Closing a bus frees the definitions that it looked up for `latest`, models or batches."""
     definition = define_msg("ComesAndGoes", "uint64 timestamp\nfloat32 comes_and_goes\n")
     publisher = bus.publisher("comes_and_goes", vehicle="1", definition=definition)
     publisher.publish({"timestamp": 1})

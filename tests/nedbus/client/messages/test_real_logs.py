@@ -1,4 +1,4 @@
-"""All topics of real logs: arrays, replays and recordings equal those read by pyulog."""
+"""All topics of real logs: arrays, replays and recordings equal the data that pyulog reads."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
 @pytest.mark.slow
 @each_flight
 def test_replay_of_a_log_equals_its_arrays(flight: Path) -> None:
-    """A replay delivers all messages in the arrays, and rejects those known to be invalid."""
+    """A replay delivers all messages in the arrays, and rejects the messages known to be invalid."""
     run = open_replay(f"ulog:{flight}?topics=*")
     arrays = nedbus.read(flight, ["*"])
     messages: dict[str, list[Any]] = {}

@@ -32,7 +32,7 @@ class Stuck(Exception):  # noqa: N818 - not an error, but an expected outcome
 
 @dataclass(eq=False)
 class Reader:
-    """A reader of `rate` messages per second; its lease expires 5 s after it is suspended."""
+    """A reader of `rate` messages per second, whose lease expires 5 s after its suspension."""
 
     name: str
     rate: float = math.inf
@@ -40,7 +40,7 @@ class Reader:
     alive: bool = True
     closed: bool = False
     stopped: float | None = None  # time of the suspension
-    stops_in_answer: bool = False  # after its next reply, before that query is finalized
+    stops_in_answer: bool = False  # suspended after its next reply, before the query is finalized
 
     def is_linked(self, now: float) -> bool:
         return self.alive and (self.stopped is None or now - self.stopped < TIMINGS.lease)
@@ -59,7 +59,7 @@ class Query:
     waiting: list[Reader]
     replies: deque[SimpleNamespace] = field(default_factory=deque)
     ended: bool = False
-    lost: bool = False  # a full queue dropped it
+    lost: bool = False  # dropped by a full queue
 
     def try_recv(self) -> SimpleNamespace | None:
         """Return the next reply, like the channel of a query."""
@@ -75,8 +75,8 @@ class FakeSession:
     readers: list[Reader] = field(default_factory=list)
     now: float = 0.0
     published: int = 0
-    sent: list[float] = field(default_factory=list)  # when each message was sent
-    requests: list[dict[str, str]] = field(default_factory=list)  # the parameters of each query
+    sent: list[float] = field(default_factory=list)  # time of each message
+    requests: list[dict[str, str]] = field(default_factory=list)  # parameters of each query
     pending: list[Query] = field(default_factory=list)
     scheduled: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
     routers: list[str] = field(default_factory=lambda: ["r1"])

@@ -47,7 +47,7 @@ def test_publisher_without_readers_never_waits(
 
 
 def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
-    """An acknowledgement of the last message is requested every 250 messages, one at a time."""
+    """The publisher requests an acknowledgement every 250 messages, and never waits for a fast reader."""
     session.readers.append(Reader("fast"))
     session.publish(control, 10_000)
     assert session.now == pytest.approx(1.0)
@@ -57,7 +57,7 @@ def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control:
 
 
 def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control: FlowControl) -> None:
-    """A stuck reader is sent 2,000 messages at once, then 10 per second until the history cache is full, then none.
+    """A stuck reader gets 2,000 messages at once, then 10 per second until the history cache is full, then none.
 
     A connected reader is never given up: requests are repeated after 0.5, 1, 2, 4 and 8 s, then every 10 s.
     """
@@ -72,7 +72,7 @@ def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control:
 
 
 def test_window_is_shared_by_active_publishers() -> None:
-    """Publishers share the window and what others leave unused; one without messages for a second does not count."""
+    """Active publishers share the window and unused shares; a second without messages makes a publisher inactive."""
     shared = SharedWindow()
     assert shared.share("a", 0, now=0.0) == WINDOW
     assert shared.share("a", 1900, now=0.1) == WINDOW
@@ -129,7 +129,7 @@ def test_slow_reader_leaves_others_ten_messages_per_second(session: FakeSession,
 
 
 def test_closed_reader_does_not_delay_the_publisher(session: FakeSession, control: FlowControl) -> None:
-    """A closing reader acknowledges the open request, and the publisher continues."""
+    """The publisher continues once a stuck reader closes, because a closing reader acknowledges the open request."""
     reader = Reader("stuck", rate=0.0)
     session.readers += [reader, Reader("fast")]
     session.schedule(1.0, lambda: setattr(reader, "closed", True))
@@ -138,7 +138,7 @@ def test_closed_reader_does_not_delay_the_publisher(session: FakeSession, contro
 
 
 def measure_lead(session: FakeSession, control: FlowControl, reader: Reader, at: float) -> float:
-    """Publish 20,000 messages, which a reader finally reads; return the lead over it after `at` seconds."""
+    """Publish 20,000 messages to a reader; return how many were published but unread after `at` seconds."""
     lead: list[float] = []
     session.schedule(at, lambda: lead.append(session.published - reader.read))
     count = session.published + 20_000
@@ -184,7 +184,10 @@ def test_reader_that_returns_in_time_misses_nothing(  # noqa: PLR0917 - a table
 def test_lost_reader_is_given_up(
     session: FakeSession, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
 ) -> None:
-    """A lost reader is given up after 5 s with a router, or 90 s after its lease; until then others get 10 Hz."""
+    """A disconnected reader is given up after 5 s with a router, a suspended reader 90 s after its lease expires.
+
+    Until then other readers get ten messages per second.
+    """
     reader = Reader("gone", rate=5_000.0)
     session.readers += [reader, Reader("fast")]
     interrupt(session, reader, at, until=math.inf)
@@ -229,7 +232,7 @@ def test_publisher_waits_for_a_suspended_reader(
 def test_reader_suspended_while_replying_is_recognized(
     session: FakeSession, control: FlowControl, others: list[str], back: float
 ) -> None:
-    """A reader suspended while replying is recognized on return: the publisher does not wait for an unknown one."""
+    """A reader suspended while replying is recognized on return, so the publisher waits for no unknown reader."""
     reader = Reader("back", stops_in_answer=True)
     session.readers += [reader, *map(Reader, others)]
     session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
@@ -238,7 +241,7 @@ def test_reader_suspended_while_replying_is_recognized(
 
 
 def test_reader_that_closes_during_a_long_request_is_given_up(session: FakeSession, control: FlowControl) -> None:
-    """A reader that closes while a stuck one delays the request is given up 5 s after the stuck one resumes."""
+    """A reader that closes while a stuck one delays the request is given up 5 s after the stuck reader resumes."""
     stuck, ended = Reader("stuck", rate=0.0), Reader("ended")
     session.readers += [stuck, ended]
     session.schedule(10.0, lambda: setattr(ended, "closed", True))
@@ -275,7 +278,7 @@ def test_flush_returns_false_on_timeout(session: FakeSession, control: FlowContr
 
 
 def test_each_flush_sends_a_new_request(session: FakeSession, control: FlowControl) -> None:
-    """Each flush sends a new request, because there may be new readers; without messages it returns at once."""
+    """Each flush sends a new request, because there may be new readers; before the first message it sends none."""
     assert control.wait_for_reception(0, timeout=5.0)
     assert session.requests == []
     session.publish(control, 250)
@@ -287,7 +290,7 @@ def test_each_flush_sends_a_new_request(session: FakeSession, control: FlowContr
 
 
 def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowControl) -> None:
-    """A flush waits for a lost reader as long as publishing would, but not for a closed one."""
+    """A flush waits for a disconnected reader as long as publishing would, but not for a closed reader."""
     ended, away = Reader("ended", stopped=0.0), Reader("away")
     session.readers += [ended, away]
     session.schedule(0.1, lambda: setattr(ended, "closed", True))

@@ -40,7 +40,7 @@ def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> N
 
 
 def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A downsampled stream has its own sequence numbers, and heartbeats with the last one."""
+    """A downsampled stream has its own sequence numbers, and its heartbeats carry the last sequence number."""
     heartbeats: Heartbeats = {}
     take, undeclare = follow_heartbeats(zenoh_session, f"nedbus/*/{VLP}/@rate/*")
     with bus.publisher(VLP, vehicle="1") as publisher, bus.subscribe(VLP, mode="every", max_rate=1):

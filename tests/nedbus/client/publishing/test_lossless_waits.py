@@ -48,7 +48,7 @@ async def wait_for_minimum_share(publisher: nedbus.AsyncPublisher) -> None:
 
 @pytest.fixture
 def stuck(bus: nedbus.Bus) -> Iterator[nedbus.Subscription[Any]]:
-    """Return a subscription whose messages stay unread unless the test reads them."""
+    """Yield a subscription whose messages stay unread unless the test reads them."""
     with bus.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
@@ -191,7 +191,7 @@ def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to positions. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
+    """Subscribe to positions. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
@@ -221,7 +221,7 @@ def test_lossless_close_waits_for_readers(
 
 @pytest.mark.parametrize("fails", [True, False])
 def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
-    """A `with` block that ends with an exception closes without a flush; otherwise it flushes, with either client."""
+    """A `with` block that ends with an exception closes without a flush; one that ends normally flushes."""
     flushed: list[nedbus.Publisher] = []
 
     def flush(publisher: nedbus.Publisher, *_: float) -> bool:
@@ -235,7 +235,7 @@ def test_exception_skips_the_wait_for_readers(client: nedbus.Bus, monkeypatch: p
 
 
 def test_lossless_publisher_loses_nothing_during_a_router_restart() -> None:
-    """Without a router, a lossless publisher sends no more than its history cache, and continues with its reader."""
+    """Without a router, a lossless publisher sends no more than its history cache holds; no message is lost."""
     endpoint, count = free_endpoint(), CACHE + 1000
     router = open_router(listen=(endpoint,))
     with nedbus.connect(endpoint) as other, nedbus.connect(endpoint) as bus:

@@ -50,7 +50,7 @@ with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mo
 
 
 def subscribe(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to positions. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
+    """Subscribe to positions. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
@@ -74,7 +74,7 @@ def publish_all(
 def test_stuck_reader_slows_down_a_replay_without_losses(
     stuck: nedbus.Subscription[Any], reader: nedbus.Subscription[Any], bus: nedbus.Bus
 ) -> None:
-    """While one reader is stuck, others get a window at once and then a trickle; finally all have all messages."""
+    """While one reader is stuck, other readers get a window at once and then a trickle; no reader misses a message."""
     publisher, sending = publish_all(bus)
     got = receive_timestamps(reader, WINDOW + 5)
     assert publisher.published < COUNT
@@ -95,7 +95,7 @@ def test_stuck_reader_slows_down_a_replay_without_losses(
 def test_suspended_reader_gets_all_messages(
     start: Start, endpoint: str, bus: nedbus.Bus, timings: Timings, *, when: str, lease: int
 ) -> None:
-    """A reader suspended (SIGSTOP) until its lease expires (normally 5 s, in this test also 1 s) loses nothing."""
+    """A reader suspended (SIGSTOP) until its lease expires (5 s by default, here also 1 s) loses nothing."""
     assert timings.lease == 5
     begin = time.monotonic()
     timings.lease = lease

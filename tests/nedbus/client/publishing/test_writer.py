@@ -18,7 +18,7 @@ from nedbus.transport import Session
 
 @dataclass(eq=False)
 class FakeWriter:
-    """The attributes of a writer that Heartbeats uses."""
+    """A fake writer with the attributes that Heartbeats uses."""
 
     published: int = 0
     key: str = "key"
@@ -80,7 +80,7 @@ def stream(monkeypatch: pytest.MonkeyPatch) -> Stream:
 
 @pytest.mark.parametrize("rate", [5, 7, 50, 400])
 def test_busy_stream_sends_no_heartbeats(stream: Stream, rate: int) -> None:
-    """A stream of 5 Hz or more needs no heartbeats, because its next message reveals losses; an unused one neither."""
+    """A stream of 5 Hz or more sends no heartbeats, because its next message reveals losses; nor does a new one."""
     assert stream.wait(10.0) == []
     for _ in range(20 * rate):
         stream.publish()
@@ -89,8 +89,11 @@ def test_busy_stream_sends_no_heartbeats(stream: Stream, rate: int) -> None:
 
 
 def test_heartbeats_of_a_silent_stream_back_off(stream: Stream) -> None:
-    """Heartbeats follow after 0.4 s, then after 0.5, 1 and 2 s, then every 4 s: 900 per hour, each with one call."""
-    for _ in range(2):  # a message restarts the schedule
+    """Heartbeats follow a message after 0.4 s, then at intervals of 0.5, 1 and 2 s, then every 4 s.
+
+    The job is called only once per heartbeat. A message restarts the schedule.
+    """
+    for _ in range(2):
         stream.publish()
         first, *others = stream.wait(60.0)
         assert first == pytest.approx(0.4)
@@ -123,8 +126,8 @@ def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> Non
     assert stream.wait(HEARTBEAT)
 
 
-def test_heartbeat_has_the_last_sequence_number(stream: Stream) -> None:
-    """A heartbeat has the sequence number of the last message, which starts at 0 and wraps after 2^32."""
+def test_heartbeat_carries_the_last_sequence_number(stream: Stream) -> None:
+    """A heartbeat carries the sequence number of the last message; numbers start at 0 and wrap at 2^32."""
     for published, payload in ((1, b"\0\0\0\0"), (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"), (2**32, b"\xff" * 4)):
         stream.publish(published)
         stream.wait(1.0)

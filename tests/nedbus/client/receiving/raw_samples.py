@@ -38,7 +38,7 @@ class Raw(SimpleNamespace):
 
 
 def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
-    """Return source info with a sequence number and the first publisher of the session `publisher`."""
+    """Return source info with a sequence number, from the first publisher of the session `publisher`."""
     entity = SimpleNamespace(zid=publisher, eid=1)
     return cast("zenoh.SourceInfo", SimpleNamespace(source_sn=number, source_id=entity))
 
@@ -59,7 +59,7 @@ def raw(
     stamp: object = None,
     congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.DROP,
 ) -> RawSample:
-    """Return a sample with a publisher's sequence number, None for a sample without one."""
+    """Return a sample of a publisher; `number`: the sequence number, or None to omit it."""
     info = None if number is None else source_info(number, publisher)
     if payload is None:
         payload = VALID if timestamp == 1 else Payload(encode(message(timestamp)))

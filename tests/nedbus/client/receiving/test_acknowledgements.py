@@ -15,7 +15,7 @@ from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, 
 
 @dataclass
 class AcknowledgingReader:
-    """A queue that receives acknowledgement requests; `acknowledged` has the names of the answered ones, in order.
+    """A queue that receives acknowledgement requests; `acknowledged`: names of the answered requests, in order.
 
     `drained`: the ring is empty when a request arrives.
     """
@@ -28,7 +28,7 @@ class AcknowledgingReader:
         self.queue = make_queue("every", clock=lambda: self.now)
 
     def request(self, number: int, *, read: bool = False, publisher: str = "a", name: str = "") -> list[str]:
-        """Send a request; return the names of all acknowledged ones."""
+        """Send a request; return the names of all acknowledged requests."""
         reply = partial(self.acknowledged.append, name or str(number))
         self.queue.acknowledge(AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained)
         return self.acknowledged
@@ -61,9 +61,9 @@ def test_read_is_acknowledged_after_all_earlier_samples_are_read(reader: Acknowl
 
 
 def test_unknown_publisher_is_acknowledged_once_the_ring_is_empty(reader: AcknowledgingReader) -> None:
-    """An unknown publisher has sent nothing to this reader, which is certain only when the ring is empty.
+    """An unknown publisher's request is acknowledged once the ring is empty: before, its messages may be in the ring.
 
-    Its message may be among those queued at that time: with `read` all of them must be read.
+    A request with `read` also waits until all samples queued at that time have been read.
     """
     reader.request(5, publisher="b")
     assert reader.request(6, publisher="b", read=True) == []
@@ -111,7 +111,7 @@ def test_read_is_acknowledged_when_the_script_reads(reader: AcknowledgingReader,
 
 
 def test_unknown_publisher_is_acknowledged_after_receiving(reader: AcknowledgingReader) -> None:
-    """While another thread drains the ring, a message may be in it: the request is acknowledged after that."""
+    """An unknown publisher's request waits while another thread drains the ring, which may hold its messages."""
     assert reader.request(7, name="while receiving") == []
     assert reader.put(raw(0, publisher="b")) == ["while receiving"]
     reader.drained = True
@@ -119,7 +119,7 @@ def test_unknown_publisher_is_acknowledged_after_receiving(reader: Acknowledging
 
 
 def test_unknown_publisher_is_not_acknowledged_after_a_link_change(reader: AcknowledgingReader) -> None:
-    """After a link change, an unknown publisher may have sent messages, which its heartbeats will reveal."""
+    """After a link change an unknown publisher's request waits, because a heartbeat may still reveal lost messages."""
     reader.drained = True
     reader.queue.on_link_change()
     reader.request(1)
@@ -147,7 +147,7 @@ def test_dropped_message_is_acknowledged(reader: AcknowledgingReader, monkeypatc
 
 
 def test_end_of_the_queue_acknowledges_all_requests(reader: AcknowledgingReader) -> None:
-    """A closed queue acknowledges all open and later requests: no publisher waits for it."""
+    """A closed queue acknowledges all open and later requests, so that no publisher waits for its reader."""
     reader.put(raw(0))
     reader.request(0, read=True, name="read")
     reader.request(9, name="arrived")

@@ -46,7 +46,7 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_mode_every_receives_all_samples_in_order(client: nedbus.Bus, publisher: nedbus.Publisher) -> None:
-    """Mode "every" receives each sample once and in order, and counts no loss."""
+    """A reader in mode "every" receives each sample once and in order, and counts no loss."""
     subscription = client.subscribe(VLP, mode="every")
     first = subscription.receive(DEADLINE)
     publish(publisher, *range(2, 1002))
@@ -206,7 +206,10 @@ def test_long_invalid_keys_are_not_kept(
 def test_newer_layout_is_looked_up_once(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An unknown layout is looked up once; its messages are invalid until then, and unknown fields are logged once."""
+    """An unknown layout is looked up once, and its unknown fields are logged once.
+
+    Messages that arrive before the reply are invalid.
+    """
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     reply = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     queries: list[object] = []
@@ -327,7 +330,7 @@ def test_rejections_of_a_closed_bus_raise(endpoint: str) -> None:
 
 
 def test_receiving_a_sample_needs_few_python_calls(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample receives it with at most 22 Python calls, in four classes."""
+    """A reader that waits for each sample needs at most 22 Python calls, in four classes, to receive it."""
     called: list[list[str]] = []
 
     def trace(frame: FrameType, event: str, _: object) -> None:

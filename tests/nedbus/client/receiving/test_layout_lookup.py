@@ -43,7 +43,7 @@ def test_failed_layout_lookups_back_off() -> None:
 
 
 def test_only_requested_layouts_are_stored() -> None:
-    """Only the requested layouts in a reply with thousands are stored, up to a limit."""
+    """From a reply with thousands of layouts, only the requested ones are stored, up to a limit."""
     fields = {"timestamp": "uint64", "x": "float32"}
     known: Schemas = {("VehicleLocalPosition", number): fields for number in range(9, 2000)}
     lookup = LayoutLookup(lambda _: known)
@@ -62,7 +62,7 @@ def test_long_field_names_are_truncated_in_the_log(caplog: pytest.LogCaptureFixt
 
 
 def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
-    """A check on the receiving thread starts a lookup without waiting for it; closing waits for the open one."""
+    """A check on the receiving thread starts a lookup without waiting for the reply; closing waits for it."""
     queried, answering = threading.Event(), threading.Event()
 
     def find(_: Collection[SchemaId]) -> Schemas:
@@ -124,7 +124,7 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
 
 
 def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """The fields of all definitions are bounded; additional ones are rejected, and logged once.
+    """The total number of fields is bounded; definitions that exceed the bound are rejected, and logged once.
 
     Definitions no longer in use are evicted, least recently used first.
     """

@@ -62,15 +62,15 @@ TestLossAccounting = LossMachine.TestCase
 TestLossAccounting.settings = settings(stateful_step_count=40, phases=set(Phase) - {Phase.explain})
 
 SEEDS = [
-    # 0 arrives twice, and was read twice.
+    # 0 arrives twice, and both copies were read.
     (InitialState("latest"), "publish 0 1, delay 0 1 1, deliver 2"),
     # 0 replaces 1, which is newer.
     (InitialState("latest"), "publish 0 2, delay 0 1, deliver 2"),
     # 1 counts as lost before it arrives.
     (InitialState("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
-    # 1 and 2 are requested, only 2 arrives: 1 is not requested again, and lost.
+    # 1 and 2 are requested, but only 2 arrives: 1 is lost and not requested again.
     (InitialState(), "publish 0 4, deliver 1, drop 0 2, deliver 1, answer 0 1 0"),
-    # The first run has sent 0 to 5: 6 of the second run was mistaken for its 6, read before 0 to 5, and read again.
+    # The first run sent 0 to 5: 6 of the second run was taken for 6 of the first run, read too early, and read again.
     (InitialState(), "publish 0 6, deliver 6, link 1, restart 0, publish 0 8, drop 0 6, deliver 2"),
     # 1 is requested and 2 announced by a heartbeat when the publisher disappears: 1 is lost, 2 is not counted.
     (InitialState(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),

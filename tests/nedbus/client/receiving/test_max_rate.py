@@ -73,7 +73,7 @@ def test_gap_in_a_downsampled_stream_counts_as_lost() -> None:
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> None:
-    """At half the lowest rate the reader omits every second message; the next one reports the losses before it."""
+    """At half the lowest rate the reader omits every second message; each sample reports the losses before it."""
     queue = make_queue(mode, max_rate=0.5)
     assert queue.rate == 1
     taken = []
@@ -91,7 +91,7 @@ def test_reader_downsamples_below_the_lowest_rate(mode: Mode, clock: Clock) -> N
 
 
 def test_last_message_is_received_once() -> None:
-    """The last message passes if it arrives first; earlier downsampled messages and later replies are omitted."""
+    """The last message passes if it arrives first; older downsampled messages and later replies are omitted."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
@@ -101,7 +101,7 @@ def test_last_message_is_received_once() -> None:
 
 
 def test_message_after_restart_with_an_earlier_clock_passes() -> None:
-    """Messages of a vehicle that restarts with an unset clock pass at once."""
+    """After a restart with an earlier clock, the messages of a vehicle pass at once."""
     queue = make_queue()
     queue.put_last([at(1000.0, None, key=KEY)])
     queue.put([at(5.0, 0), at(5.2, 1)])
@@ -130,7 +130,7 @@ def test_steady_stream_passes_evenly() -> None:
 @pytest.mark.parametrize("rate", [0.3, 1, 3, 7, 30, 33, 70, 99, 100])
 @pytest.mark.parametrize("source", [100.0, 103.7, 250.0])
 def test_mean_rate_is_the_requested_rate(rate: float, source: float) -> None:
-    """The mean rate is the requested one, even if it does not divide the rate of the stream."""
+    """The mean rate equals the requested rate, even if the rate of the stream is not a multiple of it."""
     seconds = 10_000 / source
     assert len(passed(rate, steady(source, seconds))) == pytest.approx(seconds * rate, abs=2)
 
@@ -165,7 +165,7 @@ def test_stream_passes_after_its_clock_was_set_back() -> None:
 
 
 def test_rate_step_is_the_highest_up_to_max_rate() -> None:
-    """The rate of the publisher is the highest one up to the requested rate, or the lowest of all."""
+    """The rate requested from publishers is the highest available one up to `max_rate`, or else the lowest."""
     assert [rate_step(rate) for rate in RATES] == list(RATES)
     expected = {0.1: 1, 1.9: 1, 4.99: 2, 7: 5, 30: 20, 99: 50, 1e6: 100}
     assert {max_rate: rate_step(max_rate) for max_rate in expected} == expected

@@ -102,7 +102,7 @@ def test_downsampled_messages_are_unchanged(bus: nedbus.Bus, clock: Clock) -> No
 
 
 def test_publish_many_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
-    """One message of each `publish_many` passes, because all are sent at the same clock time."""
+    """Each `publish_many` call passes one message, because it sends all its messages at the same clock time."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with bus.subscribe(VLP, mode="every", max_rate=5) as subscription:
@@ -162,7 +162,7 @@ def test_closed_publishers_leave_no_listeners(bus: nedbus.Bus, clock: Clock) -> 
                 wait_for_downsampling_reader(publisher)
                 publish(publisher, clock, start, 100)
                 assert receive_timestamps(subscription, 5) == list(range(start, start + 100, 20))
-            assert not bus._publishers._rate_listeners  # not visible from outside
+            assert not bus._publishers._rate_listeners  # no public API shows listeners
         assert subscription.counts == nedbus.Counts(received=11)
 
 
@@ -211,7 +211,10 @@ def publish_across_outage(
 def test_losses_during_an_outage_are_recovered_for_20_s(
     endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, seconds: int
 ) -> None:
-    """In mode "every", losses of a downsampled stream in an outage of up to 20 s are recovered; others are counted."""
+    """In mode "every", losses of a downsampled stream in an outage of up to 20 s are recovered.
+
+    Losses in a longer outage, or in mode "latest", are counted.
+    """
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with (
@@ -316,7 +319,7 @@ def test_echo_prints_downsampled_messages(run_nedbus: Start, endpoint: str, bus:
     assert echo.err == "51 received, 0 lost, 0 dropped, 0 invalid\n"
 
 
-def test_keys_of_downsampled_streams() -> None:
+def test_key_of_a_downsampled_stream_ends_with_its_rate() -> None:
     """The key of a downsampled stream is the stream's key, a chunk that no wildcard matches, and the rate."""
     address = Address("7", "estimator_local_position", 1)
     assert address.rate_key(5) == "nedbus/7/estimator_local_position/1/@rate/5"

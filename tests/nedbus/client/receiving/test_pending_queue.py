@@ -66,7 +66,7 @@ def test_first_reply_of_a_publisher_is_retained(mode: Mode) -> None:
 def test_loss_is_reported_by_the_next_sample_read(
     mode: Mode, arriving: list[RawSample], losses: list[int], counts: Counts
 ) -> None:
-    """A loss is reported by the next valid sample after the gap, even if others are invalid or superseded."""
+    """A loss is reported by the next valid sample after the gap, even after invalid or superseded samples."""
     pending_queue = make_queue(mode)
     put(pending_queue, [raw(0)])
     put(pending_queue, arriving)
@@ -75,7 +75,7 @@ def test_loss_is_reported_by_the_next_sample_read(
 
 
 def test_gap_within_a_batch_is_reported_by_the_sample_after_it() -> None:
-    """A gap within a batch is reported by the sample after it, and a gap at its end by the next batch."""
+    """A gap within a batch is reported by the sample after the gap, a gap at the end by the next batch."""
     pending_queue = make_queue("every")
     for start in range(0, 2000, 50):
         put(pending_queue, [raw(number) for number in range(start, start + 50)])
@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """2,000 vehicles appear and disappear, eight at a time; only those of the last ten minutes stay in memory.
+    """2,000 vehicles appear and disappear, eight at a time; memory has only the vehicles of the last ten minutes.
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
@@ -203,7 +203,7 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
 
 
 def test_losses_during_a_long_outage_are_counted() -> None:
-    """Messages lost in an outage of an hour are counted, even if other vehicles appeared in that time."""
+    """Messages lost in an outage of an hour are counted, even if other vehicles appear during the outage."""
     now = [0.0]
     pending_queue = make_queue("latest", clock=lambda: now[0])
     put(pending_queue, [raw(0, key=key_of("7"), publisher="7")])
@@ -216,13 +216,13 @@ def test_losses_during_a_long_outage_are_counted() -> None:
 
 
 def test_wait_ends_with_sample_wake_end_or_timeout() -> None:
-    """A wait ends with a sample, a call of `wake`, the end of the queue or its timeout."""
+    """A wait ends when a sample arrives, `wake` is called, the queue ends, or the timeout expires."""
     pending_queue = make_queue("every")
     assert not pending_queue.wait(0.0)
     put(pending_queue, [raw(0)])
     assert pending_queue.wait(None)
     drain(pending_queue)
-    pending_queue.wait(0.0)  # may return True for the sample already read
+    pending_queue.wait(0.0)  # may return True because of the sample already read
     assert not pending_queue.wait(0.0)
     woken: list[bool] = []
     pending_queue.on_wake = lambda: woken.append(True)
@@ -238,7 +238,7 @@ def test_wait_ends_with_sample_wake_end_or_timeout() -> None:
 
 @pytest.fixture
 def small_queue(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
-    """Return a queue for mode `every` for 10 samples, of which 4 stay attached to their receive buffer."""
+    """Return a queue for mode `every` that holds 10 samples, at most 4 of them with their receive buffers."""
     monkeypatch.setattr(module, "CAPACITY", 10)
     monkeypatch.setattr(module, "_MAX_FRESH", 4)
     return make_queue("every")
@@ -283,9 +283,9 @@ def test_losses_before_a_dropped_sample_survive_invalid_ones(small_queue: Pendin
 
 @pytest.mark.parametrize("in_batches", [False, True])
 def test_waiting_samples_release_their_receive_buffer(small_queue: PendingQueue, in_batches: bool) -> None:
-    """A Zenoh sample keeps its receive buffer alive, so samples deep in the queue are detached from it.
+    """Samples deep in the queue are detached from their receive buffers, which Zenoh samples keep alive.
 
-    They keep their sequence number, timestamp and provenance.
+    Detached samples keep their sequence number, timestamp and provenance.
     """
     encodings = [encoding_of(f"source{number}", frozenset({"timestamp"})) for number in range(9)]
     arriving = [raw(number, stamp=STAMP if number % 2 else None, encoding=encodings[number]) for number in range(9)]
@@ -306,12 +306,12 @@ def test_waiting_samples_release_their_receive_buffer(small_queue: PendingQueue,
 
 
 class Encoding(str):
-    """A string that supports weak references, used as encoding."""
+    """An encoding that supports weak references."""
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_stream_keeps_no_receive_buffer(mode: Mode) -> None:
-    """The encoding of a Zenoh sample keeps its receive buffer alive, so the state of a key has a copy."""
+    """The state of a key stores a copy of the encoding, because a Zenoh encoding keeps its receive buffer alive."""
     pending_queue, encoding = make_queue(mode), Encoding(SOURCE)
     reference = weakref.ref(encoding)
     put(pending_queue, [raw(0, encoding=encoding)])
@@ -386,7 +386,7 @@ def test_batch_skips_messages_without_a_definition() -> None:
 
 
 def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -> None:
-    """While `pop_batch` waits for a definition, arriving samples are queued at once."""
+    """While `pop_batch` waits for a definition, arriving samples are queued without delay."""
     timings.definition_timeout = DEADLINE
     queried, answered = threading.Event(), threading.Event()
 
@@ -408,7 +408,7 @@ def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -
 
 
 def test_batch_in_mode_latest_reports_losses_before_superseded_samples() -> None:
-    """In mode `latest` a batch has one message per key, and reports all losses before it."""
+    """In mode `latest` a batch has one message per key, and reports all losses before that message."""
     pending_queue = make_queue("latest")
     put(pending_queue, [raw(0), raw(3), raw(4)])
     batch = take_batch(pending_queue)
@@ -417,7 +417,7 @@ def test_batch_in_mode_latest_reports_losses_before_superseded_samples() -> None
 
 
 def test_loss_is_reported_by_the_batch_after_the_gap() -> None:
-    """Messages beyond a full batch, with the losses before them, are left to the next batch."""
+    """Messages that exceed a full batch, and the losses before them, are left to the next batch."""
     pending_queue = make_queue("every")
     put(pending_queue, [raw(number) for number in range(5000) if number not in {4500, 4501}])
     first, second = take_batch(pending_queue), take_batch(pending_queue)

@@ -49,7 +49,7 @@ def fail(*_: object) -> None:
 
 @pytest.mark.parametrize("unanswered", [0, 3])
 def test_lost_samples_are_requested_by_exact_key(lossy: Lossy, unanswered: int) -> None:
-    """Requests have an exact key, because routers match wildcards with all caches; they are repeated until answered."""
+    """A request has an exact key, because routers match wildcards with all caches, and is repeated until answered."""
     lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
     lossy.publish(*range(7))
     assert lossy.receive(7) == list(range(7))
@@ -111,9 +111,9 @@ def test_publisher_that_replies_again_is_retried(lossy: Lossy, timings: Timings)
 
 @pytest.mark.parametrize("waits", ["without", "with a timeout"])
 def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, zenoh_session: Session, waits: str) -> None:
-    """A heartbeat reveals the loss of the newest messages, even to a reader that waits in Zenoh without timeout.
+    """A heartbeat reveals the loss of the newest messages, even to a reader that waits in Zenoh without a timeout.
 
-    The sample that wakes it is invisible to other readers of its session, and does not leave the process.
+    The sample that wakes this reader is invisible to other readers of its session, and does not leave the process.
     """
     received: list[int] = []
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
@@ -192,7 +192,7 @@ def test_flood_of_replies_does_not_block_the_session(lossy: Lossy, zenoh_session
     "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
 )
 def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, entity: str) -> None:
-    """A malformed heartbeat neither causes a request nor prevents a later one."""
+    """A malformed heartbeat neither causes a request nor prevents requests after later heartbeats."""
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
     zenoh_session.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
     lossy.queue.missing = {1}
@@ -220,7 +220,7 @@ def test_unanswered_requests_do_not_delay_others(lossy: Lossy, zenoh_session: Se
 
 
 def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gaps of 60 vehicles at once are requested a few at a time, and all are filled."""
+    """Simultaneous gaps of 60 vehicles are requested a few at a time, and all are filled."""
     monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
     for publisher in publishers:
@@ -244,7 +244,7 @@ def test_close_counts_open_gaps_as_lost(lossy: Lossy) -> None:
 
 
 def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples held back behind gaps are bounded; beyond that gaps count as lost, and the samples arrive."""
+    """If too many samples are held back behind gaps, the gaps count as lost and the samples are delivered."""
     monkeypatch.setattr(pending_queue, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))

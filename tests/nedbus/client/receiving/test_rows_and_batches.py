@@ -25,7 +25,7 @@ COUNT = 900  # fewer than half a window, because one thread publishes and reads
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to all topics. Request it before `bus`, to close it later: otherwise the bus waits 5 s for it."""
+    """Subscribe to all topics. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
@@ -75,7 +75,7 @@ def test_batches_equal_published_messages(subscription: nedbus.Subscription[Any]
 
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
 def test_batch_decodes_unusual_payloads(bus: nedbus.Bus, zenoh_session: Session, filler: int) -> None:
-    """Payloads of other encoders or older layouts are in a batch; invalid payloads and keys are counted as invalid."""
+    """A batch includes payloads of other encoders and older layouts; invalid payloads and keys count as invalid."""
     good = message(7, x=1.5, hagl_max_z=3.0, hagl_max_xy=3.0)
     values = [list(value) if isinstance(value, tuple) else value for value in good.__dict__.values()]
     old = [list(value) if isinstance(value, tuple) else value for value in downgrade(good, "V0").values()]
@@ -101,7 +101,7 @@ def test_batch_decodes_unusual_payloads(bus: nedbus.Bus, zenoh_session: Session,
     assert subscription.counts == nedbus.Counts(received=len(messages), invalid=6)
 
 
-def test_batch_of_mode_latest_has_newest_messages(bus: nedbus.Bus) -> None:
+def test_batch_in_mode_latest_has_the_newest_messages(bus: nedbus.Bus) -> None:
     """In mode "latest" a batch has the newest message of each key."""
     subscription = bus.subscribe(VLP)
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in "ab"]
@@ -118,7 +118,7 @@ def test_batch_of_mode_latest_has_newest_messages(bus: nedbus.Bus) -> None:
 
 
 def test_async_subscription_yields_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
-    """AsyncSubscription provides rows and batches for `async for`."""
+    """`async for` iterates over the rows and batches of an AsyncSubscription."""
     publisher = bus.publisher(VLP, vehicle="1")
 
     async def read() -> tuple[list[int], int]:
@@ -143,7 +143,7 @@ def test_async_subscription_yields_rows_and_batches(endpoint: str, bus: nedbus.B
 
 
 def test_receive_batch_raises_no_data_error_on_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """`receive_batch` raises NoDataError on timeout; its batch has the provenance of each message."""
+    """`receive_batch` returns a batch with the provenance of each message, or raises NoDataError on timeout."""
     bus.publisher(VLP, vehicle="1", source="test").publish({"timestamp": 7, "x": 1.0})
     subscription = client.subscribe(VLP, mode="every")
     batch = subscription.receive_batch(DEADLINE)
@@ -160,7 +160,7 @@ def test_sample_has_source_and_missing_fields(bus: nedbus.Bus) -> None:
     whole = message(1).model_dump()
     publisher.publish(whole)
     subscription = bus.subscribe(VLP, mode="every")
-    missing = [subscription.receive(DEADLINE).missing]  # the last message: once it is here, the reader is subscribed
+    missing = [subscription.receive(DEADLINE).missing]  # once the last message is here, the reader is subscribed
     for fields in ({"timestamp": 2, "x": 1.0}, {"timestamp": 3}, whole):
         publisher.publish(fields)
     publisher.publish(VehicleLocalPosition(timestamp=4, y=2.0))
