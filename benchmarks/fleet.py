@@ -1,6 +1,6 @@
 """A fleet at 100 Hz in one process: python -m benchmarks.fleet VEHICLES SECONDS ENDPOINT [noise].
 
-It prints "ready", waits for a line, publishes, and prints its maximum delay in seconds.
+The process prints "ready", waits for a line, publishes, and prints its maximum delay in seconds.
 With `noise` no two messages are alike, so a recording compresses no better than that of a real flight.
 """
 

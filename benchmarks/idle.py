@@ -31,7 +31,7 @@ def resume():
     while os.read(0, 1):
         print(json.dumps({each.native_id: each.name for each in threading.enumerate()}), flush=True)
 threading.Thread(target=resume, name="benchmark", daemon=True).start()
-"""  # print the names of the Python threads for each line on stdin: Linux has only the names of Zenoh's threads
+"""  # print the names of the Python threads for each line on stdin: Linux knows only Zenoh's thread names
 BUSES: Final = """
 import sys, time
 import nedbus

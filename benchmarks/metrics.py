@@ -108,7 +108,7 @@ def main() -> None:
                 flush=True,
             )
         print(
-            f"effect, the median of {len(rates)}: {100 * statistics.median(rates):.2f} % fewer messages a second,"
+            f"effect (median of {len(rates)}): {100 * statistics.median(rates):.2f} % fewer messages a second,"
             f" {100 * statistics.median(costs):.2f} % more CPU per message (target: 2 %)"
         )
     finally:

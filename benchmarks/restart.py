@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def measure(checkout: Checkout, sessions: int, rounds: int) -> None:
-    """Restart the router `rounds` times, and print a line each; `sessions`: number per process."""
+    """Restart the router `rounds` times, and print a line for each; `sessions`: number per process."""
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     start_router = partial(checkout.start, "-m", "nedbus", "router", "-l", endpoint)

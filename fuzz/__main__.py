@@ -24,8 +24,8 @@ ROOT: Final = Path(__file__).parents[1]
 BUILD: Final = ROOT / "build" / "fuzz"
 _HANG: Final = 10  # s for one input
 _MEMORY: Final = 512  # MB of the process
-_MAX_LENGTH: Final = {"mcap": 20_000, "ulog": 10_000, "mavlink": 8_000}  # bytes of an input; others 4096
-_GRACE: Final = 600  # s beyond its time after which a harness is ended: a busy machine may start it slowly
+_MAX_LENGTH: Final = {"mcap": 20_000, "ulog": 10_000, "mavlink": 8_000}  # maximum input size [bytes]; others 4096
+_GRACE: Final = 600  # s; a harness that exceeds its time by more is killed: a busy machine starts it slowly
 _LEAST_EDGES: Final = 100
 _SHOWN: Final = 25  # lines of output for a finding
 
@@ -34,7 +34,7 @@ def main() -> int:
     """Run the harnesses, as many at once as there are processors, and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parsers", nargs="*", choices=[*PARSERS, []], help="default: all")
-    parser.add_argument("--seconds", type=float, default=600, help="in total, for all")
+    parser.add_argument("--seconds", type=float, default=600, help="total duration for all parsers [s]")
     options = parser.parse_args()
     chosen = options.parsers or [*PARSERS]
     if find_spec("atheris") is None:
@@ -47,7 +47,7 @@ def main() -> int:
 
 
 def fuzz(name: str, seconds: int) -> bool:
-    """Fuzz one parser, print how many inputs ran and edges were reached, and return True if nothing was found."""
+    """Fuzz one parser, print the numbers of inputs and of reached edges, and return True if nothing was found."""
     corpus, findings = BUILD / "corpus" / name, BUILD / "findings"
     corpus.mkdir(parents=True, exist_ok=True)
     findings.mkdir(parents=True, exist_ok=True)
@@ -66,14 +66,14 @@ def fuzz(name: str, seconds: int) -> bool:
         error, output, code = str(exc), "", -1
     runs = re.findall(r"^(?:stat::number_of_executed_units: |#)(\d+)", output, re.MULTILINE)
     edges = re.findall(r"cov: (\d+)", output)
-    # Without edges of the code nedbus is not instrumented, and the inputs would be random.
+    # If few edges are reached, nedbus is not instrumented, and the inputs are random.
     passed = code == 0 and bool(edges) and int(edges[-1]) > _LEAST_EDGES
     line = f"{name:8} {(runs or '0')[-1]:>9} inputs {(edges or '0')[-1]:>6} edges"
     print(line if passed else f"{line}  FINDING")
     if not passed:
         summary = re.findall(r"^(?:==.*|.*Error: .*|.*written to.*)$", output, re.MULTILINE)
         print("\n".join([*error.splitlines()[-_SHOWN:], *summary]))
-        print(f"again: python -m fuzz.harness {name} <that file>")
+        print(f"to reproduce: python -m fuzz.harness {name} <that file>")
     sys.stdout.flush()
     return passed
 

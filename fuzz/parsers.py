@@ -1,4 +1,4 @@
-"""One fuzz target per parser: it accepts any bytes, and lets only undocumented errors escape."""
+"""One fuzz target per parser: each accepts any bytes, and lets only undocumented errors escape."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ MAVLINK_KINDS: Final = (
 """Ids of the messages that `frames` makes."""
 MAVLINK_IDS: Final = (245, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
 """System and component of the client of the log stream."""
-_MAX_PIECES: Final = 40  # of a log: single bytes would take long
-_RAW: Final = 255  # as the kind of a message: bytes without a frame
+_MAX_PIECES: Final = 40  # of a log: feeding single bytes would take too long
+_RAW: Final = 255  # kind of an item: raw bytes without a frame
 _REMOTE: Final = 64  # bit of the kind: from another system
 _LOST: Final = 128  # bit of the kind: one message before this one was lost
 
@@ -117,7 +117,7 @@ def parse_msg(data: bytes) -> int:
 
 
 def parse_cdr(data: bytes) -> int:
-    """Decode CDR of the message and layout that the first two bytes name; a valid message is encoded as it was.
+    """Decode CDR of the message and layout that the first two bytes select; a valid message survives a round trip.
 
     Returns the number of valid messages.
     """
@@ -136,7 +136,7 @@ def parse_cdr(data: bytes) -> int:
         assert not valid, "the array accepts what the model rejects"
         return 0
     again = decode_with(definition, encode_with(definition, fields, layout), layout)
-    assert repr(again) == repr(fields)  # in which NaN equals itself
+    assert repr(again) == repr(fields)  # not ==, because NaN differs from itself
     if accepted is not None and valid:
         encode = codec_of(definition).encode
         assert encode(arrays.to_message(accepted[0])) == encode(message), "the array differs"
@@ -144,7 +144,7 @@ def parse_cdr(data: bytes) -> int:
 
 
 def parse_msgpack(data: bytes) -> int:
-    """Decode a payload of the message that the first byte names, in all forms; a valid one is encoded as it was.
+    """Decode a payload of the message that the first byte selects, in all forms; a valid one survives a round trip.
 
     Returns the number of valid messages.
     """
@@ -164,7 +164,7 @@ def parse_msgpack(data: bytes) -> int:
         assert message is not None or not valid[0], "the array accepts what the model rejects"
     if message is None:
         return 0
-    with suppress(EncodeError):  # a number of another width, beyond that of its field
+    with suppress(EncodeError):  # a number in a wider msgpack type may exceed its field
         again = codec.decode(codec.encode(message))
         assert codec.encode(again) == codec.encode(message)
     return 1
@@ -274,7 +274,7 @@ def _records(log: bytes, size: int, *, verify: bool) -> list[ulog.Record]:
 
 
 def _plain(records: list[ulog.Record]) -> str:
-    return re.sub(" at 0x[0-9a-f]+", "", repr(records))  # in which NaN equals itself
+    return re.sub(" at 0x[0-9a-f]+", "", repr(records))  # text, because NaN differs from itself
 
 
 def _definition_of(data: bytes) -> Definition[Any]:

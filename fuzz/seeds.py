@@ -1,4 +1,4 @@
-"""Seed corpora, made from the small real files of tests/data and from what nedbus itself writes."""
+"""Seed corpora, made from the small real files of tests/data and from files and payloads that nedbus writes."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(mark)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(600))  # three times their duration on four busy cores, with coverage
-        if "open_router" in vars(getattr(item, "module", item)):  # most tests of such a module open a router
+        if "open_router" in vars(getattr(item, "module", item)):  # most tests of a module that imports it call it
             item.add_marker("router")
 
 
@@ -51,7 +51,7 @@ _may_start = True
 
 
 def _watch_processes(event: str, arguments: tuple[object, ...]) -> None:
-    if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:  # Matplotlib runs it once
+    if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:  # Matplotlib runs fc-list once
         raise AssertionError("this test starts a process: mark it with pytest.mark.process")
 
 

@@ -3,7 +3,7 @@
 One thread opens and closes publishers, while others publish, call `vehicles()` and `latest()`, and subscribe, some with
 `max_rate`. The router is killed and restarted, and other processes load the processor. A thread ticks every 50 ms, and
 so does an idle control process, which on a shared machine may itself be late by seconds.
-Pass criteria: no tick is more than a second later than the latest one of the control, and the process ends.
+Pass criteria: no tick is later than the control's latest tick by more than a second, and the process ends.
 
 When no tick arrives for a second, faulthandler writes the stacks of all threads to stderr.
 """

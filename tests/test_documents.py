@@ -246,7 +246,7 @@ def test_payload_indices_are_correct_in_each_language() -> None:
 @pytest.mark.process
 @pytest.mark.parametrize("block", SHELLS, ids=str)
 def test_shell_snippet_is_valid(snippet_folder: Path, block: Block) -> None:
-    """Every shell snippet parses, its nedbus commands have these options, and its sources and files exist."""
+    """Every shell snippet parses, and the options of its nedbus commands, its sources and its files exist."""
     subprocess.run(["bash", "-n", "-c", block.text], check=True, timeout=30)
     for command in nedbus_commands(block):
         parse_command(command)
@@ -324,7 +324,7 @@ def test_mentioned_compose_files_and_variables_exist() -> None:
 
 
 def test_relative_links_resolve() -> None:
-    """Every relative link has an existing file and heading as its target."""
+    """The target file and heading of every relative link exist."""
     for page in (*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md"):
         for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#?([^)]*)\)", page.read_text()):
             file = page.parent / target if target else page
@@ -360,7 +360,7 @@ def test_no_text_installs_nedbus_from_pypi() -> None:
 
 
 def test_reference_has_every_public_name() -> None:
-    """Each name of `nedbus` and its public modules has a described entry, with the methods of the bus."""
+    """The reference has an entry with a description for each public name, and for the methods of the bus."""
     page = api_page()
     entries = dict(re.findall(r"^### `([\w.]+)`\n\n(.*?)(?=\n\n###? |\Z)", page, re.MULTILINE | re.DOTALL))
     constants = dict(re.findall(r"^\| `([\w.]+)` \| .*? \| (.+) \|$", page.partition("## Constants")[2], re.MULTILINE))

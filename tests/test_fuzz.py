@@ -1,4 +1,4 @@
-"""The fuzz targets accept their seeds, and reach the code behind the parsers with them."""
+"""The fuzz targets accept their seeds, which reach the code behind the parsers."""
 
 from __future__ import annotations
 

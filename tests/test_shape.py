@@ -26,7 +26,7 @@ def parse(path: Path) -> ast.Module:
 
 
 def test_packages_are_imported_through_their_interface() -> None:
-    """A package imports another one through its `__init__`; of `nedbus_msgs` also arrays, frames and messages."""
+    """A package imports another through its `__init__`, or from arrays, frames and messages of `nedbus_msgs`."""
     for path in PRODUCT:
         package, layer, *_ = path.relative_to(ROOT).parts[1:]
         for node in ast.walk(parse(path)):
@@ -55,7 +55,7 @@ def test_folder_has_at_most_14_files(folder: Path) -> None:
 def test_no_python_runs_on_zenoh_threads() -> None:
     """Samples and replies are received through channels: a callback would wait for the GIL on a Zenoh thread.
 
-    Advanced publishers are dropped, as `undeclare` waits for Zenoh while it holds the GIL.
+    Advanced publishers are dropped without `undeclare`, which would hold the GIL while it waits for Zenoh.
     """
     for path in PRODUCT:
         code = path.read_text()
@@ -64,7 +64,7 @@ def test_no_python_runs_on_zenoh_threads() -> None:
 
 
 def test_only_clock_module_reads_wall_clock() -> None:
-    """Only `nedbus.clock` reads the wall clock; events, silence and overload are detected by a monotonic one."""
+    """Only `nedbus.clock` reads the wall clock; events, silence and overload are detected with a monotonic clock."""
     for path in PRODUCT:
         found = re.search(r"\btime\.time(_ns)?\(|datetime\.(now|utcnow|today)\(|date\.today\(", path.read_text())
         assert not found or path.name == "clock.py", f"{path}: use nedbus.clock"

@@ -1,4 +1,4 @@
-"""Wait for conditions, with a deadline and a message for when it passes."""
+"""Wait for conditions, with a deadline and a failure message."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEA
 
 
 def wait_for_matching(zenoh_session: Session, key: str) -> None:
-    """Wait until the session has a matching subscriber of this key; Zenoh drops what it publishes before."""
+    """Wait until the session has a matching subscriber of this key; Zenoh drops earlier puts."""
     probe = zenoh_session.declare_publisher(key)
     wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
     probe.undeclare()
 
 
 def wait_for_router(zenoh_session: Session) -> None:
-    """Wait until the router has processed the session's declarations: it replies to this query after them."""
+    """Wait until the router has processed the session's declarations; it answers this query only after them."""
     token_keys(zenoh_session, "nowhere", timeout=DEADLINE)
 
 

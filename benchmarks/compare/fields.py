@@ -1,7 +1,7 @@
 """The message that all forms send, as plain Python values, from a real flight in tests/data/flights.json.
 
-The environment variable BENCH_FLIGHT selects the flight. The sender sets `timestamp`, so `timestamp_sample` is 0 to be
-never later.
+The environment variable BENCH_FLIGHT selects the flight. The sender sets `timestamp`; `timestamp_sample` is 0, because
+it must not be later.
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 VARIABLE: Final = "BENCH_FLIGHT"
-DEFAULT_FLIGHT: Final = "no origin"  # it has no terrain estimate either: dist_bottom_valid is false
+DEFAULT_FLIGHT: Final = "no origin"  # no terrain estimate either: dist_bottom_valid is false
 FLIGHTS: Final[dict[str, Any]] = json.loads((Path(__file__).parents[2] / "tests/data/flights.json").read_text())
 FLIGHT: Final = os.environ.get(VARIABLE, DEFAULT_FLIGHT)
 
@@ -40,7 +40,7 @@ COMPLETE: Final = [flight for flight in FLIGHTS if len(_read(flight)) == len(_re
 """Flights whose source provides all fields."""
 
 PROVIDED: Final = _read(FLIGHT)
-"""Fields that the source of this flight provides; nedbus transmits which these are."""
+"""Fields that the source of this flight provides; nedbus also transmits which fields are provided."""
 
 FIELDS: Final = _complete(PROVIDED)
 """All 53 fields."""

@@ -18,7 +18,7 @@ CORE: Final = ("raw", "straightforward", "models", "fields_in", "rows", "batches
 
 
 def find_forms() -> list[str]:
-    """Return the names of all forms, the core first."""
+    """Return the names of all forms, CORE first."""
     names = sorted(path.stem for path in FORMS.glob("*.py") if "PACKAGES = " in path.read_text())
     return [*CORE, *(name for name in names if name not in CORE)]
 

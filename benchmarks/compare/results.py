@@ -57,7 +57,7 @@ class Results:
         return list(dict.fromkeys(flight for flight, name, _ in self.runs if name == load.name))
 
     def median(self, flight: str, load: Load, form: str) -> Measured:
-        """Return the medians of the rounds; of `kept`, the fraction of messages that arrived, the minimum."""
+        """Return the medians of the rounds, but the minimum of `kept`, the fraction of messages that arrived."""
         runs = self.runs[flight, load.name, form]
         medians = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
         return medians | {"kept": min(run["kept"] for run in runs)}

@@ -2,7 +2,7 @@
 
 Usage: `python -m benchmarks.compare.role FORM publish|receive ENDPOINT COUNT RATE [VEHICLE,VEHICLE...]`.
 COUNT is the total number of messages; RATE is per vehicle in Hz, 0 for full speed; all vehicles send simultaneously.
-It prints "ready", waits for a line, runs, and prints its figures as JSON.
+The process prints "ready", waits for a line, runs, and prints its figures as JSON.
 """
 
 from __future__ import annotations

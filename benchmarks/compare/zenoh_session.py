@@ -7,7 +7,7 @@ import zenoh
 
 from .case import TOPIC, Case
 
-KEY = f"bench/1/{TOPIC}"  # of forms that support only one vehicle
+KEY = f"bench/1/{TOPIC}"  # for forms that support only one vehicle
 
 
 def client_config(endpoint: str, more: Mapping[str, object] | None = None) -> zenoh.Config:

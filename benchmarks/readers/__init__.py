@@ -1,1 +1,1 @@
-"""Readers that are busy or stuck, next to healthy ones."""
+"""Readers that are busy or stuck, alongside healthy ones."""

@@ -1,7 +1,7 @@
 """A reader that is busy with pure Python: python -m benchmarks.readers.busy_reader FORM SCRIPT ENDPOINT.
 
-It prints "ready", and after a line on stdin and the last message its figures as JSON: ages of messages in ms, from
-their timestamp until the script receives them.
+The reader prints "ready", and after a line on stdin and the last message prints its figures as JSON: ages of messages
+in ms, from their timestamp until the script receives them.
 """
 
 from __future__ import annotations

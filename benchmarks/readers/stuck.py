@@ -1,6 +1,6 @@
 """Effect of a stuck reader in mode `every` on a healthy one at the same router: python -m benchmarks.readers.stuck.
 
-For --seconds it does not read, reads one message a second, or is stopped with SIGSTOP; then it continues.
+For --seconds the stuck reader does not read, reads one message a second, or is stopped with SIGSTOP; then it resumes.
 Vehicle 1 is live at --rate Hz, and the healthy reader always subscribes to it; vehicle 2 is a lossless replay of
 --messages messages at the speed of its readers.
 

@@ -1,8 +1,8 @@
 """A reader in mode `every` that may be stuck: python -m benchmarks.readers.stuck_reader HABIT ENDPOINT VEHICLE...
 
 HABIT is `reads`, `never` (does not read) or `slowly` (one message a second); each vehicle has a subscription and a
-thread. It prints "ready", reads normally after the first line on stdin, and after the second line and the last message
-prints its counts per vehicle as JSON.
+thread. The reader prints "ready", reads normally after the first line on stdin, and after the second line and the last
+message prints its counts per vehicle as JSON.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from benchmarks.compare.case import TOPIC
 from benchmarks.processes import wait_for_quiet
 
 QUIET: Final = 3.0  # s without a message until the stream counts as ended
-TIMEOUT: Final = 60.0  # s; maximum wait for that
+TIMEOUT: Final = 60.0  # s; maximum wait for that end
 PAUSE: Final = 1.0  # s between two messages of a slow reader
 
 

@@ -13,11 +13,11 @@ from nedbus_msgs import MESSAGES, Definition, FieldType, codec_of, define, encod
 ROOT: Final = Path(__file__).parents[2]
 VECTORS: Final = ROOT / "docs" / "vectors.json"
 _GOLDEN: Final = ROOT / "tests" / "data" / "golden_messages.json"
-_WIDE: Final = ("int64", "uint64")  # as text: JSON readers may have only doubles
+_WIDE: Final = ("int64", "uint64")  # as strings: JSON parsers may support only doubles
 
 
 def vectors_text() -> str:
-    """Return the file with a vector for each message; new entries without a payload get theirs."""
+    """Return the file with a vector for each message; compute the payload of entries without one."""
     vectors = json.loads(VECTORS.read_text())
     definitions: dict[str, Any] = vectors["definitions"]
     for name, golden in json.loads(_GOLDEN.read_text()).items():
@@ -44,12 +44,12 @@ def vectors_text() -> str:
 
 
 def definition_of(name: str, definitions: Mapping[str, Any]) -> Definition[Any]:
-    """Return the definition of a message in the file, which may have none in nedbus."""
+    """Return the definition of a message from nedbus, or from the file if nedbus does not have the message."""
     return MESSAGES.get(name) or define(name, ((field, field_type(kind)) for field, kind in definitions[f"{name}/0"]))
 
 
 def to_json(fields: Mapping[str, Any], types: Mapping[str, FieldType]) -> list[Any]:
-    """Return the values of a message as the file has them."""
+    """Return the values of a message in the format of the file."""
     return [_map(fields[name], kind, _to_json) for name, kind in types.items()]
 
 

@@ -113,7 +113,7 @@ def published(address: str) -> float:
 
 
 def test_renewed_certificates_are_used(run_nedbus: Start, secure: Stack, pki: Path, record: Record) -> None:
-    """Renewed certificates, copied as documented, reach the containers; the router presents its own after a restart."""
+    """Renewed certificates, copied as documented, reach the containers; the restarted router presents the new one."""
     secure.up()
     recorder = record(join(secure, pki, "reader").subscribe(VLP, mode="every"))
     recorder.wait_for_more(100)

@@ -110,7 +110,7 @@ def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Rec
 
 
 def test_frozen_service_disappears_and_returns(make_stack: StartStack, record: Record) -> None:
-    """The data of a paused service becomes stale; its vehicle disappears with the lease, and returns on resume."""
+    """The data of a paused service becomes stale; its vehicle disappears when the lease ends, and returns on resume."""
     stack = make_stack("frozen")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
@@ -167,7 +167,7 @@ bus.close()
 
 
 def test_stuck_reader_does_not_affect_others(make_stack: StartStack, record: Record) -> None:
-    """While one subscriber does not read for 60 s, another one loses nothing and the publisher never blocks."""
+    """While one subscriber does not read for 60 s, another subscriber loses nothing and the publisher never blocks."""
     stack = make_stack("stuck")
     stack.up("router")
     python = ("--entrypoint", "/opt/nedbus/bin/python")

@@ -36,7 +36,7 @@ class Fleet:
     """The stack, with a published port and a recorder of all messages at each router."""
 
     def __init__(self, stack: Stack, endpoints: dict[str, str], closing: ExitStack) -> None:
-        """Start the routers, then the vehicles: each connects to the ground station it names first."""
+        """Start the routers, then the vehicles; each vehicle connects to its first configured ground station."""
         self.stack = stack
         self.endpoints = endpoints
         stack.up(*endpoints)

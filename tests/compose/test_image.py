@@ -19,7 +19,7 @@ def run_in_image(*command: str) -> str:
 
 
 def test_sbom_lists_installed_packages(images: None) -> None:
-    """The SBOM in the image has exactly its packages, with their versions, and no tool of its build."""
+    """The SBOM lists exactly the packages installed in the image, with versions, and no build tools."""
     sbom = json.loads(run_in_image("cat", "/opt/nedbus/sbom.cdx.json"))
     root = sbom["metadata"]["component"]
     listed = {each["purl"].removeprefix("pkg:pypi/").partition("?")[0] for each in [*sbom["components"]]}

@@ -46,7 +46,7 @@ def test_host_and_container_receive_all_messages(
 ) -> None:
     """Subscribers receive all messages of all topics with correct values; `compose stop` exits with 0.
 
-    They are on the network of the service, or behind a second router on another network.
+    The subscribers are on the network of the service, or behind a second router on another network.
     """
     stack = make_stack("readers", file)
     stack.up()

@@ -65,7 +65,7 @@ def check_genuine(reader: Recorder) -> None:
 
 @pytest.mark.parametrize("name", ["vehicle-2", "reader", "operator"])
 def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, name: str) -> None:
-    """Puts of another vehicle, a reader and an operator are denied: as vehicle 1, as an unknown one, as a rejection."""
+    """Another vehicle, a reader and an operator may put neither messages of vehicles 1 and 3 nor a rejection."""
     with join(secure, pki, name) as intruder:
         for vehicle in ("1", "3"):
             publisher = intruder.publisher(VLP, vehicle=vehicle)
@@ -154,7 +154,7 @@ def last_count(peer: Process) -> dict[str, int]:
 
 
 def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Recorder) -> None:
-    """Peers with certificates do not discover each other, and one without finds no peer: no forged message arrives."""
+    """Peers with certificates do not discover each other, nor does a peer without any: no forged message arrives."""
     run = ("--entrypoint", "/opt/nedbus/bin/python")
     listener = secure.run("subscriber", "-c", PEER, "reader", "0", options=run)
     wait_for(lambda: "ready" in listener.out, what=f"the listening peer {listener.err}")
@@ -170,7 +170,7 @@ def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Record
 
 
 def test_only_operators_can_query_the_admin_space(secure: Stack, pki: Path) -> None:
-    """The router's admin space answers operators, but no readers."""
+    """The router's admin space answers operators, but not readers."""
     with join(secure, pki, "operator") as operator, join(secure, pki, "reader") as other:
         wait_for(lambda: [reply.ok for reply in operator._session.get("@/*/router")], what="an answer")
         assert [reply.ok for reply in other._session.get("@/*/router")] == []

@@ -52,8 +52,8 @@ def test_vector_is_encoded_and_decoded(vector: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("vector", cases("decode"))
-def test_other_encoding_of_a_vector_is_decoded(vector: dict[str, Any]) -> None:
-    """Payloads that nedbus does not write have the same values: other layouts and other msgpack types."""
+def test_payload_not_written_by_nedbus_is_decoded(vector: dict[str, Any]) -> None:
+    """Payloads in layouts or msgpack types that nedbus never writes are decoded to the same values."""
     definition = definition_of(vector["message"], FILE["definitions"])
     types = {name: field_type(kind) for name, kind in FILE["definitions"][f"{vector['message']}/{vector['layout']}"]}
     expected = upgrade_with(definition, from_json(vector["values"], types))

@@ -36,7 +36,7 @@ std::uint8_t tag(const Type& type) {
   return (type.base[0] == 'u' ? 0xcc : 0xd0) + step;
 }
 
-// A value of vectors.json: 64-bit integers are texts, and so are NaN and the infinities.
+// A value of vectors.json: 64-bit integers, NaN and the infinities are strings.
 double to_double(const json& value) {
   if (!value.is_string()) return value.get<double>();
   return value == "NaN" ? std::nan("") : value == "Infinity" ? HUGE_VAL : -HUGE_VAL;
@@ -44,7 +44,7 @@ double to_double(const json& value) {
 
 void put_value(Bytes& out, const json& value, const Type& type) {
   if (type.base == "bool") return put(out, value.get<bool>() ? 0xc3 : 0xc2, 1);
-  if (type.base == "char") {  // str 16 of the full length, filled up with NUL
+  if (type.base == "char") {  // str 16 of the full length, padded with NUL
     auto text = value.get<std::string>();
     put(out, 0xda, 1), put(out, type.length, 2);
     text.resize(type.length, '\0');
@@ -92,7 +92,7 @@ json checked(const json& value, const Type& type) {
     auto text = value.get<std::string>();
     text = text.substr(0, text.find('\0'));
     if (text.size() > type.length) fail();
-    const auto dumped = json(text).dump(-1, ' ', false, json::error_handler_t::replace);  // U+FFFD for what is not UTF-8
+    const auto dumped = json(text).dump(-1, ' ', false, json::error_handler_t::replace);  // U+FFFD for invalid UTF-8
     text = json::parse(dumped).get<std::string>();
     for (std::size_t at; (at = text.find("\xef\xbf\xbd")) != std::string::npos;) text.replace(at, 3, "?");
     return text;
@@ -118,7 +118,7 @@ json checked(const json& value, const Type& type) {
 }
 
 json decode(const json& definitions, const std::string& message, const Bytes& payload) {
-  const auto array = json::from_msgpack(payload);  // throws for bytes that are missing, or too many
+  const auto array = json::from_msgpack(payload);  // throws for missing or trailing bytes
   if (!array.is_array() || array.empty() || !array[0].is_number_integer()) throw std::runtime_error("array");
   const auto& fields = definitions.at(message + "/" + array[0].dump());  // throws for an unknown layout
   if (array.size() != fields.size() + 1) throw std::runtime_error("count");

@@ -34,7 +34,7 @@ function decodeValue(value, { base, length }) {
 }
 
 export function decodeMessage(message, payload) {
-  // Texts stay bytes, as they may not be UTF-8, and 64-bit integers become BigInt.
+  // Texts stay bytes, because they may not be UTF-8, and 64-bit integers become BigInt.
   const array = decode(payload, { useBigInt64: true, rawStrings: true });
   const layout = Array.isArray(array) ? array.shift() : undefined;
   if (typeof layout !== "number" && typeof layout !== "bigint") throw new Error("array");
@@ -64,7 +64,7 @@ export function encodeMessage(message, layout, values) {
   const putValue = (value, { base, length }) => {
     if (base === "bool") put("setUint8", 1, value ? 0xc3 : 0xc2);
     else if (base === "char") {
-      put("setUint8", 1, 0xda); // str 16 of the full length, filled up with NUL
+      put("setUint8", 1, 0xda); // str 16 of the full length, padded with NUL
       put("setUint16", 2, length);
       new Uint8Array(view.buffer).set(new TextEncoder().encode(value), offset);
       offset += length;

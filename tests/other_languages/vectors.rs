@@ -22,7 +22,7 @@ fn parse_type(text: &str) -> Result<Type> {
     Ok(Type { base: base.to_string(), length, size, is_array: length > 0 && base != "char" })
 }
 
-// A float of vectors.json: NaN and the infinities are texts.
+// A float of vectors.json: NaN and the infinities are strings.
 fn to_float(value: &Json) -> Result<f64> {
     match value.as_str() {
         Some("NaN") => Ok(f64::NAN),
@@ -32,7 +32,7 @@ fn to_float(value: &Json) -> Result<f64> {
     }
 }
 
-// An integer of vectors.json: those of 64 bits are texts.
+// An integer of vectors.json: 64-bit integers are strings.
 fn to_integer(value: &Json) -> Result<i128> {
     match value.as_str() {
         Some(text) => Ok(text.parse()?),
@@ -44,7 +44,7 @@ fn put_value(out: &mut Vec<u8>, value: &Json, kind: &Type) -> Result<()> {
     match kind.base.as_str() {
         "bool" => out.push(if value.as_bool() == Some(true) { 0xc3 } else { 0xc2 }),
         "char" => {
-            // str 16 of the full length, filled up with NUL
+            // str 16 of the full length, padded with NUL
             let mut text = value.as_str().ok_or("text")?.as_bytes().to_vec();
             text.resize(kind.length, 0);
             out.push(0xda);
@@ -105,7 +105,7 @@ fn checked(value: &Value, kind: &Type) -> Result<Json> {
         return Ok(String::from_utf8_lossy(bytes).replace('\u{fffd}', "?").into());
     }
     if kind.base.starts_with("float") {
-        let number = value.as_f64().ok_or("type")?; // of an integer, too
+        let number = value.as_f64().ok_or("type")?; // also from an integer
         let number = if kind.size == 4 { f64::from(number as f32) } else { number };
         return Ok(match number {
             _ if number.is_nan() => "NaN".into(),
@@ -123,12 +123,12 @@ fn checked(value: &Value, kind: &Type) -> Result<Json> {
     Ok(if bits == 64 { number.to_string().into() } else { Json::from(number as i64) })
 }
 
-// Return the values of a payload; an error if it is to be rejected.
+// Return the values of a payload; an error if the payload is invalid.
 fn decode(definitions: &Json, message: &str, payload: &[u8]) -> Result<Json> {
     let mut rest = payload;
     let Value::Array(array) = rmpv::decode::read_value(&mut rest)? else { return Err("array".into()) };
     if !rest.is_empty() {
-        return Err("bytes behind the array".into());
+        return Err("trailing bytes after the array".into());
     }
     let layout = array.first().and_then(Value::as_u64).ok_or("array")?;
     let fields = definitions[format!("{message}/{layout}")].as_array().ok_or("layout")?;

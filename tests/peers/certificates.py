@@ -56,10 +56,10 @@ def tls_settings(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, P
 
 
 def client_tls(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
-    """Return the same settings for a script."""
+    """Return the TLS settings of `tls_settings` for a script."""
     return nedbus.Tls(*tls_settings(pki, name, ca).values())
 
 
 def tls_options(pki: Path, name: str | None) -> list[str]:
-    """Return the same settings as command-line options."""
+    """Return the TLS settings of `tls_settings` as command-line options."""
     return [f"--{setting.replace('_', '-')}={path}" for setting, path in tls_settings(pki, name).items()]

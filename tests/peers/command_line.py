@@ -68,7 +68,7 @@ def fork_command(
 
 @cache
 def _commands() -> Any:
-    """Return the click command of the app; cached, as it takes 0.1 s to build."""
+    """Return the click command of the app; cached, because it takes 0.1 s to build."""
     return typer.main.get_command(app)
 
 

@@ -13,7 +13,7 @@ from tests.waits import DEADLINE
 
 
 class Listener:
-    """A listening live source: pending messages, all rejections, and the topics it lacks now."""
+    """A listening live source: pending messages, all rejections, and the currently missing topics."""
 
     def __init__(self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None) -> None:
         source = parse_source(text).open_source(vehicle="1", routers=routers)

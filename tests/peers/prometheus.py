@@ -56,7 +56,7 @@ class Prometheus:
         wait_for(self._is_ready, what=f"Prometheus: {self.process.err}")
 
     def alerts(self, name: str, **labels: str) -> list[dict[str, str]]:
-        """Return the labels of the firing instances of an alert, of those with these labels."""
+        """Return the labels of the alert's firing instances that have these labels."""
         firing = [each["labels"] for each in self._get("/api/v1/alerts")["alerts"] if each["state"] == "firing"]
         return [each for each in firing if {"alertname": name, **labels}.items() <= each.items()]
 

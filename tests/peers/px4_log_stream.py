@@ -34,7 +34,7 @@ STREAMS: Final = LOGS.parent / "px4" / "ulog_stream"
 SHORT: Final = Path(__file__).parents[1] / "data" / "log_stream.bin.gz"
 """The header of `ulog_stream_flight1` without parameters and counters, and the 2 s after it.
 
-A short header, because on a very busy machine a long one is refused, as on a slow link.
+The header is short, because on a very busy machine a long one is refused, as on a slow link.
 """
 
 START, STOP = dialect.MAV_CMD_LOGGING_START, dialect.MAV_CMD_LOGGING_STOP
@@ -387,7 +387,7 @@ class Px4LogStream:
             self._answer(START, dialect.MAV_RESULT_TEMPORARILY_REJECTED, request.ids)
         else:
             self._answer(START, dialect.MAV_RESULT_ACCEPTED, request.ids)
-            if request.during_stop or self._unsent:  # its first message is never delivered
+            if request.during_stop or self._unsent:  # the first message of this stream is never delivered
                 self._unsent, self._busy_until = max(0, self._unsent - 1), now + _BLOCKED
             else:
                 self._stream = self._begin(request.ids)

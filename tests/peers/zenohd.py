@@ -30,12 +30,12 @@ def zenohd_path() -> Path:
     if not unpacked.is_dir():
         unpacked.parent.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=unpacked.parent) as folder, tarfile.open(ARCHIVE) as archive:
-            archive.extraction_filter = getattr(tarfile, "data_filter", None)  # Debian's Python 3.11.2 has none
+            archive.extraction_filter = getattr(tarfile, "data_filter", None)  # missing in Debian's Python 3.11.2
             for member in archive:
                 archive.extract(member, folder)
             try:
                 Path(folder, "zenohd").rename(unpacked)
-            except OSError:  # another run was faster
+            except OSError:  # another test process unpacked it first
                 assert unpacked.is_dir()
     return unpacked / "bin" / "zenohd"
 

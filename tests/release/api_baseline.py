@@ -1,8 +1,8 @@
 """Compare the public API with that of the last release: `python -m tests.release.api_baseline [--write]`.
 
-packaging/public_api.pyi.txt has the API of the last release, as stubs, so that neither tags nor history are needed.
-Exits with 1 for a removed name, parameter or return type, unless the version allows it: another major one, or another
-minor one before 1.0. `--write` renews the file, which is part of a release.
+packaging/public_api.pyi.txt contains the API of the last release as stubs, so that neither tags nor history are needed.
+Exits with 1 for a removed name, parameter or return type, unless the major version, or before 1.0 the minor version,
+has changed. `--write` renews the file, which is a step of each release.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from nedbus_msgs import MESSAGES
 ROOT: Final = Path(__file__).parents[2]
 BASELINE: Final = ROOT / "packaging" / "public_api.pyi.txt"
 MODULES: Final = ("nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus_msgs")
-_NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")  # by scripts
+_NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")  # scripts do not make these
 _DECORATORS: Final = ("property", "staticmethod", "classmethod")
 
 
 def main() -> int:
-    """Compare or write."""
+    """Compare the API with the baseline, or write the baseline."""
     if "--write" in sys.argv[1:]:
         BASELINE.write_text(describe_api())
         return 0
@@ -114,7 +114,7 @@ def _parameters(function: griffe.Function) -> Iterator[str]:
 
 
 def compatible_range(version: str) -> list[str]:
-    """Return the parts of a version in which a breaking change is allowed: the major one, and before 1.0 the minor."""
+    """Return the parts that compatible versions share: the major version, and before 1.0 also the minor version."""
     major, minor, *_ = version.split(".")
     return [major] if int(major) else [major, minor]
 

@@ -1,4 +1,4 @@
-"""The comparison of the public API with the last release finds what breaks a script."""
+"""The comparison of the public API with the last release detects changes that break scripts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 import nedbus
 
-pytest.importorskip("griffe")  # of the dependency group `dev`
+pytest.importorskip("griffe")  # part of the dependency group `dev`
 
 from .api_baseline import BASELINE, compatible_range, describe_api, find_breakages
 

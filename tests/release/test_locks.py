@@ -19,7 +19,7 @@ ENVIRONMENTS: Final = [(python, machine) for python in ("3.11", "3.13", "3.14") 
 
 
 def read_lock(name: str) -> dict[str, list[tuple[Requirement, int]]]:
-    """Return by package: its pins, one for each marker, and the number of hashes of each."""
+    """Return the pins of each package, one per marker, and the number of hashes of each pin."""
     pins: dict[str, list[tuple[Requirement, int]]] = {}
     text = re.sub(r"\\\n", " ", (ROOT / "packaging" / f"requirements-{name}.txt").read_text())
     for line in text.splitlines():

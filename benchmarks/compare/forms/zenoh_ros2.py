@@ -20,7 +20,7 @@ OVERRIDE = ";".join(
         'mode="client"',  # the default, peer, would bypass the router
         "listen/endpoints=[]",
         "transport/shared_memory/enabled=false",
-        # its QoS "reliable" does not find CongestionControl in zenoh 1.10 and drops
+        # with QoS "reliable" the SDK does not find CongestionControl in zenoh 1.10, and drops messages
         'qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]',
     ]
 )

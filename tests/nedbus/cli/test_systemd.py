@@ -132,7 +132,7 @@ def test_silent_source_does_not_delay_ready(systemd: Systemd) -> None:
 
 
 def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
-    """Return whether this is a status text with counts, and with a rejected configuration or without."""
+    """Return whether the status text has counts, and reports a rejected configuration if and only if `is_wrong`."""
     return "messages/s" in datagram["STATUS"] and ("configuration rejected" in datagram["STATUS"]) == is_wrong
 
 
@@ -166,7 +166,7 @@ def test_watchdog_is_not_sent_without_ticks(systemd: Systemd) -> None:
     """While the main thread hangs, no WATCHDOG is sent, but the status text is."""
     with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
-        stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # later by ten times the limit
+        stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # sent after ten times the limit
         assert not any("WATCHDOG" in datagram for datagram in stuck)
         notifier.tick()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
@@ -194,9 +194,9 @@ def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event
 def test_watchdog_is_not_sent_while_a_source_is_stuck(
     systemd: Systemd, monkeypatch: pytest.MonkeyPatch, timings: Timings, source: str, method: str
 ) -> None:
-    """While the loop of a source is blocked, no WATCHDOG is sent, although all other threads work."""
+    """While a source's loop is blocked, no WATCHDOG is sent, although all other threads are running."""
     limit = 0.1  # s
-    timings.source_tick = limit / 2  # period of the loop of a source
+    timings.source_tick = limit / 2  # period of a source's loop
     entered, opened = block(monkeypatch, method)
     with notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier), repeating(notifier.tick):
         systemd.receive_until(is_ready)
@@ -207,7 +207,7 @@ def test_watchdog_is_not_sent_while_a_source_is_stuck(
         wait_for(lambda: daemon.busy > 5 * limit, what="several limits")
         with notifier.reloading():
             stuck = systemd.receive_until(lambda datagram: "RELOADING" in datagram)
-        # One may already have been sent at the first reload.
+        # One WATCHDOG may already have been sent at the first reload.
         assert sum("WATCHDOG" in datagram for datagram in stuck) <= 1
         opened.set()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
@@ -258,7 +258,7 @@ def test_client_waits_for_its_router(systemd: Systemd) -> None:
 
 
 def test_client_without_router_is_ready_after_a_timeout(systemd: Systemd) -> None:
-    """A client whose router does not answer sends READY after a timeout, to not delay the boot."""
+    """A client whose router does not answer sends READY after a timeout, so that it does not delay the boot."""
     with notified(systemd, connect=free_endpoint(), patience=0.1):
         assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waiting for a router at tcp/")
 
@@ -275,7 +275,7 @@ def test_notifier_is_inactive_without_notify_socket(address: dict[str, str]) -> 
 
 
 def test_notify_returns_false_if_queue_is_full(systemd: Systemd) -> None:
-    """A notification that systemd cannot accept now returns False and does not block."""
+    """A notification that systemd cannot accept at the moment returns False instead of blocking."""
     accepted = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))  # until the queue is full
     for _ in range(accepted):
         systemd.receive()
@@ -336,7 +336,7 @@ def test_template_unit_differs_only_in_its_file() -> None:
 
 @pytest.mark.process
 def test_reader_unit_expands_options_like_a_shell(tmp_path: Path) -> None:
-    """OPTIONS may compute the name of a recording; the hardening equals that of nedbus.service."""
+    """OPTIONS may contain shell expansions, such as $(date); the hardening is the same as in nedbus.service."""
     text = (UNITS / "nedbus-reader@.service").read_text()
     hardening = text.partition("\nUser=")[2]
     assert hardening == (UNITS / "nedbus.service").read_text().partition("\nUser=")[2]

@@ -45,7 +45,7 @@ HOUR = 3600.0
 
 @pytest.fixture(autouse=True)
 def _short_observation(timings: Timings) -> None:
-    """Shorten the observation; `diagnose` sets its duration."""
+    """Shorten the doctor's timeouts; `diagnose` sets the duration of the observation."""
     timings.min_listen, timings.tls_alert, timings.listen = 0.1, 0.1, 0.5
 
 
@@ -137,7 +137,7 @@ def test_unexpected_error_in_check_is_a_finding(
 
 
 def test_server_that_is_not_a_router_is_wrong(timings: Timings) -> None:
-    """An HTTP server and a server that never answers are not Zenoh routers and do not speak TLS."""
+    """An HTTP server and a server that never answers are reported to speak neither Zenoh nor TLS."""
     timings.doctor_open = timings.handshake = 0.2
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
@@ -173,7 +173,7 @@ def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str
 
 
 def test_two_publishers_of_one_address_are_wrong(bus: nedbus.Bus, endpoint: str) -> None:
-    """Two publishers of one address share a token; the source info of messages or heartbeats distinguishes them."""
+    """Two publishers of one address share a token, but the source info of messages or heartbeats tells them apart."""
     with nedbus.connect(endpoint) as other:
         with publishing(bus), publishing(other):
             find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
@@ -207,7 +207,7 @@ def test_undecodable_payload_is_wrong(zenoh_session: Session, endpoint: str) -> 
 def test_clock_offset_is_wrong(
     zenoh_session: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str
 ) -> None:
-    """With two clocks either may be off; with three the one that disagrees is off, which may be this host's."""
+    """If one of three clocks disagrees, it is wrong, even if it is this host's; of two clocks either may be wrong."""
     with ExitStack() as services:
         for name, offset in clocks.items():
             services.enter_context(service_status(zenoh_session, name, offset=offset))
@@ -258,9 +258,9 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
 
 
 def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, endpoint: str) -> None:
-    """A bad vehicle is wrong, one to watch a warning; a healthy vehicle, or one silent for an hour, has no finding.
+    """A bad vehicle is wrong, a watch vehicle a warning; healthy vehicles, and those silent for an hour, are omitted.
 
-    If two services report a vehicle, the one that receives its messages counts.
+    If two services report a vehicle, only the report of the service that receives its messages counts.
     """
     silent = {"severity": "bad", "text": "no position", "kinds": ["silent"]}
     with (
@@ -444,7 +444,7 @@ def test_invalid_certificate_is_wrong(
 ) -> None:
     """A finding states the reason, which Zenoh omits, and the router's certificate even if no session opens."""
     router, name, ca = case
-    if name != "reader":  # the alert that rejects it may be slow
+    if name != "reader":  # the router's TLS alert may be slow
         timings.tls_alert = DEADLINE
     findings = diagnose(run_router(router), tls=tls_settings(pki, name, ca))
     for check, text in expected.items():
@@ -493,7 +493,7 @@ def test_wrong_protocol_and_wrong_tls_files_are_reported(
 def test_read_and_write_permissions_are_reported(
     run_router: Run, pki: Path, *, client: str, vehicle: str | None, published: str, check: str, state: State, text: str
 ) -> None:
-    """A vehicle may only write, and only as itself; a reader may only read, and detects dropped messages."""
+    """The findings state what the access rules permit a client to read and write, and whose messages are dropped."""
     older = {"@doctor": "@probe"} if client == "older" else {}  # access rules without the probe key
     endpoint, own = run_router(**older), client_tls(pki, "vehicle-1")
     with (

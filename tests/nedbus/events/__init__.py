@@ -1,1 +1,1 @@
-"""Events of a flight, with a fake clock."""
+"""Tests of events, with a fake clock."""

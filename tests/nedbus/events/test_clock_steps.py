@@ -34,7 +34,7 @@ GPS: Final = Address("1", "vehicle_gps_position")
 
 
 class World:
-    """A service, a reader, and their host's clock, which is stepped by `step` seconds `at` a time."""
+    """A service, a reader, and their host's clock, which is stepped by `step` seconds at the time `at`."""
 
     def __init__(self, patch: pytest.MonkeyPatch, step: float, at: float) -> None:
         self.now, self._step, self._at = 0.0, step, at
@@ -118,7 +118,7 @@ _, EXPECTED = fly(0.0, 0.0)
 
 
 def test_service_and_reader_detect_the_expected_events() -> None:
-    """The reference flight has an invalid position with evidence, silence, a reset and losses, in both logs."""
+    """Both logs contain the events of the reference flight: an invalid position with evidence, silence, reset, loss."""
     for events in cast("list[list[dict[str, Any]]]", EXPECTED):
         kinds = {(each["vehicle"], each["kind"], each["change"]) for each in events}
         assert {("1", "xy_invalid", "begin"), ("2", "silent", "begin"), ("2", "silent", "end")} <= kinds
@@ -130,5 +130,5 @@ def test_service_and_reader_detect_the_expected_events() -> None:
 
 @given(step=st.sampled_from([-3600.0, -1.0, 10.0, 3600.0]), at=st.floats(0.0, LENGTH))
 def test_clock_step_does_not_change_events(step: float, at: float) -> None:
-    """A step of the host's clock does not change events or durations, at any time; it only shifts times in reports."""
+    """A step of the host's clock at any time shifts only the times in reports; events and durations stay the same."""
     assert fly(step, at)[1] == EXPECTED

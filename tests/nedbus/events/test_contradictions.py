@@ -22,7 +22,7 @@ def fly(
     flight: Flight, seconds: float, *, up: float = 0.0, north: float = 0.0, baro: float | None = None,
     truth: float | None = None, gps: dict[str, Any] | None = None, missing: tuple[str, ...] = (), **fields: Any,
 ) -> list[Event]:  # fmt: skip
-    """Fly with an estimate off by `up` and `north` from GNSS, and by `baro` and `truth` from other references [m]."""
+    """Fly with an estimate that is off by `up` and `north` from GNSS, by `baro` and `truth` from other sources [m]."""
     reported: list[Event] = []
     for _ in range(round(seconds * 10)):
         reported += flight.wait(0.1).send(missing=missing, **{**ORIGIN, "z": -20.0 - up, "x": north, **fields})
@@ -60,7 +60,7 @@ def test_height_is_contradicted_when_all_references_disagree(flight: Flight) -> 
 
 
 def test_position_is_contradicted_beyond_its_limit(flight: Flight) -> None:
-    """The limit is 4 m plus three times the receiver's accuracy and the distance flown in 0.5 s."""
+    """The limit is the sum of 4 m, three times the receiver's accuracy, and the distance flown in 0.5 s."""
     assert fly(flight, 10.0, north=6.9) == []
     assert fly(flight, 10.0, north=12.0, vx=12.0, x=12.0) == []
     assert fly(flight, 10.0, north=30.0, gps={"eph": 9.0}) == []
@@ -81,7 +81,7 @@ def test_position_is_contradicted_beyond_its_limit(flight: Flight) -> None:
         {"gps": {"fix_type": 0, "satellites_used": 0}},
         {"gps": {"latitude_deg": 0.0, "longitude_deg": 0.0}},
         {"gps": {"epv": 10.0}},
-        {"up": 23.0},  # below 2 x (8 m + 5 % of z + 3 x epv), as there is one reference
+        {"up": 23.0},  # below 2 x (8 m + 5 % of z + 3 x epv), the limit for one reference
         {"xy_global": False, "z_global": False, "ref_lat": float("nan"), "ref_lon": float("nan"),
          "ref_alt": float("nan")},
     ],

@@ -56,7 +56,7 @@ def test_conditions_in_first_message_are_not_events() -> None:
 
 @pytest.mark.parametrize("kind", ["xy", "z", "v_xy", "v_z"])
 def test_invalid_flag_begins_and_ends_condition(flight: Flight, kind: str) -> None:
-    """A validity flag is a bad condition from the message that clears it to the message that sets it."""
+    """A cleared validity flag is a bad condition until a message sets the flag again."""
     begun = flight.wait(0.1).send(**dict[str, Any]({f"{kind}_valid": False}))
     assert brief(begun) == [(f"{kind}_invalid", "begin", "bad")]
     ended = flight.wait(2.5).send()
@@ -121,7 +121,7 @@ def test_reordered_message_is_not_a_reboot(flight: Flight) -> None:
 
 
 def test_silence_is_reported_until_next_position(flight: Flight) -> None:
-    """A vehicle is silent since its last position, gone with its publisher, and recovers with the next position."""
+    """Silence is dated from the last position, turns into gone without a publisher, and ends with the next position."""
     flight.fly(1)
     last = flight.now
     assert flight.wait(2.0).update() == []
@@ -146,7 +146,7 @@ def test_vehicle_without_stream_states_is_silent_after_3_s(flight: Flight) -> No
 
 
 def test_burst_of_losses_is_one_event(flight: Flight) -> None:
-    """A burst of losses is one event with their number, at the time of the first loss."""
+    """A burst of losses is one event with the number of lost messages, at the time of the first loss."""
     flight.wait(1.0).send(lost=2)
     first = flight.now
     flight.wait(1.0).gps()
@@ -185,7 +185,7 @@ def test_consecutive_rejections_are_one_condition(flight: Flight) -> None:
 
 
 def test_vehicle_is_not_silent_while_link_is_down(flight: Flight) -> None:
-    """While the link is down no vehicle becomes silent; the link is an event of all vehicles."""
+    """While the link is down no vehicle becomes silent, and the outage is an event of all vehicles."""
     flight.fly(1)
     flight.link = "no link to tcp/host:7447"
     begun = flight.update()
@@ -237,7 +237,7 @@ def test_flapping_link_is_suppressed(flight: Flight) -> None:
 
 
 def test_overload_ends_after_5_s_without_drops(flight: Flight) -> None:
-    """Drops begin one overload; 5 s without a drop end it, with their number."""
+    """The first drop begins an overload, and 5 s without a drop end it; the end event has the number of drops."""
     assert flight.update(dropped=0) == []
     begun = flight.update(dropped=10)
     assert [(event.vehicle, event.kind, event.change) for event in begun] == [(ALL, "overload", "begin")]
@@ -252,7 +252,7 @@ def test_overload_ends_after_5_s_without_drops(flight: Flight) -> None:
 
 
 def test_overload_is_evidence_for_loss(flight: Flight) -> None:
-    """An active condition of all vehicles is evidence for an event of one, however long ago it began."""
+    """An active condition of all vehicles is evidence for an event of one vehicle, however long ago it began."""
     for dropped in range(1, 31):
         flight.fly(1)
         flight.update(dropped=dropped)
@@ -265,7 +265,7 @@ def test_overload_is_evidence_for_loss(flight: Flight) -> None:
 
 
 def test_battery_warning_is_a_condition(flight: Flight) -> None:
-    """A low battery is watch, a critical one bad; the last warning is active until it is 0."""
+    """A low battery is watch and a critical one bad; a warning is active until the field `warning` is 0."""
     assert flight.wait(1.0).battery(0) == []
     assert brief(flight.wait(1.0).battery(1)) == [("battery", "begin", "watch")]
     critical = flight.wait(1.0).battery(2)
@@ -332,8 +332,8 @@ def test_flags_changed_in_one_message_are_one_event(flight: Flight) -> None:
     assert brief(send()) == [("not_fused", "begin", "watch")]
 
 
-def test_missing_fix_and_reference_are_conditions_once_armed() -> None:
-    """A fix and global reference missing since the first message are conditions since then, but only once armed."""
+def test_missing_fix_and_reference_are_conditions_only_once_armed() -> None:
+    """In an armed vehicle, a fix or global reference missing since the first message is a condition since then."""
     flight, since = Flight(), 100.0
     assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
     assert flight.wait(1.0).status(DISARMED) == []
@@ -464,7 +464,7 @@ def test_new_timestamp_alone_does_not_move_origin() -> None:
 
 
 def test_motion_unexplained_by_velocity_is_a_jump(flight: Flight) -> None:
-    """Unexplained motion over several messages is one jump, reported when it ends; motion by velocity is not."""
+    """Motion that the velocity does not explain is one jump, even over several messages, reported when it ends."""
     for step in range(1, 20):
         assert flight.wait(0.1).send(x=2.0 * step, vx=20.0) == []
     flight = Flight()
@@ -480,7 +480,7 @@ def test_motion_unexplained_by_velocity_is_a_jump(flight: Flight) -> None:
 
 
 def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
-    """A jump that the estimator reports as a reset is a reset with its size."""
+    """A jump with a change of the reset counter is reported as a reset with its size, not as a jump."""
     reported = flight.wait(0.1).send(
         x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0), delta_z=-4.0
     )
@@ -515,7 +515,7 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
 def test_reset_size_is_delta_or_observed_step(
     flight: Flight, seconds: float, fields: dict[str, Any], size: str
 ) -> None:
-    """The size is the delta if both samples agree with it, else their difference minus motion if they are close."""
+    """The size is the delta if both samples agree with it, else their difference minus motion if close in time."""
     reset = next(each for each in flight.wait(seconds).send(**fields) if each.kind == "reset")
     assert reset.text == f"reset of {size}"
 
@@ -538,7 +538,7 @@ def test_flapping_flag_is_reported_after_it_settles(flight: Flight) -> None:
 
 
 def test_flapping_combinations_of_flags_are_suppressed(flight: Flight) -> None:
-    """Flags of one kind that change in new combinations are reported twenty times, then once they settle."""
+    """If flags of one kind keep changing in new combinations, twenty changes are reported, then the settled state."""
     names = list(KINDS["failsafe_flag"].flags)[:8]
     flags: dict[str, Any] = dict.fromkeys(names, False)
     reported = flight.send("failsafe_flags", **flags)
@@ -561,7 +561,7 @@ def test_flapping_of_one_kind_does_not_suppress_another(flight: Flight) -> None:
 
 
 def test_evidence_is_at_most_10_s_old(flight: Flight) -> None:
-    """Events of related kinds up to 10 s before are evidence; older and unrelated ones are not."""
+    """Events of related kinds up to 10 s before are evidence; older and unrelated events are not."""
     flight.gps()
     flight.gps(jamming_indicator=100)
     flight.gps()
@@ -597,7 +597,7 @@ def test_events_of_other_vehicles_are_not_evidence(flight: Flight) -> None:
 
 
 def test_evidence_is_not_nested(flight: Flight) -> None:
-    """Events that are evidence have no evidence themselves, so chains do not grow."""
+    """Events listed as evidence omit their own evidence, so that chains do not grow."""
     flight.gps()
     flight.gps(fix_type=0)
     flight.wait(0.1).send(dead_reckoning=True)
@@ -606,8 +606,8 @@ def test_evidence_is_not_nested(flight: Flight) -> None:
     assert all(each.evidence == () for each in reported[0].evidence)
 
 
-def test_state_is_worst_first(flight: Flight) -> None:
-    """Bad conditions precede watch conditions; a single watch event counts for a minute."""
+def test_state_lists_the_worst_condition_first(flight: Flight) -> None:
+    """Bad conditions precede watch conditions, and a single watch event affects the state for a minute."""
     flight.wait(0.1).send(xy_reset_counter=1, delta_xy=(5.0, 0.0), x=5.0)
     assert (flight.severity, flight.kinds) == ("watch", ["reset"])
     flight.gps()
@@ -652,7 +652,7 @@ def update(event_log: EventLog, now: float, *present: str, link: str = "") -> se
 def test_vehicle_beyond_limit_replaces_longest_gone_one(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A vehicle beyond the limit has no events, which is logged once, until it can replace the longest gone one."""
+    """A vehicle beyond the limit is logged once, and has no events until it replaces the longest gone vehicle."""
     flight = Flight()
     for number in range(MAX_VEHICLES):
         flight.send(vehicle=f"v{number}")
@@ -681,7 +681,7 @@ def test_gone_vehicle_is_forgotten_after_an_hour() -> None:
     assert update(event_log, start + 2 * TIMINGS.forgotten + 2, "here") == {"here"}
     assert {name for name, _ in event_log.counts} == {ALL, "here"}
     assert [each.vehicle for each in event_log.events if each.kind == "xy_invalid"] == ["here", "gone"]
-    event_log.update(start + 9 * TIMINGS.forgotten, {})  # as for a file
+    event_log.update(start + 9 * TIMINGS.forgotten, {})  # without vehicles, as for a file
     assert set(event_log.vehicles) == {"here"}
 
 
@@ -706,7 +706,7 @@ def test_fleet_that_vanishes_at_once_is_remembered() -> None:
 
 
 def test_rejection_reasons_are_not_kept(flight: Flight) -> None:
-    """Reasons of ended rejections are not kept, because each may be different."""
+    """The reasons of ended rejections are discarded, because their number is unlimited."""
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
         flight.wait(6.0).update()
@@ -714,7 +714,7 @@ def test_rejection_reasons_are_not_kept(flight: Flight) -> None:
 
 
 def test_active_condition_precedes_single_events(flight: Flight) -> None:
-    """The state names an active condition before single events of the last minute, and of those the largest."""
+    """The state names an active condition, or if there is none the largest single event of the last minute."""
     flight.send()
     flight.wait(1.0).send(xy_reset_counter=1, delta_xy=(20.0, 0.0), x=20.0)
     flight.wait(1.0).send(xy_reset_counter=2, delta_xy=(3.0, 0.0), x=23.0)

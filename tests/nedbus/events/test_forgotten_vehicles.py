@@ -77,7 +77,7 @@ class World:
 
 
 def test_state_of_vehicles_that_come_and_go_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After hundreds of vehicles, eight at a time, state remains of the last fifty and of the last minute only."""
+    """After hundreds of vehicles, eight at a time, only those of the last minute and fifty more are kept."""
     world = World(monkeypatch)
     sizes = []
     for number in range(240):

@@ -8,7 +8,7 @@ from .flight import Flight
 
 
 def test_causes_are_kinds_in_the_table() -> None:
-    """Each cause of a kind is a kind in the table itself."""
+    """Every cause listed for a kind is itself a kind in the table."""
     for name, kind in KINDS.items():
         assert set(kind.causes) <= set(KINDS), name
 

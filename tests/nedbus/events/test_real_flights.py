@@ -98,7 +98,7 @@ def sizes_of(event: Event) -> Mapping[str, float]:
 def test_events_equal_the_independent_table(name: str) -> None:
     """Events and table rows are the same: kind, change, time within a millisecond, flags and sizes.
 
-    Intended differences: flapping flags are suppressed, and old PX4 names are mapped to those of the newest layout.
+    Intended differences: flapping flags are suppressed, and old PX4 field names are mapped to current ones.
     """
     dropouts = [each.duration / 1e3 for each in ULog(str(path_of(name))).dropouts]  # not in the table
     left = [each for each in events_in(name) if each.kind not in NOT_IN_TABLE]
@@ -195,8 +195,8 @@ def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_conditions_of_the_whole_flight_are_fix_reference_or_position(name: str) -> None:
-    """Conditions active in the first message and never ended are a missing fix, reference or valid position."""
+def test_only_fix_reference_or_position_is_missing_for_a_whole_flight(name: str) -> None:
+    """The only conditions that last a whole flight are a missing fix, global reference or valid position."""
     vehicle = cached_events(name).event_log.vehicles["1"]
     held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
     not_global = {"xy has no global reference", "z has no global reference"}
@@ -207,7 +207,7 @@ def test_conditions_of_the_whole_flight_are_fix_reference_or_position(name: str)
     }.get(name, set())
 
 
-def test_gps_loss_without_gps_topic_has_missing_topics() -> None:
+def test_gps_loss_without_gps_topic_names_missing_topics() -> None:
     """In a log with position and status only, dead reckoning is the evidence, and missing topics are named."""
     only = why("gps_loss")
     assert [each.what for each in only] == ["xy and vxy not valid"]
@@ -240,7 +240,7 @@ def test_gps_loss_with_all_topics_has_gps_evidence() -> None:
 
 
 def test_stories_at_a_time_are_those_active_then() -> None:
-    """At a given time, the stories are those active then, bad or not, else the last one before."""
+    """`at` selects the stories active at that time, bad or not, or if there are none the last one before it."""
     assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
     assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
     assert [each.what for each in why("gps_loss", at=36.0)] == ["failsafe"]
@@ -264,8 +264,8 @@ def test_primary_ekf_changes_are_events() -> None:
 def test_only_one_log_has_a_contradicted_estimate(name: str) -> None:
     """Only one log has a contradicted estimate: height 27 m below GNSS and barometer, and position 6 to 9 m off.
 
-    In the other logs no valid estimate is off for as long: 92 m for half a second in twelve_messages, 3 m in gps_loss,
-    and from the barometer alone 16 m in fast flight and 6 m at takeoff.
+    In the other logs no valid estimate is off by enough for long enough: 92 m for half a second in twelve_messages,
+    3 m in gps_loss, and from the barometer alone 16 m in fast flight and 6 m at takeoff.
     """
     events = [each for each in events_in(name) if each.kind.endswith("_contradicted")]
     right = [
@@ -278,7 +278,7 @@ def test_only_one_log_has_a_contradicted_estimate(name: str) -> None:
 
 
 def test_contradicted_height_has_evidence_and_reset() -> None:
-    """The story of a diverged height has its evidence, the contradicted position, and the reset that ended it."""
+    """The story of a diverged height contains its evidence, the contradicted position, and the reset that ended it."""
     height = next(each for each in why("nxp_v0_ekf_failure") if each.begin and each.begin.kind == "height_contradicted")
     assert [each for each in short(height.before) if each[0] != "text"] == [
         ("dead_reckoning", 116.238), ("estimator_fault", 116.609),
@@ -290,7 +290,7 @@ def test_contradicted_height_has_evidence_and_reset() -> None:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_px4_texts_are_events(name: str) -> None:
-    """Each text in a table made with pyulog is exactly one event with its time and words.
+    """Each text in a table made with pyulog is exactly one event with the same time and words.
 
     A text logged in two forms is one event. A failed check that PX4 repeats because another check has changed is an
     event only the first time.

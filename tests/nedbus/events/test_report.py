@@ -88,7 +88,7 @@ def test_story_from_report_equals_that_of_service() -> None:
 
 
 def test_report_has_all_events_of_its_period() -> None:
-    """A report has all kept events of the period, and none for a period of NaN."""
+    """A report contains all kept events of the period, and no events for a period of NaN."""
     flight = Flight()
     for number in range(1500):
         flight.wait(0.1).status(ARMED, nav_state=number % 3)
@@ -114,7 +114,7 @@ def test_large_report_is_sent_in_parts() -> None:
 
 
 def test_large_status_is_split_by_source() -> None:
-    """A status is split between sources; a single source that is too large loses the health of its streams."""
+    """A large status is split between sources; a single source that is too large omits the health of its streams."""
     address = f"{'v' * 60}/{VLP}"
     stream = StreamStatus(address, StreamHealth(VLP).snapshot(0))
     sources = tuple(SourceStatus(f"ulog:{number}", addresses=(address,) * 100) for number in range(100))
@@ -144,12 +144,12 @@ def test_vehicle_with_too_large_report_is_omitted(caplog: pytest.LogCaptureFixtu
     ],
 )  # fmt: skip
 def test_malformed_reply_returns_none(content: object) -> None:
-    """A reply that is not a report is None."""
+    """Parsing a reply that is not a report returns None."""
     assert from_json(content) is None
 
 
 def test_deeply_nested_reply_returns_none() -> None:
-    """A reply with deeply nested evidence is None, not an error."""
+    """Parsing deeply nested evidence returns None instead of raising."""
     event: dict[str, Any] = {
         "vehicle": "1", "kind": "jump", "change": "once", "severity": "info", "text": "", "time": 0.0
     }  # fmt: skip
@@ -159,7 +159,7 @@ def test_deeply_nested_reply_returns_none() -> None:
 
 
 def test_reply_beyond_limits_returns_none() -> None:
-    """A reply with more events or vehicles than a service sends is None."""
+    """Parsing a reply with more events or vehicles than a service sends returns None."""
     event = asdict(Event("1", "jump", "once", "info", "", 0.0))
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
     assert from_json(content | {"events": [event] * (KEPT + 1)}) is None
@@ -178,7 +178,7 @@ json_values = st.recursive(
 
 @given(st.sampled_from(["events", "vehicles", "now", "service", "host"]), json_values)
 def test_any_reply_returns_a_report_or_none(name: str, value: object) -> None:
-    """Any reply is a report or None, and stories and faults of the report can be computed."""
+    """Parsing any reply returns None, or a report whose stories and faults can be computed."""
     content = json.loads(json.dumps(asdict(report(flying(xy_valid=False)))))
     read = from_json(content | {name: value})
     if read is not None:
@@ -199,7 +199,7 @@ def test_vehicles_are_listed_worst_first() -> None:
 
 
 def test_healthy_vehicle_has_no_fault() -> None:
-    """A vehicle that sends has no fault unless a criterion is violated."""
+    """A vehicle that is sending has no fault unless it violates a criterion."""
     assert faults_of([report(flying())], NOTHING) == []
     expected = Expectation(("1",), 1, ("xy", "z", "vxy", "vz"), 60.0)
     assert faults_of([report(flying())], expected) == []
@@ -221,7 +221,7 @@ def test_silent_vehicle_is_a_fault_for_an_hour() -> None:
 
 
 def test_vehicle_received_by_one_service_is_not_missing() -> None:
-    """A vehicle gone for one service but received by another has no fault, in any order of replies."""
+    """A vehicle gone for one service but received by another has no fault, whatever the order of the replies."""
     lost, found = flying(), flying()
     lost.wait(10.0).update("gone")
     reports = [report(lost, service="a"), report(found, service="b")]
@@ -231,7 +231,7 @@ def test_vehicle_received_by_one_service_is_not_missing() -> None:
 
 
 def test_missing_vehicles_are_faults() -> None:
-    """Missing vehicles are faults, by name or by number; vehicles published by scripts count."""
+    """Missing vehicles are faults, by name or by number; vehicles published by scripts count as present."""
     one = report(flying())
     assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
@@ -249,7 +249,7 @@ def test_other_hosts_are_not_checked() -> None:
 
 
 def test_invalid_flags_are_one_fault_since_the_first() -> None:
-    """All invalid flags of a vehicle are one line with the time of the first, not of another condition."""
+    """The invalid flags of a vehicle are one fault since the first of them, not since an earlier failsafe."""
     flight = Flight()
     flight.send()
     flight.status(ARMED, failsafe=True)

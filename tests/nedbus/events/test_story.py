@@ -76,8 +76,8 @@ def test_reboot_ends_a_story() -> None:
     ]  # fmt: skip
 
 
-def test_end_of_one_flag_does_not_end_another() -> None:
-    """The end of a fault from the first message does not end one that began later."""
+def test_end_of_one_fault_does_not_end_another() -> None:
+    """The end of a fault present in the first message does not end a fault that began later."""
     flight = Flight()
     flight.send()
     flags: dict[str, Any] = {"cs_baro_fault": True, "fs_bad_hdg": False}
@@ -87,8 +87,8 @@ def test_end_of_one_flag_does_not_end_another() -> None:
     assert [(each.what, each.until) for each in why(flight)] == [("EKF fault: heading", None)]
 
 
-def test_watch_condition_is_a_story_without_bad_one() -> None:
-    """A watch condition is a story only if there is no bad one, or at a given time."""
+def test_watch_condition_is_a_story_if_none_is_bad() -> None:
+    """A watch condition is a story if no condition is bad, or if `at` selects its time."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -106,7 +106,7 @@ def test_watch_condition_is_a_story_without_bad_one() -> None:
 
 
 def test_active_watch_condition_is_a_story_after_ended_fault() -> None:
-    """A watch condition that is active now is a story, even after a bad one that has ended."""
+    """A watch condition that is active now is a story, even after a bad condition that has ended."""
     flight = Flight()
     lose_gps(flight)
     recover(flight)
@@ -155,7 +155,7 @@ EVENING = datetime(2026, 11, 22, 23, 59, 50, tzinfo=UTC).timestamp()
     ],
 )  # fmt: skip
 def test_time_is_parsed(text: str, step: float) -> None:
-    """A time of day is the closest one, even across midnight; a number is seconds since boot."""
+    """A time of day selects its closest occurrence, even across midnight; a number is seconds since boot."""
     live, event = Times(is_live=True), event_at(EVENING, boot=100.0)
     assert live.find(text, event) - event.time == pytest.approx(step, abs=1e-3)
     of_file, event = Times(offsets={"1": EVENING - 100.0}), event_at(40.0, boot=100.0)

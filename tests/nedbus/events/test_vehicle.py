@@ -56,7 +56,7 @@ def test_flags_not_provided_are_neither_valid_nor_invalid(vehicle: SimpleVehicle
 
 
 def test_gone_vehicle_that_resumes_is_not_silent(vehicle: SimpleVehicle) -> None:
-    """After a vehicle was silent, then gone, and has resumed, no story is active."""
+    """When a vehicle resumes after it was silent and then gone, no story stays active."""
     vehicle.send(0.0)
     vehicle.event_log.update(4.0, {MAIN: "stale"})
     vehicle.event_log.update(8.0, {MAIN: "gone"})
@@ -80,7 +80,7 @@ def test_conditions_of_superseded_stream_end(vehicle: SimpleVehicle) -> None:
 
 
 def test_removed_battery_ends_its_warning(vehicle: SimpleVehicle) -> None:
-    """Removing a battery ends its warning; the next battery has none until it reports one."""
+    """Removing a battery ends its warning; the next battery has no warning until it reports one."""
     vehicle.send(0.0, "battery_status", 0, warning=0, connected=True)
     vehicle.send(1.0, "battery_status", 0, warning=2, connected=True)
     assert vehicle.state(1.0) == "bad"
@@ -91,7 +91,7 @@ def test_removed_battery_ends_its_warning(vehicle: SimpleVehicle) -> None:
 
 
 def test_damaged_timestamp_is_not_a_reboot(vehicle: SimpleVehicle) -> None:
-    """A single message far ahead in time, as in a damaged log, does not make the next one a reboot."""
+    """After a single message far ahead in time, as in a damaged log, the next message is not a reboot."""
     for second in range(5):
         vehicle.send(float(second), xy_valid=second < 3)
     vehicle.send(5.0, timestamp=9 * 10**18, xy_valid=False)
@@ -245,8 +245,8 @@ def test_fault_of_other_ekf_is_info_with_its_instance(vehicle: SimpleVehicle) ->
     assert vehicle.event_log.vehicles["1"].state(100.0).conditions == ()
 
 
-def test_primary_ekf_without_selector_is_found_by_estimate(vehicle: SimpleVehicle) -> None:
-    """Without a selector, the EKF whose estimate alone equals the vehicle's is primary."""
+def test_primary_ekf_without_selector_is_identified_by_its_estimate(vehicle: SimpleVehicle) -> None:
+    """Without a selector, the primary EKF is the only one whose estimate equals the vehicle's."""
     for time, other in ((0.0, 0.0), (1.0, 5.0), (2.0, 6.0)):
         for instance, x in ((0, other), (1, time)):
             vehicle.send(time, "estimator_local_position", instance, timestamp_sample=round(1e6 * time), x=x)

@@ -100,7 +100,7 @@ def px4_text(flight: Flight, words: str, level: int = 4) -> None:
 
 
 def test_evidence_of_end_is_later_than_begin() -> None:
-    """A GPS fix regained before the position became invalid does not explain its end, nor does a PX4 text."""
+    """Neither a GPS fix regained before the position became invalid nor a PX4 text explains the end of the fault."""
     flight = Flight()
     flight.gps(fix_type=0)
     flight.fly(1)
@@ -157,7 +157,7 @@ def condition_of(kind: str, flag: str, words: str, since: float = 0.0) -> Condit
 
 
 def test_conditions_of_whole_flight_are_one_fault() -> None:
-    """Conditions active for a whole flight are one fault, and evidence if the position was never valid."""
+    """Conditions active for a whole flight form one fault, or are its evidence if the position was never valid."""
     conditions = [
         condition_of("gps_fix_lost", "", "no GPS fix"),
         condition_of("xy_not_global", "xy_global", "xy has no global reference", 0.1),

@@ -1,1 +1,1 @@
-"""Metrics and health over HTTP."""
+"""Tests of metrics and health over HTTP."""

@@ -47,7 +47,7 @@ def others() -> Iterator[tuple[HttpClient, HttpClient]]:
 
 
 def test_unknown_path_returns_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
-    """404 and / list the available pages; a page that raises is 500, is logged, and does not stop the server."""
+    """404 and / list the available pages; a page that raises returns 500, is logged, and does not stop the server."""
     assert server.request("/other") == (404, "available pages: /page, /fails, /waits\n")
     assert server.request("/")[0] == 200
     assert server.request("/fails") == (500, "unexpected error: see the log\n")
@@ -56,7 +56,7 @@ def test_unknown_path_returns_404_and_failing_page_500(server: HttpClient, caplo
 
 
 def test_only_get_and_head_are_allowed(server: HttpClient) -> None:
-    """Other methods than GET and HEAD are 501; HEAD returns the headers of GET without content."""
+    """Methods other than GET and HEAD return 501; HEAD returns the headers of GET without content."""
     for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"):
         assert server.request("/page", method)[0] == 501, method
     assert server.request("/page", "HEAD") == (200, "")
@@ -88,9 +88,9 @@ def test_only_get_and_head_are_allowed(server: HttpClient) -> None:
 def test_foreign_host_header_is_forbidden(
     others: tuple[HttpClient, HttpClient], host: str, status: int, elsewhere: int
 ) -> None:
-    """A page whose host name is rebound to this server cannot read the status, and on loopback nothing at all.
+    """A foreign site that rebinds its DNS name to this host cannot read /status, or anything from a loopback server.
 
-    On other interfaces, metrics, health, readiness and vehicles are served under any name.
+    A server on all interfaces serves metrics, health, readiness and vehicles under any host name.
     """
     local, public = others
     for path in PATHS:
@@ -129,7 +129,7 @@ def test_malformed_requests_are_rejected(
     ids=["no request", "half a request", "byte by byte", "response not read"],
 )
 def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes) -> None:
-    """While 16 clients stall in sending or reading, a new client is served once a stalled one times out."""
+    """While 16 clients stall in sending or reading, a new client is served once a stalled client times out."""
     timings.http_client = 0.5
     large = Page.text("x" * 20_000_000)  # exceeds the socket buffers
     server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})
@@ -151,7 +151,7 @@ def test_slow_clients_time_out(timings: Timings, sent: bytes, each_second: bytes
 
 
 def test_close_does_not_wait_for_clients(timings: Timings) -> None:
-    """The server closes at once while 16 clients do not read responses and another one is queued."""
+    """The server closes at once while 16 clients do not read their responses and another client is queued."""
     timings.http_client = 10_000.0  # far beyond the deadline of this test
     made = threading.Semaphore(0)
 
@@ -170,7 +170,7 @@ def test_close_does_not_wait_for_clients(timings: Timings) -> None:
 
 
 def test_client_beyond_thread_limit_waits(server: HttpClient) -> None:
-    """While 16 clients are served, another one waits; all get their responses."""
+    """While 16 clients are served, another client waits; all clients get their responses."""
     with ThreadPoolExecutor(17) as pool:
         answers = []
         for _ in range(16):  # sequential: a client that has not yet sent its request may be disconnected

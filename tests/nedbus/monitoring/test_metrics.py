@@ -135,7 +135,7 @@ def test_exporter_measures_loss_latency_and_invalid_payloads(
 
 
 def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
-    """/vehicles is 200 with a line for each healthy vehicle, and no condition is exported."""
+    """/vehicles returns 200 with a line for each healthy vehicle, and no condition is exported."""
     times = range(100_000, 300_000_000, 100_000)
     well = write_log(tmp_path / "well.ulg", times, **VALID)
     serve(f"ulog:{well}?vehicle=7")
@@ -146,7 +146,7 @@ def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: HttpClient,
 
 
 def test_bad_vehicle_returns_503_on_vehicles_page_only(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
-    """A bad vehicle makes /vehicles 503 and is in the metrics; /healthz and /readyz of the service stay 200."""
+    """For a bad vehicle /vehicles returns 503 and a metric is exported; /healthz and /readyz still return 200."""
     times = range(100_000, 300_000_000, 100_000)
     logs = {
         "lost": write_log(tmp_path / "lost.ulg", times, **{**VALID, "xy_valid": False, "dead_reckoning": True}),
@@ -224,7 +224,7 @@ def test_metrics_pass_promtool_check(serve: Serve, pages: HttpClient, start: Sta
 
 
 def test_rejections_are_counted_by_rule(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
-    """Rejections are counted by violated rule; the sum is the count of the source."""
+    """Rejections are counted by violated rule, and the counts add up to the total of the source."""
     log = tmp_path / "flight.ulg"
     writer = UlogWriter()
     writer.define([VLP])
@@ -252,7 +252,7 @@ def test_sources_with_equal_text_have_unique_series(serve: Serve, pages: HttpCli
 
 
 def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
-    """/readyz is 503 with a line for each failed source and each silent live source; /healthz stays 200.
+    """/readyz returns 503 with a line for each failed and each silent live source; /healthz still returns 200.
 
     A replay that waits for a reader is ready.
     """
@@ -266,7 +266,7 @@ def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: HttpClient, t
 
 
 def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_nedbus: Start, pages: HttpClient) -> None:
-    """/readyz is 503 before the router starts, 200 while it runs, and 503 after it has ended."""
+    """/readyz returns 503 before the router starts, 200 while it runs, and 503 after it has ended."""
     where, exported = free_endpoint(), HttpClient(free_port())
     serve("sim:", connect=where)
     assert pages.request("/readyz") == (503, f"the service is starting: {where}\n")
@@ -285,7 +285,7 @@ def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_ned
 def test_missing_prometheus_client_returns_501_with_install_hint(
     start: Start, pages: HttpClient, endpoint: str
 ) -> None:
-    """Without prometheus-client, /metrics is 501 with the extra to install; the other pages work."""
+    """Without prometheus-client, /metrics returns 501 and names the extra to install; the other pages work."""
     start("-c", WITHOUT_CLIENT, "serve", "-c", endpoint, "-s", "sim:", "--http", pages.where)
     wait_for(lambda: pages.request("/readyz")[0] == 200, what="the service")
     status, text = pages.request("/metrics")
@@ -349,7 +349,7 @@ def test_streams_beyond_limit_are_summed_by_source() -> None:
 
 
 def test_positions_are_exported_before_other_streams() -> None:
-    """Positions have series beyond the limit; streams without a nominal rate have no age."""
+    """Positions keep their series when the limit is exceeded; streams without a nominal rate have no age."""
     many = [*streams(2, "home_position"), *streams(MAX_STREAMS, "battery_status"), *streams(3)]
     families = {each.name: each for each in stream_metrics(many, messages="nedbus_messages_received")}
     topics = Counter(sample.labels["topic"] for sample in families["nedbus_messages_received"].samples)
@@ -360,7 +360,7 @@ def test_positions_are_exported_before_other_streams() -> None:
 
 
 def test_labels_are_escaped() -> None:
-    """A source with quotes and line breaks is one label value; the page also has process metrics."""
+    """Quotes and line breaks in a source are escaped in its label; the page also has process metrics."""
     source = 'ulog:a"b\\c\nd{}é'
     strange = replace(streams(1)[0], labels=("v0", VLP, source), latencies=Histogram((0.001, 1.0)))
     families = stream_metrics([*streams(3), strange], messages="nedbus_messages_received")
@@ -372,7 +372,7 @@ def test_labels_are_escaped() -> None:
 
 
 def test_blocked_source_is_not_healthy(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """/healthz is 503 when one message has blocked a source for 20 s: only a restart helps."""
+    """/healthz returns 503 when one message has blocked a source for 20 s, because only a restart helps."""
     pages = service_pages(Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0"))
     assert pages["/healthz"]() == Page.text("ok")
     monkeypatch.setattr(Daemon, "busy", 20.0)

@@ -98,7 +98,7 @@ def shorten(rules: str) -> str:
 def test_every_alert_fires_and_clears(
     start: Start, run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
-    """Each alert fires for its cause, has labels that name it, and clears when the cause ends.
+    """Each alert fires for its cause, names the cause in its labels, and clears when the cause ends.
 
     All causes are present at the same time; the packaged rules have shortened times.
     """
@@ -163,7 +163,7 @@ def test_every_alert_fires_and_clears(
         of_gone = f'nedbus_messages_received_total{{instance="{exporter}", vehicle="gone"}} > 10'
         wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=TIMEOUT)
         bad.set()
-        for _ in range(6):  # plus two of the exporter: eight of ten
+        for _ in range(6):  # with the exporter's two sessions, eight of ten
             crowd.enter_context(nedbus.connect(small))
         router.kill()
         to_end.kill()
@@ -255,10 +255,10 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
         ),
     ],
 )
-def test_rules_fire_after_their_time(
+def test_rules_fire_only_after_their_duration(
     start: Start, tmp_path: Path, name: str, series: str, times: dict[str, bool]
 ) -> None:
-    """With unchanged times rules do not fire too early or without a fault."""
+    """With unchanged times the rules fire neither too early nor without a fault."""
     inputs = []
     for each in series.split("; "):
         metric, _, values = each.rpartition("} ") if "}" in each else each.partition(" ")
@@ -279,7 +279,7 @@ def test_rules_fire_after_their_time(
 
 
 def test_rules_and_scrape_configuration_are_valid(start: Start) -> None:
-    """Promtool accepts both; each rule has a severity, a summary and a description."""
+    """Rules and scrape configuration pass promtool; each rule has a severity, a summary and a description."""
     for arguments in (("rules", str(ALERTS)), ("config", str(ALERTS.with_name("prometheus.yml")))):
         promtool = start_promtool(start, "check", *arguments)
         assert promtool.wait() == 0, promtool.err
@@ -315,5 +315,5 @@ def test_dashboard_and_rules_use_existing_metrics(
     exposed = {each["__name__"] for each, _ in prometheus.query('{__name__!=""}')}
     used = set(re.findall(r"\b(?:nedbus|process)_\w+", " ".join([*queries, ALERTS.read_text()])))
     without = {"nedbus_messages_rejected_total", "nedbus_vehicle_refused"}  # only with a fault or TLS
-    assert used - exposed - {"nedbus_vehicle_condition"} == without  # the simulation has it at times
+    assert used - exposed - {"nedbus_vehicle_condition"} == without  # exported by the simulation only at times
     assert len(used) > 20

@@ -67,7 +67,7 @@ def write_image(folder: Path, *, world: str | None, size: tuple[int, int] = (40,
 
 @pytest.mark.parametrize("suffix", [".pgw", ".wld"])
 def test_image_is_placed_by_its_world_file(tmp_path: Path, suffix: str) -> None:
-    """The world file has the centre of the first pixel; the image is north up, its first row is the northernmost."""
+    """The world file locates the centre of the first pixel; the image is north up, with the northernmost row first."""
     file = write_image(tmp_path, world=WORLD)
     file.with_suffix(".pgw").rename(file.with_suffix(suffix))
     background = Background(file)
@@ -81,7 +81,7 @@ def test_image_is_placed_by_its_world_file(tmp_path: Path, suffix: str) -> None:
 
 
 def test_large_image_is_scaled_down(tmp_path: Path) -> None:
-    """A browser gets at most 2,000 pixels per side."""
+    """An image sent to the browser has at most 2,000 pixels per side."""
     file = write_image(tmp_path, world=WORLD, size=(5000, 40))
     assert max(Background(file).pixels.shape) == 2000
 

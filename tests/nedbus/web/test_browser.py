@@ -279,7 +279,7 @@ def test_viewers_are_independent(url: str, tab: Open, fly: Fly, zenoh_session: S
     assert first.page.title() == "(1 bad) nedbus"
 
     def tap() -> bool:
-        second.tap(30, 30)  # a map that is being redrawn ignores it
+        second.tap(30, 30)  # a map ignores taps while it is redrawn
         with suppress(AssertionError):
             wait_for(lambda: second.chosen == ["b"], what="the selection", seconds=3)
         return second.chosen == ["b"]

@@ -134,7 +134,7 @@ def test_since_is_the_start_of_the_state(sim: SimulatedFleet) -> None:
 
 
 def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:
-    """Without a link vehicles keep their last state, have no current position, and the snapshot contains an alarm."""
+    """Without a link vehicles keep their last states but have no positions, and the snapshot contains an alarm."""
     sim.fly(3)
     sim.time += 60
     row = sim.vehicle(alive=[], link="no link to tcp/ground:7447")
@@ -186,7 +186,7 @@ def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypat
 
 
 def test_position_replaces_other_streams_at_the_limit(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit, a new position stream replaces a stream of another topic; streams of other topics replace none."""
+    """At the limit, a new position stream replaces a stream of another topic; no other new stream does."""
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
     attitude, battery = Address("wing", "vehicle_attitude"), Address("wing", "battery_status", 0)
     sim.fly(2, attitude, battery)
@@ -275,7 +275,7 @@ def test_reset_adds_a_gap_to_the_history(sim: SimulatedFleet) -> None:
 
 
 def test_history_has_ten_points_per_second(sim: SimulatedFleet) -> None:
-    """At 100 Hz the history covers a minute and has each flag change; the long history has about a point per second."""
+    """At 100 Hz the history covers a minute with every flag change; the long history has about one point per second."""
     sim.fly(2, rate=100)
     minute, long = sim.stream().minute, sim.stream().long
     assert 18 <= minute.written <= 22
@@ -343,7 +343,7 @@ def test_position_error_requires_a_common_frame(sim: SimulatedFleet) -> None:
 
 
 def test_formatted_time_names_its_clock() -> None:
-    """Live times are UTC; in a recording UTC if known, else since boot for a single vehicle, else since its start."""
+    """Live times are UTC; recordings use UTC if known, else time since boot for one vehicle, else since their start."""
     recorded = EventTimeline(EventLog(), times=Times())
     assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_clock("1", 70.0, 10.0)

@@ -231,7 +231,7 @@ def test_invalid_time_in_the_url_is_ignored(recording: Recording) -> None:
         assert 0 <= open_page(recording, query=query).player.time <= recording.length
 
 
-@pytest.mark.slow  # test_viewer.py has the same for a live page
+@pytest.mark.slow  # test_viewer.py tests the same on a live page
 @pytest.mark.usefixtures("clock")
 def test_malformed_actions_leave_the_recording_playable(recording: Recording) -> None:
     """No action, index or time from a browser breaks the page or moves the position outside the recording."""
@@ -249,7 +249,7 @@ def test_malformed_actions_leave_the_recording_playable(recording: Recording) ->
 
 
 def test_only_timestamps_of_other_topics_are_kept(tmp_path: Path, clock: SimpleNamespace) -> None:
-    """Topics other than positions and status topics have a rate and an age; only their timestamps are in memory."""
+    """Only the timestamps of topics other than position and status are kept, for their rate and age."""
     file = write_flight(tmp_path, {VLP: lambda _: {}, "vehicle_attitude": lambda _: {}}, seconds=20)
     opened = Recording(file)
     wait_for(lambda: opened.length > 19.8, what="the recording")

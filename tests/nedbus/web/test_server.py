@@ -78,7 +78,7 @@ def is_answered(url: str, origin: str) -> bool:
 
 
 def test_foreign_hosts_and_origins_are_refused(url: str) -> None:
-    """A page of another site, even one whose name resolves to this host, gets neither page, WebSocket nor metrics."""
+    """A page of another site, even if its name resolves to this host, gets no page, no WebSocket and no metrics."""
     host = url.removeprefix("http://")
     for path in PATHS:
         assert status_of(url + path) == 200
@@ -133,7 +133,7 @@ def test_oversized_websocket_message_closes_the_connection(url: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
 def test_page_above_the_viewer_limit_shows_a_notice(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """A page above the limit of open pages, 1 here, shows only a notice."""
+    """A page beyond the maximum number of open pages, here 1, shows only a notice."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for text in ("a word", "limit of 1 open pages reached: close one"):
         session = pull_session(url=url)
@@ -154,7 +154,7 @@ def test_cross_site_subresources_are_refused(url: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
 def test_requests_without_websocket_do_not_count_as_viewers(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
-    """Ten requests without a WebSocket do not use up the limit of one page; their pages are also limited."""
+    """Pages requested without opening a WebSocket do not count as viewers, but have a separate limit."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
     for _ in range(10):
         assert status_of(url) == 200

@@ -136,7 +136,7 @@ def test_tracks_send_only_new_points(sim: SimulatedFleet) -> None:
 
 
 def test_points_per_track_shrink_with_the_number_of_tracks(sim: SimulatedFleet) -> None:
-    """With 200 vehicles a track has one point per second, so a browser draws no more points than with 20."""
+    """With 200 vehicles a track has one point per second, so a browser draws no more points than with 20 vehicles."""
     sim.fly(0.1, *[Address(f"v{number}", VLP) for number in range(200)])
     tracks = Tracks()
     tracks.update(tracks_of(sim))
@@ -176,7 +176,7 @@ def sources(page: RenderedPage) -> list[ColumnDataSource]:
 
 
 def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
-    """The selected vehicle has a line about its ULog stream, whose text comes from a peer and is escaped."""
+    """A line describes the ULog stream of the selected vehicle; its text comes from a peer and is escaped."""
     page = Page(sim)
     sim.fly(3)
     page.refresh()
@@ -249,7 +249,7 @@ def test_overloaded_page_is_reported_in_the_header(sim: SimulatedFleet) -> None:
 
 
 def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet) -> None:
-    """The table of streams has their rate and state; a vehicle without a position has no marker."""
+    """The table of streams shows their rates and states; a vehicle without a position has no marker."""
     attitude, battery = Address("wing", "vehicle_attitude"), Address("far", "battery_status", 0)
     sim.fly(3, WING, attitude, battery, x=4.0)
     page = Page(sim)
@@ -271,7 +271,7 @@ def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet)
 
 
 def test_status_values_are_in_row_and_tiles(sim: SimulatedFleet) -> None:
-    """The row has mode, battery and GPS; the tiles also have the arming state."""
+    """The row shows mode, battery and GPS; the tiles also show the arming state."""
     sim.fly(2, x=-0.01, heading=-0.001)
     sim.add(Address("wing", "vehicle_status"), nav_state=4, arming_state=2)
     sim.add(Address("wing", "battery_status", 0), remaining=0.5)
@@ -307,8 +307,8 @@ def test_values_of_silent_streams_show_their_age(sim: SimulatedFleet) -> None:
         assert f'<span>{name}</span><b class="quiet">{text}</b> <small>35 min ago</small>' in page.panel("nums")
 
 
-def test_slow_stream_is_named_below_the_numbers(sim: SimulatedFleet) -> None:
-    """If a position arrives below half its usual rate, both rates are shown below the numbers."""
+def test_rates_of_a_slow_stream_are_shown_below_the_numbers(sim: SimulatedFleet) -> None:
+    """If positions arrive at less than half the usual rate, both rates are shown below the numbers."""
     sim.fly(20, rate=20)
     sim.fly(3, rate=5)
     page = Page(sim)
@@ -317,7 +317,7 @@ def test_slow_stream_is_named_below_the_numbers(sim: SimulatedFleet) -> None:
 
 
 def test_story_explains_the_displayed_state(sim: SimulatedFleet) -> None:
-    """With several active conditions, the story explains the one in badge and list, whichever began first."""
+    """With several active conditions, the story explains the one shown in badge and list, whichever began first."""
     gps = Address("wing", "sensor_gps", 0)
     for seconds, state, fields in ((5, 1, {}), (5, 3, {}), (5, 3, {"dead_reckoning": True})):
         for _ in range(seconds):
@@ -373,7 +373,7 @@ def test_selection_survives_reordering(sim: SimulatedFleet) -> None:
 
 
 def test_search_filters_by_name_and_state(sim: SimulatedFleet) -> None:
-    """The list has the vehicles whose name or state contains the search text; counts and map show all."""
+    """The list shows the vehicles whose name or state contains the search text; counts and map show all vehicles."""
     sim.fly(3, WING, Address("wind", VLP), QUAD)
     sim.fly(3, Address("wind", VLP), QUAD, xy_valid=False)
     page = Page(sim)
@@ -467,7 +467,7 @@ def frame_of(page: Page) -> tuple[list[float], list[float]]:
 
 
 def test_map_fits_all_vehicles_or_follows_one(sim: SimulatedFleet) -> None:
-    """The map shows at least 20 m: all vehicles with trails, the selected one in the centre, or only its trail."""
+    """The map shows all vehicles with trails, or the selected one centred, or its whole trail, and at least 20 m."""
     sim.fly(3, WING)
     page = Page(sim)
     east, north = frame_of(page)
@@ -543,7 +543,7 @@ def test_trail_length_toggles_between_one_and_fifteen_minutes(sim: SimulatedFlee
 
 
 def test_timeline_counts_hidden_vehicles(sim: SimulatedFleet) -> None:
-    """The selected vehicle and those with faults come first; of 50 vehicles, the last row counts those hidden."""
+    """The selected vehicle and those with faults come first; with 50 vehicles, the last row counts the hidden ones."""
     addresses = [Address(f"uav-{number}", VLP) for number in range(1, 51)]
     sim.fly(1, *addresses)
     sim.fly(1, addresses[29], xy_valid=False)
@@ -589,7 +589,7 @@ def test_timeline_begins_with_the_first_event(sim: SimulatedFleet) -> None:
 
 @pytest.fixture
 def faulty_fleet(sim: SimulatedFleet) -> SimulatedFleet:
-    """Return two vehicles: xy of "wing" was invalid for 4 s, 200 s ago, and reset 50 s ago; "quad" dead reckoned."""
+    """Return two vehicles: xy of "wing" was invalid 200 s ago, and reset 50 s ago; "quad" was dead reckoning."""
     sim.fly(30.04, WING, QUAD)
     for seconds, wing, quad in (
         (4, {"xy_valid": False}, {}), (96, {}, {}), (4, {}, {"dead_reckoning": True}), (46, {}, {}),
@@ -665,7 +665,7 @@ def test_keys_step_through_events(faulty_fleet: SimulatedFleet) -> None:
 
 @pytest.mark.parametrize("event", ["xy not valid", "reset", None])
 def test_url_restores_the_page(faulty_fleet: SimulatedFleet, event: str | None) -> None:
-    """A page opened with the URL of another has the same vehicle, view, theme, moment and verdict."""
+    """A page opened with another page's URL shows the same vehicle, view, theme, moment and verdict."""
     page = Page(faulty_fleet, query="?theme=light")
     page.send("vehicle", "wing")
     page.send("focus:follow")
@@ -739,7 +739,7 @@ def test_malformed_input_from_the_browser_is_ignored(faulty_fleet: SimulatedFlee
     for start, end in ranges:
         for plot in figures:
             for name, value in (("start", start), ("end", end)):
-                with suppress(ValueError):  # Bokeh rejects it from a browser, too
+                with suppress(ValueError):  # Bokeh also rejects it from a browser
                     setattr(cast("Any", plot).x_range, name, value)
         page.update()
     for drawn in ("", "x", "-5", "1e9", "9" * 6000, "²", "NaN"):

@@ -18,20 +18,20 @@ ROOT = Path(__file__).parents[4]
 
 
 def check(*arguments: object, command: tuple[str, ...] = ("check",)) -> list[str]:
-    """Return the lines of a check that finds mistakes."""
+    """Run a check that must find mistakes, and return its lines on stderr."""
     checked = run_command(*command, *map(str, arguments))
     assert (checked.exit_code, checked.out) == (2, "")
     return [line.removeprefix("nedbus: ") for line in checked.err.splitlines()]
 
 
 def passes(*arguments: object) -> bool:
-    """Return whether a check finds no mistake."""
+    """Run a check, and return whether it finds no mistakes."""
     checked = run_command(*map(str, arguments))
     return (checked.exit_code, checked.out, checked.err) == (0, "no mistakes found\n", "")
 
 
 def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
-    """Each setting and list item is checked even if others are wrong; a source reports its first mistake."""
+    """Each setting and list item is checked even if others are wrong, but only a source's first mistake is reported."""
     file, closed = tmp_path / "nedbus.toml", free_endpoint()
     file.write_text(
         'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\n'
@@ -64,7 +64,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
 
 
 def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
-    """Options and environment variables are still checked; settings possibly in the file are not reported missing."""
+    """Options and variables are still checked, but settings that the file may contain are not reported missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
     for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
@@ -76,7 +76,7 @@ def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
 
 
 def test_two_sources_with_the_same_address_are_reported(tmp_path: Path) -> None:
-    """Replays, and live sources with a named vehicle, must not publish an address of another source."""
+    """No replay, and no live source with a named vehicle, may publish an address of another source."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
@@ -113,7 +113,7 @@ def test_router_config_named_in_settings_is_checked(tmp_path: Path) -> None:
 
 
 def test_mistakes_in_source_tables_are_reported_with_line(tmp_path: Path) -> None:
-    """An unknown option is reported at its line; a missing log at its table, but not with --offline."""
+    """An unknown option is reported at its line, and a missing log at its table unless --offline is given."""
     file = tmp_path / "nedbus.toml"
     file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
     wrong = f"{file}, line 3, column 1: source 'sim:?sed=1': unknown option 'sed'"
@@ -146,7 +146,7 @@ def test_invalid_endpoint_in_router_file_is_reported_with_position(
     assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [True, True], mistakes
 
 
-def test_router_files_are_parsed_like_zenohd(tmp_path: Path, endpoint: str) -> None:
+def test_router_files_are_parsed_as_zenohd_does(tmp_path: Path, endpoint: str) -> None:
     """Syntax errors, unknown keys and missing files are reported; the shipped files and a valid setup pass."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
     broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')
@@ -186,7 +186,7 @@ def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
 
 
 def test_missing_cryptography_package_is_a_warning(start: Start, tmp_path: Path) -> None:
-    """Without `cryptography` the expiry is not checked: a warning, not a mistake in the settings."""
+    """Without `cryptography` the check warns that it cannot verify expiry dates, but reports no mistake."""
     make_authority(tmp_path / "pki")
     settings = tmp_path / "nedbus.toml"
     settings.write_text(f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n')

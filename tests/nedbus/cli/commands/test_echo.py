@@ -1,4 +1,4 @@
-"""`nedbus echo`: its output, its exit codes, and the effect of a blocked one on a replay."""
+"""`nedbus echo`: its output, its exit codes, and the effect of blocked output on a replay."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def echo(endpoint: str, *options: str) -> CommandResult:
 
 
 class Paused(NamedTuple):
-    """`nedbus echo` with a full pipe as stdout, which is not read before `resume`."""
+    """`nedbus echo` blocked by a full stdout pipe, which is not read until `resume`."""
 
     process: ForkedProcess
     is_full: Callable[[], bool]
@@ -70,7 +70,7 @@ def pause_echo(
         process = fork_command(fork_server, "echo", "-c", endpoint, "--json", *options, out=write_end)
         os.close(write_end)
 
-        def is_full() -> bool:  # the next line blocks the process
+        def is_full() -> bool:  # writing another line blocks the process
             unread = struct.unpack("i", fcntl.ioctl(output, termios.FIONREAD, bytes(4)))[0]
             return bool(unread > capacity - LINE)
 
@@ -148,7 +148,7 @@ def test_closed_pipe_exits_with_0(simulation: str, fork_server: ForkServer) -> N
 
 
 def test_echo_prints_counts_at_exit(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """Lost messages and invalid payloads are counted on stderr at exit."""
+    """At exit, stderr reports the numbers of lost messages and invalid payloads."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     process = run_nedbus("echo", "-c", endpoint, "-n", "2")
@@ -161,7 +161,7 @@ def test_echo_prints_counts_at_exit(run_nedbus: Start, endpoint: str, bus: nedbu
 
 
 def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Timings) -> None:
-    """`echo` marks an old last message as old, and `hz` does not measure it."""
+    """`echo` marks a last message beyond the age limit as old, and `hz` does not count it."""
     timings.old = 0.01
     bus.publisher(VLP, vehicle="1").publish(message(1))
     wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
@@ -174,9 +174,9 @@ def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Tim
 def test_blocked_echo_does_not_delay_a_replay(
     run_nedbus: Start, endpoint: str, pause_echo: Callable[..., AbstractContextManager[Paused]]
 ) -> None:
-    """A replay at speed=max ends while the output of an echo is blocked, as echo subscribes with mode "latest".
+    """A replay at speed=max ends while `echo` is blocked, because `echo` subscribes in mode "latest".
 
-    With --every the replay waits until that output is read.
+    With --every the replay waits until the output of `echo` is read.
     """
     replay = ("serve", "--connect", endpoint, "--until-done", "-s", REPLAY)
     with pause_echo() as paused:
@@ -221,7 +221,7 @@ def test_echo_csv_has_a_row_per_message(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
-    """Every row of a position has its state, whatever fields are selected; stderr counts the missing messages."""
+    """Every position row includes its state, whatever fields are selected; the message counts follow on stderr."""
     bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
     result = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
     [row] = csv.DictReader(result.out.splitlines())

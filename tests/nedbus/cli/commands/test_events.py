@@ -86,8 +86,8 @@ def lines_of(result: CommandResult) -> list[tuple[str, str, str]]:
     return [(match[1], match[2] or "", match[3]) for match in found if match]
 
 
-def test_events_of_a_file_have_evidence(log: Path) -> None:
-    """One line per event with its evidence; stderr names the clock of the times."""
+def test_each_event_of_a_file_is_one_line_with_evidence(log: Path) -> None:
+    """Each event is one line with its evidence, and stderr names the clock of the event times."""
     result = run_command("events", str(log))
     assert (result.exit_code, result.err) == (0, "times: seconds since boot, no message contains UTC\n")
     assert lines_of(result) == EXPECTED_EVENTS
@@ -102,12 +102,12 @@ def test_severity_selects_events(log: Path, severity: str, count: int) -> None:
 
 @pytest.mark.parametrize(("origin", "count"), [("nedbus", 6), ("px4", 0), ("*", 6)])
 def test_origin_selects_events(log: Path, origin: str, count: int) -> None:
-    """--origin selects PX4's own texts, none in this log, or the events that nedbus derives."""
+    """--origin selects PX4's own texts, which this log lacks, or the events that nedbus derives."""
     assert len(run_command("events", str(log), "--origin", origin).out.splitlines()) == count
 
 
 def test_json_and_csv_events_have_every_field(log: Path) -> None:
-    """Both formats have every field; JSON contains no NaN, and CSV has one cell each for evidence and numbers."""
+    """Both formats include every field: JSON without NaN, CSV with one cell each for evidence and numbers."""
 
     def refuse(constant: str) -> None:
         pytest.fail(f"{constant} is not valid JSON")
@@ -131,7 +131,7 @@ def test_json_and_csv_events_have_every_field(log: Path) -> None:
 
 
 def test_converted_log_has_the_same_events(log: Path, tmp_path: Path) -> None:
-    """A log converted to MCAP has the same events."""
+    """A log converted to MCAP yields the same events."""
     assert run_command("convert", str(log), "flight.mcap").exit_code == 0
     assert lines_of(run_command("events", "flight.mcap")) == EXPECTED_EVENTS
     assert "'nedbus record' without --topic" in run_command("why", "flight.mcap", "--all").out
@@ -142,7 +142,7 @@ def test_converted_log_has_the_same_events(log: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("read_once")
 def test_real_flight_has_expected_events() -> None:
-    """A log of PX4 1.17 and the MCAP converted from it have the same events, with causes."""
+    """A log of PX4 1.17 and its MCAP conversion yield the same events, with causes."""
     assert run_command("convert", str(REAL), "flight.mcap", "--topics", "*").exit_code == 0
 
     def events_of(file: str) -> list[tuple[str, str, str]]:
@@ -165,7 +165,7 @@ def test_real_flight_has_expected_events() -> None:
 
 
 def test_why_prints_verdict_and_faults(log: Path) -> None:
-    """`why` prints the verdict; --all also each fault with the preceding events and the topics missing in the log."""
+    """`why` prints the verdict; --all adds each fault with the events before it, and topics missing from the log."""
     result = run_command("why", str(log))
     assert (result.exit_code, result.out, result.err) == (0, VERDICT, "--all shows 1 fault in detail\n")
     result = run_command("why", str(log), "--all")
@@ -196,7 +196,7 @@ def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.usefixtures("read_once")
 def test_why_at_accepts_utc_and_seconds() -> None:
-    """--at with UTC, and with the same time since boot, print the same."""
+    """--at prints the same for a UTC time and for the equivalent time since boot."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
     assert "GPS fix lost: 3D to none, satellites 10 to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
     for moment in ("27.557", "+27.325"):
@@ -298,7 +298,7 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
 def test_why_live_uses_service_history(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path
 ) -> None:
-    """`why` uses the history of a service for all or one vehicle; a vehicle published by a script has no history."""
+    """`why` uses a service's history, for all vehicles or one; no service keeps the history of a script's vehicle."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
     result = run_command("why", "-c", endpoint)
@@ -317,7 +317,7 @@ def test_why_live_uses_service_history(
     begin = rf"1: not usable: {fault}\. Evidence: {clock} dead reckoning\. Not in .*"
     assert re.match(rf"{begin}\n\n1: {fault}\n  before it\n", result.out)
     assert "to publish them, add them to PX4's dds_topics.yaml" in result.out
-    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # when it ended
+    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--all", "--at", "12")  # end of the fault
     assert set(result.out.splitlines()) <= set(since_boot.out.splitlines())
     refused = run_command("why", "-c", endpoint, "-v", "1", "--at", "+3")
     assert (refused.exit_code, "--at: '+3': live data has no start" in refused.err) == (2, True)
@@ -332,7 +332,7 @@ def test_why_live_uses_service_history(
 
 
 def test_why_live_reports_initial_faults(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
-    """A vehicle that has been invalid since the service started is reported as not usable."""
+    """A vehicle whose position has been invalid since the service started is reported as not usable."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(1, 50):
@@ -357,7 +357,7 @@ def test_events_within_shows_the_history(run_nedbus: Start, bus: nedbus.Bus, end
 
 
 def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
-    """A service keeps PX4's own texts; `events --within` and `why` show them as from a file."""
+    """A service keeps PX4's own texts, and `events --within` and `why` show them as they do for a file."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 60):
@@ -468,7 +468,7 @@ def test_every_event_kind_is_documented() -> None:
 
 
 def test_file_suffix_is_case_insensitive(log: Path, tmp_path: Path) -> None:
-    """Every command reads FLIGHT.ULG, as on an SD card formatted as FAT, and FLIGHT.MCAP."""
+    """Every command accepts uppercase suffixes: FLIGHT.ULG, as on a FAT-formatted SD card, and FLIGHT.MCAP."""
     flight, converted = tmp_path / "FLIGHT.ULG", tmp_path / "FLIGHT.MCAP"
     flight.write_bytes(log.read_bytes())
     for arguments in (["convert", flight, converted], ["plot", flight, "-o", tmp_path / "A.PNG"], ["plot", converted]):

@@ -55,7 +55,7 @@ def wait_for_state(daemon: Daemon, state: str) -> None:
 
 
 def test_service_without_vehicles_is_not_healthy(endpoint: str, health: Health) -> None:
-    """A service whose sources work but have received no vehicle is not healthy."""
+    """A service is not healthy if its sources work but have not received any vehicle."""
     source = f"mavlink:udpin:127.0.0.1:{free_port()}"
     with serving(endpoint, source) as daemon:
         wait_for_state(daemon, "waiting")
@@ -138,7 +138,7 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
 
 
 def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
-    """--valid checks the current flags, --within past events; stderr gets one line per fault, --json lists all."""
+    """--valid checks current flags and --within past events; stderr has one line per fault, and --json lists all."""
     writer = UlogWriter()
     writer.define([VLP])
     for tenth in range(10, 60):
@@ -166,7 +166,7 @@ def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: H
 
 
 def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
-    """A silent vehicle is a fault without any option; --expect and --vehicle can select others."""
+    """By default every silent vehicle is a fault; --expect and --vehicle restrict the check to other vehicles."""
     with serving(endpoint, "sim:") as daemon:
         wait_for(lambda: health().exit_code == 0, what="health")
         daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time() - 100)

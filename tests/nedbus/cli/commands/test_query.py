@@ -99,7 +99,7 @@ def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatc
     assert sum(str(each.address) in listed.out for each in publishers) == 1
 
 
-def test_late_list_is_not_reported_as_empty(
+def test_list_is_not_reported_as_empty_before_the_router_replies(
     bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
     """Before the router has replied, `list` does not claim that no vehicle is published."""
@@ -118,7 +118,7 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -
     measured: list[dict[str, Any]] = []
 
     def is_near() -> bool:
-        """Measure; return whether a rate is near 100 Hz, which takes several attempts on a busy machine."""
+        """Measure the rate, and return whether it is near 100 Hz; a busy machine needs several attempts."""
         result = run_command("hz", "-c", simulation, "-d", "2.1", "--json", "-t", VLP)
         assert result.exit_code == 0, result.err
         measured[:] = [json.loads(line) for line in result.out.splitlines()]
@@ -143,7 +143,7 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -
 
 @pytest.mark.process
 def test_get_shows_the_last_message(simulation: str) -> None:
-    """`get` prints all fields of the last message, by default vehicle_local_position; without one it exits with 1."""
+    """`get` prints all fields of the last message, by default of vehicle_local_position, or exits with 1."""
 
     def get(*arguments: str) -> str:
         got = run_command("get", "-c", simulation, *arguments)
@@ -178,10 +178,10 @@ def test_schema_needs_no_network() -> None:
     assert [layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)] == list(LAYOUTS)
 
 
-def test_no_data_yet_is_reported(
+def test_absence_of_vehicles_is_reported(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """Without a published vehicle, `list` reports that and exits, and `echo` reports it and waits."""
+    """If no vehicle is published, `list` and `echo` print a notice; `list` then exits, and `echo` waits."""
     listed = run_command("list", "-c", endpoint)
     assert (listed.exit_code, listed.out, "no vehicle is published" in listed.err) == (0, "", True)
     notice = follow.write_notice
@@ -273,7 +273,7 @@ def test_invalid_option_exits_with_2(endpoint: str, arguments: list[str], text: 
     ids=" ".join,
 )
 def test_http_option_is_identical_in_all_commands(endpoint: str, arguments: list[str]) -> None:
-    """Every command that serves HTTP or a WebSocket has --http, and validates it before it connects."""
+    """Every command that serves HTTP or a WebSocket accepts --http, and validates the address before it connects."""
     assert run_command(*arguments, NEDBUS_CONNECT=endpoint).exit_code == 2
     wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=free_endpoint())
     assert wrong.exit_code == 2

@@ -73,7 +73,7 @@ def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
 
 
 def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
-    """Return the events that a log call may have."""
+    """Return the events that a log call may emit."""
     extras = [value for each in call.keywords if each.arg == "extra" for value in values_of(each.value, tree)]
     assert extras, f"line {call.lineno} has no event: extra=about(...)"
     assert all(is_about(each) for each in extras), f"line {call.lineno}: extra is not about(...)"
@@ -94,7 +94,7 @@ def test_log_calls_use_exactly_the_documented_events() -> None:
 
 
 def test_documented_log_limits_match_the_code() -> None:
-    """docs/operate.md has the rate limits of the code, and names existing events."""
+    """docs/operate.md states the rate limits of the code, and every event it names exists."""
     section = (ROOT / "docs" / "operate.md").read_text().partition("\n## Logs\n")[2]
     named = re.findall(r"^\| ((?:`[a-z_]+`(?:, )?)+) \| [a-z ]", section, re.MULTILINE)
     events = {each for names in named for each in re.findall(r"`([a-z_]+)`", names)} & EVENTS.keys()
@@ -104,7 +104,7 @@ def test_documented_log_limits_match_the_code() -> None:
 
 
 def test_json_line_escapes_text_of_peers() -> None:
-    """A line is one JSON object of printable ASCII, whatever a peer sent; only a missing event is null."""
+    """A line is one JSON object in printable ASCII, whatever a peer sent; only the event can be null."""
     address = Address("7", "estimator_local_position", 2)
     extra = about("rejected", address, source=EVIL, reason=EVIL * 1000)
     line = JsonFormatter().format(record("%s: rejected", EVIL * 1000, about=extra["about"], created=1.5))
@@ -123,7 +123,7 @@ def test_json_line_escapes_text_of_peers() -> None:
 
 
 def test_json_traceback_is_one_string() -> None:
-    """A traceback in JSON is one string; a long one keeps its end, which names the error."""
+    """A traceback in JSON is one string; a long traceback keeps its end, which names the error."""
     try:
         raise ValueError("x" * 100_000 + EVIL + "the end")
     except ValueError:
@@ -149,7 +149,7 @@ def test_journal_lines_have_syslog_priorities() -> None:
 
 
 def test_service_logs_json(start: Start) -> None:
-    """Each line of a service is a JSON object with an event, and with the source if there is one.
+    """Each line of a service is a JSON object with an event, and with the source if a source logged it.
 
     Notices to the user are objects as well; the suggested commands are omitted.
     """
@@ -248,7 +248,7 @@ def test_flood_is_rate_limited() -> None:
 
 
 def test_each_kind_of_line_has_its_own_limit() -> None:
-    """A flood does not suppress lines of other events and texts; lifecycle events are never limited."""
+    """A flood does not suppress lines with other events or texts, and lifecycle events are never limited."""
     limited = Limited()
     limited.flood(1000)
     assert limited.flood(3, "%s is back", event="stream_resumed") == 3
@@ -274,14 +274,14 @@ def test_suppressed_lines_are_reported_after_a_flood() -> None:
 
 
 def test_lines_of_other_packages_are_limited() -> None:
-    """Lines without an event are limited by their text; above a number of distinct texts all others share a limit."""
+    """Lines without an event are limited per text; beyond the maximum number of texts, all others share one limit."""
     limited = Limited()
     assert limited.flood(1000, event=None) == BURST
     assert sum(limited.flood(1, f"text {number} %s", event=None) for number in range(5000)) <= 1000 + BURST
 
 
 def test_report_of_suppressed_lines_is_an_event() -> None:
-    """A report of suppressed lines has their number, event and level."""
+    """A report of suppressed lines states their number, event and level."""
     reports: list[logging.LogRecord] = []
     limit = RateLimit(reports.append, now=lambda: 0.0)
     for _ in range(BURST + 3):
@@ -322,7 +322,7 @@ def test_flood_of_invalid_payloads_is_rate_limited(run_nedbus: Start, endpoint: 
     echo.signal(signal.SIGINT)
     assert echo.wait() == 130
     total = count_lines(echo.err, time.monotonic() - start)
-    assert total["invalid"] == 100  # keys; further ones are only counted
+    assert total["invalid"] == 100  # limit of logged keys; further keys are only counted
 
 
 def test_log_of_flapping_vehicles_is_rate_limited(

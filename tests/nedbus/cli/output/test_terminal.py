@@ -61,7 +61,7 @@ ROWS = [
 
 @pytest.mark.parametrize("width", [30, 40, 64, 80, 110])
 def test_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    """Lines fit; optional columns are removed first, then names are folded."""
+    """No line is wider than the terminal: optional columns are removed first, then names are folded."""
     monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: width)
     lines = to_table(HEAD, ROWS, optional=OPTIONAL).splitlines()
     assert all(len(line) <= width for line in lines)
@@ -72,7 +72,7 @@ def test_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, width: int) ->
 
 
 def test_table_without_rows_prints_only_its_header() -> None:
-    """Before the first message a table is only its header."""
+    """Before the first message a table consists of its header only."""
     assert to_table(HEAD, [], optional=OPTIONAL).split() == list(HEAD)
 
 
@@ -106,7 +106,7 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
 
 
 def test_narrow_terminal_removes_columns_in_order(lines: Callable[[int], Lines]) -> None:
-    """A narrower terminal removes eph, then heading, then velocity, but never position, doubts and loss."""
+    """As the terminal gets narrower, eph, heading and velocity disappear in this order; all other columns stay."""
     one = sample(nedbus.Address("1", VLP))
     seen: list[list[str]] = []
     for width in range(150, 87, -1):
@@ -122,7 +122,7 @@ def test_narrow_terminal_removes_columns_in_order(lines: Callable[[int], Lines])
 
 
 def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
-    """A heading comes first, once per screenful, and when the columns change; every state is below STATE."""
+    """The heading is repeated once per screenful and when the columns change, and every state is below STATE."""
     to_line, with_heading, state = lines(150), [], 0
     for number in range(80):
         *head, line = to_line(sample(nedbus.Address("1" if number < 40 else "wing", VLP))).splitlines()
@@ -182,7 +182,7 @@ def on_terminal(fork_server: ForkServer) -> OnTerminal:
 
 @contextmanager
 def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
-    """Publish topics of landed vehicles."""
+    """Publish valid messages of these vehicles and topics until the block ends."""
     publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
 
     def publish() -> None:
@@ -211,7 +211,7 @@ def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbu
 
 @pytest.mark.process
 def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_session: Session) -> None:
-    """The table has the number of gone streams; their addresses follow below it, and are not split on a terminal."""
+    """The table shows the number of gone streams; their addresses are listed below it, unsplit on a terminal."""
     gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
     sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
     service = answer(zenoh_session, "nedbus/@service/s/status", {"service": "s", "sources": sources})
@@ -371,7 +371,7 @@ def test_malicious_keys_are_escaped(endpoint: str, zenoh_session: Session) -> No
 def test_hz_limits_rows(endpoint: str, bus: nedbus.Bus) -> None:
     """For 100 vehicles `hz` prints 50 rows per second, and the number of omitted vehicles."""
     with publishing(bus, *(f"flood-{number}" for number in range(100))):
-        hz = run_command("hz", "-c", endpoint, "-n", "1000")  # each vehicle has sent by then
+        hz = run_command("hz", "-c", endpoint, "-n", "1000")  # by then each vehicle has sent a message
     assert hz.exit_code == 0
     assert "\n50 more\n" in hz.out
     assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
@@ -414,7 +414,7 @@ MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz"
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports after that of nedbus.cli; 10,000 are all
+@pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports between nedbus.cli and the signal; 10,000: all
 def test_interrupt_during_imports_prints_no_traceback(endpoint: str, command: str, imports: int) -> None:
     """Ctrl-C at any time after the start of `main` ends without a traceback, with 130 in a shell."""
     environment = without_coverage() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
@@ -509,7 +509,7 @@ run.run_until_stopped(work, closing=closing)
 def test_hanging_command_is_terminated_after_timeout(
     start: Start, number: signal.Signals, exit_code: int, limit: str, reason: str
 ) -> None:
-    """Work and the closing of a session have a timeout each; the log names the one that expired."""
+    """A command's work and the closing of its session each have a timeout, and the log names the one that expired."""
     endless = start("-c", ENDLESS.replace("LIMIT", limit), coverage=False)
     wait_for(lambda: "started" in endless.out, what="the start")
     endless.signal(number)
