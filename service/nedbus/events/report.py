@@ -24,7 +24,7 @@ _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, kinds of all.
+    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, all kinds.
 
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
@@ -106,7 +106,7 @@ def joined(parts: Sequence[AccountReport]) -> AccountReport:
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
-    """Return one report per vehicle, worst vehicle first, preferably from a service that receives its messages."""
+    """Return one report per vehicle, worst vehicle first, preferably from a service that receives the vehicle."""
     found: dict[str, AccountReport] = {}
     for report in reports:
         for name in report.vehicles:
