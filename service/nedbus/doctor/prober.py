@@ -1,4 +1,4 @@
-"""Probes of endpoints, routers and certificates; `nedbus check` uses all but those that open a session."""
+"""Probes of endpoints, routers and certificates; `nedbus check` uses all except those that open a session."""
 
 import socket
 import ssl

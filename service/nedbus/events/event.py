@@ -16,7 +16,7 @@ WINDOW: Final = 10.0
 """Seconds before an event in which others count as evidence; the start of an active condition always counts."""
 
 ALL: Final = "*"
-"""Vehicle name of events that concern all vehicles: those of the router link and of the reader."""
+"""Vehicle name in events that concern all vehicles: events of the router link and of the reader."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
 """Time on the event log's clock [s]; the bounds validate reports from peers."""

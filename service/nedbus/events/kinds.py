@@ -180,7 +180,7 @@ class _Kinds(dict[str, Kind]):
 
 
 KINDS: Final = _Kinds({kind.name: kind for kind in _ROWS})
-"""All kinds of events by name, the most important first; unknown names, as from a newer service, get a default kind."""
+"""All kinds of events by name, most important first; a name unknown to this version gets a default kind."""
 
 
 def importance(kind: str) -> int:

@@ -116,7 +116,7 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 
 
 def from_json(content: object) -> AccountReport | None:
-    """Validate the reply of a peer; return None if it is not a report, as from an older service."""
+    """Validate the reply of a peer; return None if it is not a report, for example from an older service."""
     try:
         return _REPORT.validate_python(content)
     except ValidationError:

@@ -196,7 +196,7 @@ def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Float
 
 
 def _stamps(stream: str, messages: MessageArray) -> _Ints:
-    """Return the timestamps [us]; raise ConfigError if they restart, as after a reboot of the vehicle."""
+    """Return the timestamps [us]; raise ConfigError if they restart, for example after a reboot."""
     stamps: _Ints = np.minimum(messages["timestamp"], 2**62).astype(np.int64)
     late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
     early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])

@@ -117,7 +117,7 @@ class Player:
         self._feed()
 
     def toggle(self, *, pause: bool = False) -> None:
-        """Toggle between play and pause; with `pause`, pause."""
+        """Toggle between play and pause; if `pause` is true, only pause."""
         self._play.active = not (pause or self._play.active)
 
     def seek(self, seconds: float) -> None:

@@ -138,7 +138,7 @@ class _Check:
             yield f"the newest message is {age} old, from vehicle {name}: the limit is {self._max_age:g} s"
 
     def vehicle_faults(self) -> Iterator[str]:
-        """Yield the faults of vehicles: those that services report, and of answering vehicles without a service."""
+        """Yield the faults of vehicles that services report, and of vehicles that answer without a service."""
         expected = self._expected
         others = [
             sample

@@ -33,7 +33,7 @@ ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tupl
 
 
 class TextFormatter(logging.Formatter):
-    """Format a record as one printable line, plus those of a traceback."""
+    """Format a record as one printable line, followed by the lines of a traceback."""
 
     def __init__(self, style: str = "%(asctime)s %(levelname)-7s %(message)s") -> None:
         super().__init__(style, _DATE)
