@@ -39,9 +39,9 @@ def define(
     meanings: Mapping[str, str] = {},
     rules: Sequence[Rule] = (),
 ) -> Definition[Message]:
-    """Define a message that is not built in, from a log, a .msg file or a publisher; `fields`: in CDR order.
+    """Define a message that is not built in, from a log, a .msg file or a publisher.
 
-    `meanings`: unit and meaning of fields, by name.
+    `fields`: names and types, in CDR order. `meanings`: unit and meaning of fields, by name.
 
     Raises ValueError for an invalid name, a missing timestamp, too many fields or too many bytes.
     """

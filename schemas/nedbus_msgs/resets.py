@@ -1,9 +1,9 @@
 """Compute a continuous track of a stream despite estimator resets, from the deltas and reset counters of its messages.
 
-When an estimator corrects itself, its position jumps, and the message holds the delta.
+When an estimator corrects itself, its position jumps, and the message contains the delta.
 A delta explains a jump only if its counter rose by exactly one since the previous message.
 A new origin also counts as a reset, but its delta may describe a jump that did not happen, so it is checked against
-the values. Source: real logs, in one of which `delta_z` is -179.5 m and z moved by 2 mm.
+the values. Source: real logs; in one of them `delta_z` is -179.5 m, although z moved by 2 mm.
 """
 
 import math
@@ -110,7 +110,7 @@ def _point(message: Message, fields: Iterable[str]) -> Point:
 
 
 def _delta(name: Quantity, message: Message, count: int) -> Point | None:
-    """Return the delta of a single reset; None if there were several, or the delta is not provided."""
+    """Return the delta of a single reset; None after several resets, or if the delta is not provided."""
     delta = getattr(message, f"delta_{name}")
     jump: Point = delta if isinstance(delta, tuple) else (delta,)
     return jump if count == 1 and all(map(math.isfinite, jump)) else None

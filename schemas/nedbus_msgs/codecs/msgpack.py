@@ -125,7 +125,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
             raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
 
     def decode_full_width(payload: bytes) -> Values | None:
-        """Decode a payload as `encode` writes it; return None for any other, which `decode_any` handles."""
+        """Decode a payload in the form that `encode` writes; return None for any other, which `decode_any` decodes."""
         if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
             return None
         # The tags prove type and range of every value; only the rules are left to check.

@@ -158,7 +158,7 @@ class VehicleLocalPosition(Message):
 def describe_flags(shares: Mapping[str, float]) -> str:
     """Describe the flags that cast doubt on messages, given each flag's share of messages with it set (0 to 1).
 
-    "xy z invalid, dead reckoning" applies to all messages, "xy invalid 20 %" to some of them; "ok" if there is none.
+    "xy z invalid, dead reckoning" applies to all messages, "xy invalid 20 %" to some; "ok" means that no flag is bad.
     A flag without a share is unknown: "vz unknown", or "validity unknown" if all are.
     """
     bad = {name: 1.0 - shares[name] for name in _VALID if name in shares}
@@ -178,5 +178,5 @@ def describe_flags(shares: Mapping[str, float]) -> str:
 
 
 def message_doubts(message: VehicleLocalPosition, missing: Collection[str] = ()) -> str:
-    """Describe the flags that cast doubt on one message, which lacks the `missing` fields; "ok" if there is none."""
+    """Describe the flags that cast doubt on one message, which lacks the `missing` fields; "ok" if none does."""
     return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS if name not in missing})

@@ -24,10 +24,10 @@ class Topic:
     """One uORB topic.
 
     `rate`: nominal rate at which PX4 publishes or logs it [Hz]; 0 if there is none.
-    `doc`: its publisher.
-    `on_change`: True if PX4 publishes it on change, so bursts and pauses are normal; False if it does so at `rate`.
+    `doc`: the component that publishes it.
+    `on_change`: True if PX4 publishes it on change, so bursts and pauses are normal; False if published at `rate`.
     `instances`: True if it has uORB instances, one per EKF or sensor; None if unknown.
-    `plain_first`: the ROS 2 topic of instance 0 has no suffix, as in PX4's defaults.
+    `plain_first`: True if the ROS 2 topic of instance 0 has no suffix, as in PX4's defaults.
     `priority`: Zenoh priority; higher ones are sent first on a congested link.
     """
 
@@ -80,7 +80,7 @@ def cached_on_owner(make: _F) -> _F:
     @wraps(make)
     def find(owner: Any, *arguments: object) -> Any:
         cached = owner.caches.get(make)
-        if cached is None:  # setdefault: another thread may have set it
+        if cached is None:  # setdefault: another thread may have stored a result first
             cached = owner.caches.setdefault(make, lru_cache(1024)(partial(make, owner)))
         return cached(*arguments)
 

@@ -24,10 +24,10 @@ M_co = TypeVar("M_co", bound="Message", covariant=True)
 
 
 class Row(tuple[Any, ...]):
-    """A message as a named tuple, which is much faster than a model: the same fields in the same order.
+    """A message as a named tuple with the fields of the model in the same order; much faster than a model.
 
-    Validated when decoded or encoded, not when created.
-    Type checkers see the message class; `_fields` and `_asdict()` are those of any named tuple.
+    A row is validated when it is decoded or encoded, not when it is created.
+    Type checkers treat it as the message class; `_fields` and `_asdict()` work as in any named tuple.
     """
 
     __slots__ = ()
@@ -48,7 +48,7 @@ class Row(tuple[Any, ...]):
 class UpgradePlan(NamedTuple):
     """Mapping from the fields of a layout to those of the model.
 
-    `provided`: the model's fields that get a value: the keys of `names` and `converted`.
+    `provided`: the model's fields that receive a value, which are the keys of `names` and `converted`.
     `names`: the source field, for each field whose value is copied.
     `converted`: for each other field, the source fields (None for a missing array element) and the conversion.
     """
@@ -64,7 +64,7 @@ class Definition(Generic[M_co]):
     `name`: its name in PX4, such as VehicleAttitude. `model`: its Pydantic model.
     `types`: the PX4 type of every field of the model, in order.
     `topics`, `older`: topics and older fields by name. `rules`: the rules for its fields.
-    `flags`: the fields that are valid while a flag is true.
+    `flags`: for each flag, the fields that are valid while it is true.
     `always`: the fields present in every log, even the oldest. `caches`: see `cached_on_owner`.
     """
 
@@ -254,7 +254,7 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
         values = [NAN if old is None else fields[old] for old in olds]
         try:
             upgraded[name] = convert(*values)
-        except (TypeError, OverflowError):  # not a number, which the model rejects
+        except (TypeError, OverflowError):  # not a number: the model rejects it
             (upgraded[name],) = values
     return upgraded
 

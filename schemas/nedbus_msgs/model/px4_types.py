@@ -39,7 +39,7 @@ BASES: Final[Mapping[str, Base]] = {
     "uint64": Base("Q", 0xCF, 9, 0),
     "float32": Base("f", 0xCA, 10, NAN),
     "float64": Base("d", 0xCB, 11, NAN),
-    "char": Base("s", 0xDA, 3, ""),  # only as an array, which is text; ROS 2 uses uint8
+    "char": Base("s", 0xDA, 3, ""),  # only in arrays, which are text; ROS 2 uses uint8
 }
 ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 """Other names that PX4 uses for types of single values."""

@@ -32,7 +32,7 @@ class Check(NamedTuple):
 class Rule:
     """Base class of rules; values already have the right types, and NaN never breaks a rule on a single field.
 
-    `flags`: the fields that are finite while a flag is set, by flag.
+    `flags`: for each flag, the fields that are finite while it is set.
     """
 
     flags: Mapping[str, Sequence[str]] = {}

@@ -18,10 +18,10 @@ _FIELD = re.compile(
     r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})\s*"
     r"(?:=\s*(?P<value>[^#]*)|(?:[-+.\d\[\"']|true\b|True\b|false\b|False\b)[^#]*)?(?P<comment>#.*)?"
 )
-"""A field, with a default value or not, or a constant."""
+"""A field, with or without a default value, or a constant."""
 _LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or form feed, which may occur in a comment
-_LENGTH = re.compile(r"\[([1-9]\d{0,2})\]")  # of an array of nested messages
-_STRINGS: Final = ("string", "wstring")  # types of constants only
+_LENGTH = re.compile(r"\[([1-9]\d{0,2})\]")  # length of an array of nested messages
+_STRINGS: Final = ("string", "wstring")  # only constants have these types
 # Possessive quantifiers: a comment may have 200,000 spaces or digits.
 _NUMBER: Final = r"[-+]?(?:\d++\.?\d*+(?:[eE][-+]?\d++)?|inf)"
 _RANGE = re.compile(rf"@range\s++({_NUMBER})?\s*+,\s*+({_NUMBER})?")
@@ -90,7 +90,7 @@ def bases_of_msg(text: str) -> set[str]:
 
 
 class _Line(NamedTuple):
-    """A field as written; `base`: its type without the array length."""
+    """A field as written in the file; `base`: its type without the array length."""
 
     number: int
     column: int

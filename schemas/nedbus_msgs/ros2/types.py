@@ -32,7 +32,7 @@ def dds_type(name: str) -> str:
 
 @cache
 def ros2_types() -> Mapping[str, Definition[Any]]:
-    """Return the definition for each ROS 2 type of a built-in message, including those of PX4's translation node."""
+    """Return the definitions of built-in messages by ROS 2 type, including the types of PX4's translation node."""
     return {
         name: definition
         for definition in MESSAGES.values()

@@ -25,7 +25,7 @@ def follow(
 ) -> None:
     """Handle samples until `count` are counted or `duration` [s] has passed.
 
-    `handle` returns False for a sample that does not count. Once a second the link is checked and `each_second` called.
+    `handle` returns False for a sample that does not count. Once a second it checks the link and calls `each_second`.
 
     Raises NoDataError if no sample was counted.
     """

@@ -82,7 +82,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     options = sorted([*direct, *itertools.chain(*expanded.values())], key=lambda each: each.kind)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined] # Typer reads both
     run.__annotations__ = {each.name: each.annotation for each in options}
-    run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")  # rich would keep the line breaks
+    run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")  # because rich keeps line breaks
     return run
 
 
@@ -114,7 +114,7 @@ def _exit_on_errors() -> Iterator[None]:
         where = f"{exc.filename}: " if exc.filename else ""
         raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
     except BaseException as exc:
-        if type(exc).__name__ != "PanicException":  # raised by Zenoh; it cannot be imported
+        if type(exc).__name__ != "PanicException":  # Zenoh raises this class, which cannot be imported
             raise
         hint = "check the system clock, free memory and the limit of open files ('ulimit -n')"
         raise _exit_with(NedbusError(f"Zenoh failed ({exc}): {hint}"), 1) from exc

@@ -79,7 +79,7 @@ def check_router_file(
 
 
 def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
-    """Yield a mistake for each source that cannot be opened, or that publishes an address of another source."""
+    """Yield a mistake for each source that cannot be opened, or that publishes the same address as another source."""
     plan, mistakes = plan_sources(settings, tuple(endpoints))
     yield from mistakes
     publishers: dict[Address, PlannedSource] = {}
@@ -126,7 +126,7 @@ def _try_listen(endpoint: str) -> Finding | None:
 
 
 def _reason(finding: Finding | None) -> str:
-    """Return the text of a mistake, "" for none; an unknown state, as with a missing package, is only logged."""
+    """Return the text of a mistake, "" for none; an unknown state, for example without a package, is only logged."""
     if finding is None or finding.state == "ok":
         return ""
     subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""

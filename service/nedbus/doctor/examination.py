@@ -92,7 +92,7 @@ def check_network(seen: Observation, router: str, tls: Tls | None) -> Iterator[F
 def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> list[Finding]:
     """Run checks, given by name and subject, in parallel threads; return findings in the order of the checks.
 
-    A check that fails or exceeds `seconds` becomes a finding; its thread then ends by the check's own timeouts.
+    A check that fails or exceeds `seconds` results in a finding; the check's own timeouts then end its thread.
     """
     found: dict[tuple[str, str], list[Finding]] = {}
 

@@ -38,7 +38,7 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def limit_findings(findings: Iterable[Finding]) -> list[Finding]:
-    """Return the worst findings of a check, preceded by one with the number of the others."""
+    """Return the worst findings of a check, preceded by a finding that states the number of the others."""
     ordered = sort_findings(findings)
     rest, kept = ordered[:-_MAX_FINDINGS], ordered[-_MAX_FINDINGS:]
     if rest:

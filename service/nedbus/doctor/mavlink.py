@@ -83,7 +83,7 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[An
                 parser = dialect.MAVLink(None)
                 parser.robust_parsing = True
             for message in parser.parse_buffer(data) or []:
-                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # neither has a header
+                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these types have no header
                     ids = message.get_srcSystem(), message.get_srcComponent()
                     ignored = ignore_reason(*ids)
                     if fault := f"ignored: {ignored}" if ignored else both.add(ids[0], peer, now):

@@ -147,7 +147,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
             yield Finding("vehicle", name, severity, text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
-    for each in hidden if arrived or seen.ages else ():  # else this client may not read at all
+    for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission
         advice = "check that the router's access rules allow that service to write this vehicle: docs/security.md"
         yield Finding("vehicle", each, "wrong", "reported as published by a service, but no message arrives", advice)
     if flowing := [address for address in known if address in arrived]:
@@ -181,7 +181,7 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:
-    """Yield clocks that are off; if all others agree with each other, this host's clock is off."""
+    """Yield findings on clocks that are off; if all others agree with each other, this host's clock is off."""
     clocks = {  # offset from this host's clock, and its uncertainty [s]
         f"service {brief(each.service)} on {brief(each.host)}": (each.now - seen.asked, seen.error)
         for each in seen.services
@@ -189,7 +189,7 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
     }
     for address, delay in seen.delays.items():
         if delay is not None:
-            error = 0.0 if delay < 0 else _CLOCK_WARNING  # a positive delay includes the network's
+            error = 0.0 if delay < 0 else _CLOCK_WARNING  # a positive delay includes the network latency
             clocks[f"publisher of {address}"] = (-delay, error)
     off = {name: offset for name, (offset, error) in clocks.items() if abs(offset) > _CLOCK_WARNING + error}
     if len(off) > 1 and len(off) == len(clocks) and max(off.values()) - min(off.values()) < _CLOCK_WARNING:

@@ -47,7 +47,7 @@ class Observation:
     `services`: status of each service; clocks were read at `asked` +- `error` by this host's clock [Unix, s].
     `alive`: number of publishers by address, from liveliness tokens.
     `ages`: age of the last message by address at the end of the observation [s]; None without timestamp.
-    `delays`: minimum latency by address with messages, by the clocks of both hosts [s]; None without timestamps.
+    `delays`: minimum latency by address with messages, from the clocks of both hosts [s]; None without timestamps.
     `errors`: last decoding error by address. `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes. `ros2`: publishers of ROS 2 topics.
     `routers`: routers that disclose their sessions. `accounts`: event reports of services.
@@ -98,7 +98,7 @@ class Observation:
         tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add(take_messages())
-        self.delays = dict.fromkeys(self.delays)  # these were buffered during the queries, and seem late
+        self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
         while time.monotonic() < end:
             time.sleep(_POLL)

@@ -1,4 +1,4 @@
-"""Probes of endpoints, routers and certificates; `nedbus check` uses all but those that open a session."""
+"""Probes of endpoints, routers and certificates; `nedbus check` uses all except those that open a session."""
 
 import socket
 import ssl
@@ -64,7 +64,7 @@ def reach_endpoint(endpoint: str) -> Finding | None:
             socket.getaddrinfo(host, port)
         else:
             socket.create_connection((host, port), _CONNECT_TIMEOUT).close()
-    except (socket.gaierror, UnicodeError):  # UnicodeError: an empty label, as in a..b
+    except (socket.gaierror, UnicodeError):  # UnicodeError: an empty label, such as in a..b
         seen, advice = f"cannot resolve host name {host}", "correct the name, or use the IP address"
     except ConnectionRefusedError:
         seen = "connection refused: nothing listens on this port"
@@ -120,7 +120,7 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
 
 
 def _read_certificate(host: str, port: int) -> str:
-    """Return the unverified certificate of a server in PEM; "" if it does not speak TLS."""
+    """Return a server's certificate in PEM, without verifying it; "" if the server does not speak TLS."""
     with suppress(OSError):  # also catches SSLError
         return ssl.get_server_certificate((host, port), timeout=TIMINGS.handshake)
     return ""

@@ -19,7 +19,7 @@ REFERENCES: Final = {
     "vehicle_gps_position": _GNSS, "sensor_gps": _GNSS, AIR_DATA: ("barometer", ("baro_alt_meter", "baro_device_id")),
     "vehicle_local_position_groundtruth": ("ground truth", ("x", "y", "z", "ref_lat", "ref_lon", "ref_alt")),
 }  # fmt: skip
-"""Topics with independent measurements: instrument and fields."""
+"""Topics with independent measurements, each with its instrument and its fields."""
 
 _ESTIMATE: Final = ("x", "y", "z", "vx", "vy", "z_valid", "xy_valid", "ref_lat", "ref_lon", "ref_alt")
 _INTERVAL: Final = 390_000  # us between comparisons with a reference
@@ -44,7 +44,7 @@ class ReferenceDetector(ChangeDetector):
         if 0 <= self.stamp - self._compared < _INTERVAL:
             return found
         self._compared, values = self.stamp, self._read_reference(message)
-        if not all(isinstance(each, int | float) for each in values):  # AIR_DATA may have any types
+        if not all(isinstance(each, int | float) for each in values):  # fields of AIR_DATA may have any type
             return found
         new = self._comparison.add(self._name, self.stamp, values)
         return chain(found or (), new) if new else found
@@ -99,7 +99,7 @@ class Comparison:
         return [each for each in found if each]
 
     def _relative(self, name: str, difference: float, origin: object) -> float:
-        """Return a height difference minus the one at the first comparison with this origin."""
+        """Return the change of a height difference since the first comparison with this origin."""
         if name not in self._offsets or self._offsets[name][0] != origin:
             self._offsets[name] = (origin, difference)
         return difference - self._offsets[name][1]
@@ -120,7 +120,7 @@ class _Contradiction:
     text: str = ""
 
     def update(self, name: str, stamp: int, error: float, limit: float) -> Finding | None:
-        """Add an error, NaN if not measured; return the start or end of a contradiction."""
+        """Add an error, NaN if not measured; return the finding that begins or ends a contradiction, if any."""
         self.errors[name] = (stamp, error, limit)
         if not self.since and not abs(error) > limit:
             return None

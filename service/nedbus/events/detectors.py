@@ -33,10 +33,10 @@ class Finding:
     """A change detected in one message; Vehicle turns it into an event.
 
     `severity`: None for the default of its kind.
-    `first`: text of an end if the condition was already active in the first message.
-    `initial`: active in the first message; it becomes a condition without an event.
+    `first`: text for the end of a condition that was already active in the first message.
+    `initial`: True if it was active in the first message: its condition begins without an event.
     `age`: time since it began [s].
-    `switch`: ignored unless it changes the condition: begins an inactive one, or ends an active one.
+    `switch`: True to ignore it unless it begins an inactive condition or ends an active one.
     """
 
     kind: str
@@ -52,7 +52,7 @@ class Finding:
 
 
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
-"""Yields findings from the fields of the previous message, {} at first, and of the current one."""
+"""Yields findings from the fields of the previous message ({} for the first one) and of the current message."""
 Detection = tuple[Sequence[str], Sequence[str], Detect]
 """Fields whose changes trigger the function, other fields that it needs, and the function."""
 
@@ -81,7 +81,7 @@ class ChangeDetector:
     `detect` receives None for fields that were not provided. `context`: other fields passed to it.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
     `stamp`, `earlier`: timestamps of the last message and of the one before [us].
-    `pause`: minimum interval between messages [s]; earlier ones, until `due` on the event log's clock, are skipped.
+    `pause`: minimum interval between messages [s]; those before `due`, on the event log's clock, are skipped.
     """
 
     pause = 0.0
@@ -147,7 +147,7 @@ def detection_of(message: str) -> Detection | None:
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield conditions that begin or end; a change from or to an unknown value is not an event."""
     for kind in kinds:
-        found: dict[tuple[bool, Change], list[str]] = {}  # by (is an event rather than initial, change)
+        found: dict[tuple[bool, Change], list[str]] = {}  # by whether it is an event, and by change
         for name in kind.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == kind.bad and kind.initial:
@@ -203,7 +203,7 @@ def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
-    """Return level, texts and numbers by kind; a condition begins at level 2 and ends at 0; None is unknown."""
+    """Return level (None if unknown), texts and numbers by kind; a condition begins at level 2 and ends at level 0."""
     satellites, few = gps.get("satellites_used"), None
     if satellites is not None and satellites != _UNKNOWN_SATELLITES:
         few = (satellites < rules.FEW_SATELLITES) + (satellites < rules.ENOUGH_SATELLITES)

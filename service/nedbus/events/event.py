@@ -13,10 +13,10 @@ from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import LARGE_CORRECTION
 
 WINDOW: Final = 10.0
-"""Seconds before an event in which other events are evidence; the start of an active condition always is."""
+"""Seconds before an event in which others count as evidence; the start of an active condition always counts."""
 
 ALL: Final = "*"
-"""Vehicle name of events that concern all vehicles: those of the router link and of the reader."""
+"""Vehicle name in events that concern all vehicles: events of the router link and of the reader."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
 """Time on the event log's clock [s]; the bounds validate reports from peers."""
@@ -90,7 +90,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """State of a vehicle: severity, text and start of its worst condition, and all conditions; "info" if healthy."""
+    """State of a vehicle: severity ("info" if healthy), text and start of its worst condition; all its conditions."""
 
     severity: Severity
     text: str
@@ -124,8 +124,8 @@ def state_of(conditions: Iterable[Condition]) -> State:
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
     """Return the possible causes of an event: the latest of each kind within WINDOW seconds, or still active.
 
-    The start of a condition may be caused by other starts and PX4's log messages, its end by ends since its start, and
-    a correction of the estimate by all of these. All log messages are returned, not just the latest.
+    Other starts and PX4's log messages may cause a start; other ends since the condition began may cause its end.
+    All of these may cause a correction of the estimate. All log messages are returned, not just the latest.
     """
     kind, latest = KINDS[event.kind], dict[object, Event]()
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""

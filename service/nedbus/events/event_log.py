@@ -21,13 +21,13 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 KEPT: Final = 2000
-"""Maximum number of events in an event log; beyond that, the oldest of the vehicle with the most events is dropped."""
+"""Maximum number of events in an event log; beyond it, the vehicle with the most events loses its oldest one."""
 
 MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an event log; beyond that, the one gone longest is forgotten."""
+"""Maximum number of vehicles in an event log; beyond it, the one gone longest is forgotten."""
 
 MAX_GONE: Final = 50
-"""Number of gone vehicles remembered, or the maximum number ever present at once if that is larger."""
+"""Maximum number of gone vehicles remembered, unless more vehicles were ever present at once."""
 
 _SHARE: Final = 20  # events guaranteed to each vehicle while others have more
 _NONE: Final[frozenset[str]] = frozenset()
@@ -56,7 +56,7 @@ class EventLog:
 
     @property
     def events(self) -> list[Event]:
-        """The events kept, in the order of reports."""
+        """The retained events, in the order in which they were reported."""
         return self.events_since(0)[0]
 
     @property
@@ -107,7 +107,7 @@ class EventLog:
         `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
         `link`: fault of the router link, "" if it is up. `dropped`: messages dropped by this reader since it started.
         `is_behind`: the reader has a backlog. `present`: vehicles with a publisher. Others are forgotten after an hour
-        of silence with the link up, or earlier beyond MAX_GONE. With None, no vehicle is forgotten.
+        of silence with the link up, or earlier beyond MAX_GONE. If None, no vehicle is forgotten.
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:
@@ -154,13 +154,13 @@ class EventLog:
             return known.state(time) if known is not None else state_of(())
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
-        """Return the events kept, without the first `seen` ever reported, and the number of events ever reported."""
+        """Return the retained events after the first `seen` reported ones, and the number of all reported events."""
         with self._lock:
             new = [self._events[number] for number in takewhile(lambda number: number >= seen, reversed(self._events))]
             return new[::-1], self.reported
 
     def label_first_events(self) -> None:
-        """Set the time since boot of events before the first message that contained it; for files."""
+        """For files: set the time since boot of the events before the first message that contained it."""
         for number, event in self._events.items():
             known = self.vehicles.get(event.vehicle)
             if event.boot is None and known is not None and known.boot is not None:
@@ -184,7 +184,7 @@ class EventLog:
         return known
 
     def _gone(self, time: float) -> list[tuple[float, str]]:
-        """Return time last seen and name of each vehicle gone for a minute, longest gone first."""
+        """Return the time last seen and the name of each vehicle gone for a minute, longest gone first."""
         return sorted((each.last_seen, name) for name, each in self.vehicles.items() if time - each.last_seen > RECENT)
 
     def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:

@@ -9,7 +9,7 @@ from .rules import FAILSAFE_FLAGS, FAULTS, FUSED, HEIGHTS, REJECTED
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
-"""Worst first. bad: the vehicle cannot do its task; watch: this may become bad; info: routine."""
+"""Severities, worst first: bad (the vehicle cannot do its task), watch (may become bad), info (routine)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +22,7 @@ class Kind:
 
     `fault`: `nedbus why` always reports it as a fault. `validity`: a quantity of the estimate is invalid.
     `correction`: the estimate is corrected; both starts and ends of conditions may explain it.
-    `phase`: a phase of any flight, shown although its severity is info.
+    `phase`: a phase of a flight, shown although its severity is info.
     `stateless`: it does not affect the vehicle's state. `kept_on_reboot`: it survives a reboot.
 
     A kind with `flags` is a condition, active while any of these fields of the message equals `bad`; the values of
@@ -180,7 +180,7 @@ class _Kinds(dict[str, Kind]):
 
 
 KINDS: Final = _Kinds({kind.name: kind for kind in _ROWS})
-"""All kinds of events by name, the most important first; unknown names, as from a newer service, get a default kind."""
+"""All kinds of events by name, most important first; a name unknown to this version gets a default kind."""
 
 
 def importance(kind: str) -> int:

@@ -134,7 +134,7 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
 def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:
     """Return the size of a reset between two messages, None if unknown.
 
-    This is the message's delta if the data confirms it, else the difference of the samples minus the motion in between.
+    This is the message's delta if the data confirms it, else the step between the samples minus the motion in between.
     """
     values, rates, *_ = _RESETS[name]
     seconds = (after["timestamp"] - before["timestamp"]) / 1e6
@@ -146,7 +146,7 @@ def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float
     is_reported = count == 1 and all(map(math.isfinite, reported))
     if not all(map(math.isfinite, observed)):
         return reported if is_reported else None
-    # Velocity changes at an unknown time between the two, and vz need not be the rate of z: allow for each rate.
+    # The velocity changed at an unknown time in between, and vz need not be the rate of z: allow for every rate.
     motions = [
         [rate * seconds for of in names for rate in (before[of], after[of]) if math.isfinite(rate)] or [0.0]
         for names in rates

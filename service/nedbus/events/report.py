@@ -24,7 +24,7 @@ _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, kinds of all.
+    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, all kinds.
 
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
@@ -106,7 +106,7 @@ def joined(parts: Sequence[AccountReport]) -> AccountReport:
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
-    """Return one report per vehicle, worst vehicle first, preferably from a service that receives its messages."""
+    """Return one report per vehicle, worst vehicle first, preferably from a service that receives the vehicle."""
     found: dict[str, AccountReport] = {}
     for report in reports:
         for name in report.vehicles:
@@ -116,7 +116,7 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 
 
 def from_json(content: object) -> AccountReport | None:
-    """Validate the reply of a peer; return None if it is not a report, as from an older service."""
+    """Validate the reply of a peer; return None if it is not a report, for example from an older service."""
     try:
         return _REPORT.validate_python(content)
     except ValidationError:

@@ -1,4 +1,4 @@
-"""Stories for `nedbus why`: each fault with its period, its evidence, and missing topics that may have more."""
+"""Stories for `nedbus why`: each fault with its period, evidence, and missing topics that may hold more of it."""
 
 import math
 from collections.abc import Collection, Iterable, Sequence
@@ -19,7 +19,7 @@ _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_
 
 @dataclass(frozen=True, slots=True)
 class Span(Condition):
-    """A condition with its end, the time `until` and the event `end`; both are None while it is active."""
+    """A condition and its end: the time `until` and the event `end`, both None while the condition is active."""
 
     until: float | None = None
     end: Event | None = None
@@ -38,7 +38,7 @@ class Story:
     `since`, `until`: times on the event log's clock [s]; `until` is None while it is active.
     `begin`: the event that began it, None if it was active in the first message. `end`: the event that ended it.
     `before`: the evidence, oldest first. `meanwhile`: other events during the fault. `after`: events at its end.
-    `lacking`: topics missing from the data that may have evidence.
+    `lacking`: topics that may hold evidence, but are missing from the data.
     """
 
     spans: tuple[Span, ...]
@@ -196,7 +196,7 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _is_part(story: Story, of: Story) -> bool:
-    """Return True if a story is part of another one, unless it is bad and more important or outlasts it."""
+    """Return True if a story is part of another one; a bad story that is more important or lasts longer is not."""
     begin, kind = story.spans[0].begin, story.spans[0].kind
     if not of.is_bad or begin not in (*of.before, *of.meanwhile, *of.after):
         return False
@@ -206,7 +206,7 @@ def _is_part(story: Story, of: Story) -> bool:
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
-    """Return all spans of one story: `span`, and validity lost with it or similar initial conditions."""
+    """Return all spans of one story: `span`, and losses of validity at the same time or similar initial conditions."""
 
     def is_part(each: Span) -> bool:
         if KINDS[span.kind].validity:

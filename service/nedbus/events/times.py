@@ -24,7 +24,7 @@ CLOCKS: Final[Mapping[str, str]] = {
 class Times:
     """Conversion of event times to UTC, for live data or a file.
 
-    `is_live`: event times are on a clock of this host, which is `ahead` seconds behind Unix time.
+    `is_live`: event times are on a clock of this host; `ahead`: Unix time minus that clock [s].
     `offsets`: Unix time minus time since boot [s], for each vehicle whose messages contain it.
     """
 
@@ -57,7 +57,7 @@ class Times:
         return format_utc(utc)
 
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
-        """Format a period and its duration [s]; None: since before the first message, or until after the last."""
+        """Format a period and its duration [s]; None: it began before the first message, or ends after the last one."""
         still = f"until {'now' if self.is_live else 'the end'}"
         if begin is None:
             return f"from the first message {still} ({format_duration(lasted)})"

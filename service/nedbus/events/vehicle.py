@@ -35,7 +35,7 @@ _read_sample: Final = detectors.FieldReader(_SAMPLE)
 class Vehicle:
     """Events and conditions of one vehicle.
 
-    `on_event`: callback for each event. `common`: holder of the conditions that concern all vehicles.
+    `on_event`: callback for each event. `common`: pseudo-vehicle whose conditions concern all vehicles.
 
     `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
     `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
@@ -48,7 +48,7 @@ class Vehicle:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
-        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; active once it is armed
+        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; effective once armed
         self._armed_at = math.inf
         self.topics: set[str] = set()
         self.main: Address | None = None
@@ -68,7 +68,7 @@ class Vehicle:
         self._ekf = 0  # instance of the primary EKF
         self._position: PositionDetector | None = None  # of `main`
         self._comparison = Comparison(lambda: self._position)
-        self._equal: dict[int, bool] = {}  # by EKF: its estimate equals the vehicle's
+        self._equal: dict[int, bool] = {}  # by EKF: whether its estimate equals the vehicle's
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
         """Add a message; `lost`: number of messages lost before it."""
@@ -273,7 +273,7 @@ class Vehicle:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
-        """Without a selector: yield this EKF if its estimate equals the vehicle's and that of the primary does not."""
+        """Without a selector: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
         vehicle = _read_sample(None if self._position is None else self._position.last)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
@@ -293,7 +293,7 @@ class Vehicle:
                 self.emit(found, _EKF, self.time)
 
     def _end(self, new: Address, is_over: Callable[[str, str], bool]) -> None:
-        """End conditions selected by kind and flag, as a preferred stream is in use."""
+        """End conditions, selected by kind and flag, because a preferred stream is now in use."""
         self._on_ground = {key: each for key, each in self._on_ground.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
@@ -322,7 +322,7 @@ class Vehicle:
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
     def _is_flapping(self, event: Event) -> bool:
-        """Return True if such events are too frequent to report each; `settle` then reports the last one."""
+        """Return True if such events are too frequent to report them all; `settle` then reports the last one."""
         keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in any combination
         limits = [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
         for key, limit in [(keys[1], MAX_SINGLE)] if event.change == "once" else limits:

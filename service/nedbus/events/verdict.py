@@ -73,7 +73,7 @@ def verdict_of(
     found = [each for each in near if each.text not in earlier] + [e for e in worst.before if e.kind != "text"]
     cause = tuple(sorted(found, key=lambda each: each.time))
     text = f"{head}{_cut(worst.what)}{_count(worst, stories)} {worst.when(times, end)}."
-    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # reserved for others
+    room = 3 * _WIDTH - len(text) - (80 if sum(each.is_bad for each in stories) > 1 else 30)  # reserved for the others
     text = " ".join([text, *(f"{part}." for part in _why(worst, cause, times, room))])
     largest = {each.spans[0].kind: each for each in reversed(ranked)}
     also = ""  # the worst other fault of each kind, nearest in time first

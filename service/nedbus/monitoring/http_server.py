@@ -86,7 +86,7 @@ class HttpServer(ThreadingHTTPServer):
         self.server_close()
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Accept a client; pause if that fails, as without free file descriptors, to avoid a busy loop."""
+        """Accept a client; if that fails, for example without free file descriptors, pause to avoid a busy loop."""
         try:
             return super().get_request()
         except OSError:

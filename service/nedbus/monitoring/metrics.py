@@ -121,7 +121,7 @@ class MeasuredStream:
 
 
 def metrics_page(metrics: Iterable[core.Metric]) -> Page:
-    """Return these metrics and those of this process in the Prometheus text format."""
+    """Return these metrics, and the metrics of this process, in the Prometheus text format."""
 
     class Metrics(Collector):
         def collect(self) -> Iterator[core.Metric]:

@@ -15,7 +15,7 @@ from nedbus_msgs import Address, Selection
 _MAX_WAITING: Final = 200  # queued messages above which the reader is behind
 _MAX_LAG: Final = 1.0  # s of queued messages at the usual rate, if that is more
 _MAX_PAUSE: Final = 2.5  # s between polls; after a longer pause, this process was stalled
-_SETTLING_TIME: Final = 3.0  # s after a reconnect; then delayed messages have arrived
+_SETTLING_TIME: Final = 3.0  # s after a reconnect; delayed messages have arrived by then
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Observer:
         self._lock = threading.Lock()  # a stream is briefly missing from the monitor while it is updated
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample just read; ignore a retained one, as its stream may have ended long ago."""
+        """Add a sample just read; ignore a retained one, because its stream may have ended long ago."""
         with self._lock:
             counts = self.monitor.add(sample)
         if counts:

@@ -96,7 +96,7 @@ def align(
         if not found:
             expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
             raise ArgumentError("on", on, expected, problem="is not in this flight")
-        on, *_ = reference = found[:1]  # the first vehicle that has it
+        on, *_ = reference = found[:1]  # the first vehicle with this stream
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
@@ -178,7 +178,7 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
     """Interpolate linearly, angles the shorter way, to a range from -period/2 if one is negative, else from 0."""
-    with np.errstate(invalid="ignore"):  # infinity minus infinity, and an infinite period
+    with np.errstate(invalid="ignore"):  # for infinity minus infinity, and for an infinite period
         step = second - first
         turned = first + weight * (step - np.sign(step) * period)
         start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
@@ -196,7 +196,7 @@ def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Float
 
 
 def _stamps(stream: str, messages: MessageArray) -> _Ints:
-    """Return the timestamps [us]; raise ConfigError if they restart, as after a reboot of the vehicle."""
+    """Return the timestamps [us]; raise ConfigError if they restart, for example after a reboot."""
     stamps: _Ints = np.minimum(messages["timestamp"], 2**62).astype(np.int64)
     late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
     early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])

@@ -39,7 +39,7 @@ Library = Literal["pandas", "polars"] | None
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
-    """Return the fields that some or all of these messages lack, where their values are NaN, false or 0.
+    """Return the fields that some or all of these messages lack; the missing values are NaN, false or 0.
 
     `read` stores the names in the metadata of the dtype: slices, masks and copies keep them, `numpy.save` does not.
     """
@@ -158,7 +158,7 @@ class _Decoded(NamedTuple):
 
 
 def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
-    """Decode messages of a log, vectorized; streams with fields of another type message by message."""
+    """Decode messages of a log, vectorized; in streams with fields of another type, decode them one by one."""
     table: npt.NDArray[np.void] = np.frombuffer(payloads, np.dtype(stream.subscription.layout.dtype))
     definition, columns = stream.definition, {name: table[name] for name in stream.names}
     decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(tuple(columns))
@@ -222,7 +222,7 @@ def _decode_fields(definition: Definition[Any], chunk: Sequence[Any]) -> _Decode
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
-    """Convert a structured array to a data frame with nulls for absent fields; without a library return it as is."""
+    """Convert a structured array to a data frame with nulls for absent fields; without a library, return the array."""
     if library is None:
         return messages
     if library not in ("pandas", "polars"):

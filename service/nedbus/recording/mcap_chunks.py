@@ -54,7 +54,7 @@ class ChunkFile:
     """An MCAP file open for reading.
 
     `summary`: schemas, channels, chunk indexes and statistics; empty if the summary is absent or damaged.
-    `warnings`: the damage found so far; `damaged`: True if it cost messages.
+    `warnings`: the damage found so far; `damaged`: True if any of it cost messages.
 
     Raises SourceError if the file is not MCAP or cannot be opened.
     """
@@ -169,7 +169,7 @@ class ChunkFile:
 
 
 def _expected_length(opcode: int, body: bytes, length: int) -> int:
-    """Return the record length implied by the lengths of its fields; `length` for types without such fields."""
+    """Return the record length implied by the lengths of its fields; `length` for record types without such fields."""
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:

@@ -53,7 +53,7 @@ class RecordingWriter:
     """Write messages to a new MCAP file; a context manager that finishes the file on exit.
 
     Each combination of address, definition and provenance has its own channel. Its layout is the current one; if no
-    PX4 release has all its fields, a release with exactly the fields that the source provides is preferred.
+    PX4 release has all its fields, the layout with exactly the fields that the source provides is preferred.
     PX4's log messages are duplicated as ROS 2's Log on `/<vehicle>/log`, for Foxglove's Log panel.
     `chunk_size`: bytes per chunk before compression; a flipped bit costs one chunk. `boot_utc`: Unix time of the
     vehicle's boot [us], for `utc_of` if the messages do not provide it.

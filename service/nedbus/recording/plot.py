@@ -86,7 +86,7 @@ def draw(
     The time axis shows UTC if `times` has it for all vehicles, else seconds since boot.
     Positions are local NED in metres; altitude is -z.
     Fields named by `missing_of` are not plotted; a note lists them.
-    `events`: those of severity bad or watch, mode changes, arming and landing of the plotted vehicles are marked.
+    `events`: events of severity bad or watch, mode changes, arming and landing of plotted vehicles are marked.
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
@@ -131,7 +131,7 @@ def draw_figure(
     label = _label_times(axes["altitude"], drawn, start / 1e6, times)
     for name in ("speed", "events" if marks else "flags"):
         axes[name].set_xlabel(label)
-    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may contain any bytes
     missing = {each.address: [*filter(missing_of(each.messages).__contains__, (*_FLAGS, *_COUNTERS))] for each in drawn}
     notes = (f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)
     figure.supxlabel("\n".join(notes), fontsize="small")

@@ -87,7 +87,7 @@ def read_streams(
 ) -> tuple[Streams, int]:
     """Return the messages of one vehicle's streams, or of several files, and when recording began [us].
 
-    `topics`: None selects all streams; of a log, those of topics known to nedbus.
+    `topics`: None selects all streams, or in a log the streams of all topics known to nedbus.
     """
     if not isinstance(path, FlightPath):
         names = [topics] if isinstance(topics, str) else topics

@@ -18,7 +18,7 @@ from .flight_files import matching, require_one_vehicle
 _FIELDS: Final = ("time_utc_usec", "estimated_offset")  # UTC of a GNSS receiver, or offset to a companion's clock
 _RELATIVE: Final = "timestamp_time_relative"  # us from the message's timestamp to the receiver's UTC
 _TOLERANCE: Final = 1_000_000  # us; messages this close to the median agree
-_AGREEING: Final = 0.9  # fraction that must agree; fewer indicate several boots or a clock step
+_AGREEING: Final = 0.9  # fraction that must agree; a smaller one indicates several boots or a clock step
 
 
 @dataclass(frozen=True, slots=True)

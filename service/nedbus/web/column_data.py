@@ -35,7 +35,7 @@ def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None
     new = {name: [row[name] for row in rows] for name in old}
     if any(len(column) != len(rows) for column in old.values()):
         source.data = new
-    else:  # repr, as NaN is not equal to itself
+    else:  # repr, because NaN is not equal to itself
         cells = slice(len(rows))
         changed = {name: [(cells, values)] for name, values in new.items() if repr(values) != repr(old[name])}
         if changed:
@@ -52,7 +52,7 @@ class Tracks:
     def __init__(self) -> None:
         self.source = table(*_COLUMNS)
         self._tracks: Mapping[Address, Track] = {}
-        self._seen: list[int] = []  # points of each history that are in the data source
+        self._seen: list[int] = []  # number of points of each history in the data source
         self._step = self._slots = 1
 
     def update(self, tracks: Mapping[Address, Track]) -> None:

@@ -205,7 +205,7 @@ class Fleet:
         self.snapshot = FleetSnapshot(time, vehicles, tuple(self._reports), rejected, len(self._left_out), alarms)
 
     def _evict(self, time: float) -> bool:
-        """Remove the least recent stream, positions last and only if silent; return whether a stream was removed."""
+        """Remove the stream silent for longest, positions last and only if silent; return True if one was removed."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False

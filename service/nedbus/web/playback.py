@@ -117,7 +117,7 @@ class Player:
         self._feed()
 
     def toggle(self, *, pause: bool = False) -> None:
-        """Toggle between play and pause; with `pause`, pause."""
+        """Toggle between play and pause; if `pause` is true, only pause."""
         self._play.active = not (pause or self._play.active)
 
     def seek(self, seconds: float) -> None:
@@ -128,7 +128,7 @@ class Player:
         self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
         indices = list(self.recording.indices.values())
         silent = (known[at - 1] for known in indices if (at := bisect_left(known, self._next)))
-        for index in sorted(silent):  # the last message before this minute of each stream
+        for index in sorted(silent):  # the last message of each stream before this minute
             self._add(index)
         for address, stream in self.fleet.streams.items():
             overview = self.recording.overview.streams.get(address)

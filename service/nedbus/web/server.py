@@ -75,7 +75,7 @@ def serve_live(
     background = None if options.background is None else Background(options.background)
     server = WebServer(options, lambda page: Viewer(page, live.fleet, live.timeline, background=background), live.pages)
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
-        reading = pool.submit(live.run, stop)  # sets `stop` when it fails
+        reading = pool.submit(live.run, stop)  # a failure of `run` sets `stop`
         on_listening(server.url)
         server.run(stop)
         reading.result()
@@ -143,14 +143,14 @@ class WebServer:
         self, options: PageOptions, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
     ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
-            logging.getLogger(name).setLevel(logging.ERROR)  # they log a warning for each closed tab
+            logging.getLogger(name).setLevel(logging.ERROR)  # else they warn about each closed tab
         host = options.host
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
             sessions = self._server.get_sessions("/")
             waiting = [each for each in sessions if not each.connection_count]
-            for each in waiting[:-MAX_VIEWERS]:  # their clients have opened no WebSocket
+            for each in waiting[:-MAX_VIEWERS]:  # pages whose clients have opened no WebSocket
                 each.request_expiration()
             if len(sessions) - len(waiting) >= MAX_VIEWERS or len(waiting) >= _MAX_WAITING:
                 _log_once("limit of %d open pages reached: further pages are refused", MAX_VIEWERS)

@@ -56,7 +56,7 @@ class History:
     def __init__(self, size: int, step: float) -> None:
         self.size, self.step = size, step
         self.written = 0
-        self._points = np.empty((size, len(COLUMNS)))  # uses no memory until written; only positions are
+        self._points = np.empty((size, len(COLUMNS)))  # uses no memory until written, and only positions are written
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
         """Return points `begin` to `end` that are not overwritten yet, oldest first; shape (n, columns)."""

@@ -30,7 +30,7 @@ from .time_plots import Plots, TimelinePlot, notable, set_time_range
 
 _TICK: Final = 100  # ms between updates of the map
 _TEXT_TICKS: Final = 5  # map updates per update of text and plots
-_MAX_AHEAD: Final = 2  # updates sent ahead of the browser's drawing
+_MAX_AHEAD: Final = 2  # updates sent before the browser has drawn them
 _MINUTE: Final = 60.0  # s
 _AROUND: Final = 30.0  # s shown before and after a selected moment
 _SECONDS: Final = re.compile(r"[0-9]{1,10}(\.[0-9])?")
@@ -43,7 +43,7 @@ class Viewer:
     """One page in one browser; `update` sends changes of the fleet ten times a second.
 
     `timeline`: the events; `player`: playback of a recording, None for live vehicles.
-    The URL always has the selected vehicle, moment, view and theme, so it can be shared.
+    The URL always contains the selected vehicle, moment, view and theme, so it can be shared.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class Viewer:
             "view": self._map.focus if self._map.focus != "all" else None,
             "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
-        if self._drawn.value:  # before the browser is connected, it would miss the change
+        if self._drawn.value:  # a browser that is not connected yet would miss the change
             self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
 
     def _update_plots(self, snapshot: FleetSnapshot, chosen: VehicleView | None, now: float) -> None:

@@ -93,7 +93,7 @@ class _Check:
         self._is_local = count is None and not expected.expect and expected.vehicles is None
         self.services = [each for each in bus.services() if not self._is_local or each.host == _HOST]
         self.sources = [source for service in self.services for source in service.sources]
-        self.ages: dict[str, float] = {}  # measured by the services
+        self.ages: dict[str, float] = {}  # as measured by the services
         for source in self.sources:
             for stream in source.streams:
                 name, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
@@ -138,7 +138,7 @@ class _Check:
             yield f"the newest message is {age} old, from vehicle {name}: the limit is {self._max_age:g} s"
 
     def vehicle_faults(self) -> Iterator[str]:
-        """Yield the faults of vehicles: those that services report, and of answering vehicles without a service."""
+        """Yield the faults of vehicles that services report, and of vehicles that answer without a service."""
         expected = self._expected
         others = [
             sample

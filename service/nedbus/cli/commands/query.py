@@ -157,7 +157,7 @@ def schema(
 def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     reason = "and no such topic is published"
     try:
-        get_topic(topic)  # raises for "*"
+        get_topic(topic)  # raises AddressError for "*"
         with open_bus() as bus:
             for sample in bus.latest(topic):
                 message: Message = sample.message

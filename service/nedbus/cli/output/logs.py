@@ -33,7 +33,7 @@ ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tupl
 
 
 class TextFormatter(logging.Formatter):
-    """Format a record as one printable line, plus those of a traceback."""
+    """Format a record as one printable line, followed by the lines of a traceback."""
 
     def __init__(self, style: str = "%(asctime)s %(levelname)-7s %(message)s") -> None:
         super().__init__(style, _DATE)
@@ -111,8 +111,8 @@ class _TokenBucket:
 class RateLimit(logging.Filter):
     """Pass a burst of each kind of record, then a few per minute.
 
-    `handle`, the method of the handler, gets a record with the number of suppressed lines once that kind may be logged
-    again. Records of unlimited events always pass.
+    `handle`, the method of the handler, receives a record with the number of suppressed lines once that kind may be
+    logged again. Records of unlimited events always pass.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class RateLimit(logging.Filter):
         kind = record.name, event, str(record.msg)
         with self._lock:
             if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
-                kind = "", None, ""  # all others
+                kind = "", None, ""  # one bucket for all further kinds
             bucket = self._buckets.setdefault(kind, _TokenBucket(now))
             if bucket.refill(now):
                 bucket.tokens -= 1

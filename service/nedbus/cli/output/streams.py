@@ -29,7 +29,7 @@ def printable(text: str) -> str:
 
 
 def to_text(value: object, limit: int = _MAX_CELL) -> str:
-    """Return text from a peer as one printable line of at most `limit` characters, before escapes."""
+    """Return text from a peer as one printable line, truncated to `limit` characters before they are escaped."""
     text = str(value)
     short = text if len(text) <= limit else f"{text[: limit - 3]}..."
     return printable(short.replace("\n", "\\n"))[: 4 * limit]

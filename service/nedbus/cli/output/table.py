@@ -101,4 +101,4 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
         with live:
             yield show
     finally:
-        console.show_cursor()  # in case a signal came while it was being hidden
+        console.show_cursor()  # a signal may have arrived while the cursor was being hidden
