@@ -23,7 +23,7 @@ def main() -> None:
     axes.bar_label(bars, [f"{rate:,.0f}" for rate in rates], padding=3)
     axes.set_xscale("log")
     axes.set_xlim(right=max(rates) * 2.5)
-    axes.set_xlabel("messages a second without loss, two processes on two cores (logarithmic)")
+    axes.set_xlabel("messages per second, two processes on two cores (logarithmic)")
     axes.set_title(f"The same 53 fields, publisher to reader: {about['date']}, {about['machine']}", fontsize=10)
     axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
