@@ -38,7 +38,7 @@ def main() -> int:
     options = parser.parse_args()
     chosen = options.parsers or [*PARSERS]
     if find_spec("atheris") is None:
-        print("skipped: Atheris has no wheel for this machine")
+        print("skipped: Atheris has no wheel for this machine or Python")
         return 0
     seconds = max(1, round(options.seconds / len(chosen)))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
