@@ -325,11 +325,13 @@ def test_mentioned_compose_files_and_variables_exist() -> None:
 
 
 def test_relative_links_resolve() -> None:
-    """The target file and heading of every relative link exist."""
+    """The target file and heading of every relative link exist; the site has no page from outside docs."""
     for page in (*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md"):
         for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#?([^)]*)\)", page.read_text()):
             file = page.parent / target if target else page
             assert file.exists(), f"{page.name}: {target}"
+            on_site = DOCS in file.resolve().parents or DOCS not in page.parents
+            assert on_site or file.suffix != ".md", f"{page.name}: the site does not have {target}"
             headings = re.findall(r"^#+ (.*)", file.read_text(), re.MULTILINE) if anchor else []
             anchors = [re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings]
             assert not anchor or anchor in anchors, f"{page.name}: {target}#{anchor}"
