@@ -169,6 +169,7 @@ class StreamHealth:
         else:
             timestamp, *seen = (getattr(message, name) for name in names)
         window = self._window
+        received = max(received, self._received or received)  # a step of the wall clock must not turn time back
         if received - window.start >= _WINDOW:
             if window.messages:
                 self._last_window = window
@@ -253,10 +254,12 @@ class Monitor:
         self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample received now, or at `received` [ns] of another clock; return False for a retained one."""
+        """Add a sample, received at `received` [ns] if another clock counts; return False for a retained one."""
         if sample.retained:
             return False
-        address, now = sample.address, time.monotonic_ns() if received is None else received
+        if received is None:  # not the time of reading: a reader that starts or lags would show a higher rate
+            received = time.monotonic_ns() - max(0, clock.utc_ns() - sample.received)
+        address = sample.address
         stream = self._streams.pop(address, None)
         if stream is None and len(self._streams) >= _MAX_STREAMS:
             if not self.evicted:
@@ -266,7 +269,7 @@ class Monitor:
             del self._streams[next(iter(self._streams))]
         self._streams[address] = stream = StreamHealth(sample.topic) if stream is None else stream
         missing = sample.provenance.missing
-        stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=missing)
+        stream.add(sample.message, received=received, latency=sample.latency, lost=sample.lost, missing=missing)
         return True
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:

@@ -200,22 +200,34 @@ def sample(vehicle: str, timestamp: int = 0) -> Sample:
     return Sample(message(timestamp), Address(vehicle, VLP), received=time.time_ns())
 
 
-def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rate and age use the monotonic clock: setting the wall clock back changes nothing."""
-    monitor, now, address = Monitor(), 100 * SECOND, Address("1", VLP)
+@pytest.mark.parametrize("step", [3600, -3600])
+def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Rate and age use the monotonic clock: setting the wall clock between arrival and reading changes nothing."""
+    monitor, now, utc, address = Monitor(), 10_000 * SECOND, 10_000 * SECOND, Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
-    monkeypatch.setattr("time.time_ns", lambda: 0)
-    monitor.add(sample("1"))
+    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: utc)
     for index in range(300):
-        now += SECOND // 100
-        if index == 150:
-            monkeypatch.setattr("time.time_ns", lambda: -3600 * SECOND)
-        monitor.add(sample("1", index * 10_000))
+        now, utc = now + SECOND // 100, utc + SECOND // 100
+        arrived = dataclasses.replace(sample("1", index * 10_000), received=utc)
+        utc += step * SECOND * (index == 150)
+        monitor.add(arrived)
     assert monitor.snapshot()[address].rate == pytest.approx(100.0)
     now += 7 * SECOND
     health = monitor.snapshot()[address]
     assert health.rate is None
     assert health.age == pytest.approx(7.0)
+
+
+def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples that arrive while a reader starts, and that it reads at once, do not raise the rate."""
+    monitor, now, start, address = Monitor(), SECOND, time.time_ns(), Address("1", VLP)
+    monkeypatch.setattr("time.monotonic_ns", lambda: now)
+    monkeypatch.setattr("nedbus.clock.utc_ns", lambda: start + now)
+    for index in range(151):
+        arrival = SECOND // 2 + index * SECOND // 100
+        now = max(now, arrival)
+        monitor.add(dataclasses.replace(sample("1", index * 10_000), received=start + arrival))
+    assert monitor.snapshot()[address].rate == pytest.approx(100.0)
 
 
 def test_monitor_is_bounded() -> None:
