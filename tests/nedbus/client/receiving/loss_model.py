@@ -157,6 +157,7 @@ class Simulation:
         self._reported = 0
         self._runs = [PublisherRun(slot, slot, cache) for slot, cache in enumerate(setting.caches)]
         self._running = list(self._runs)
+        self._newest: dict[int, PublisherRun] = {}  # per key, the run whose newest message arrived last
 
     def step(self, name: str, *arguments: int) -> None:
         """Run a step, then check the invariants."""
@@ -263,7 +264,7 @@ class Simulation:
         least = most - sum(map(self._unknown, self._runs))
         assert least <= total <= most, f"received + lost + dropped + invalid is {total}, not {least} to {most}"
         for run in self._runs:
-            if self._latest and run.arrived and run in self._running:
+            if self._latest and self._newest.get(run.slot) is run:
                 assert max(run.arrived) in {*run.read, *run.invalid}, "the newest message was not read"
             complete = run.whole and run.cache == UNLIMITED and not run.given_up
             if complete and not (self._latest or self._slow or self._overflowed):
@@ -285,6 +286,8 @@ class Simulation:
 
     def _add_arrived(self, arrived: Iterable[tuple[PublisherRun, int]]) -> None:
         for run, number in arrived:
+            if number > max(run.arrived, default=-1):
+                self._newest[run.slot] = run
             run.arrived.add(number)
         waiting = (number > max(run.read, default=-1) for run in self._runs for number in run.arrived)
         self._slow |= sum(waiting) > self.setting.capacity

@@ -66,6 +66,8 @@ SEEDS = [
     (InitialState("latest"), "publish 0 1, delay 0 1 1, deliver 2"),
     # 0 replaces 1, which is newer.
     (InitialState("latest"), "publish 0 2, delay 0 1, deliver 2"),
+    # 0 of the second run arrives before 1 of the first run, which is the latest by arrival.
+    (InitialState("latest"), "publish 0 2, deliver 1, restart 0, publish 0 1, delay 0 1, deliver 2"),
     # 1 counts as lost before it arrives.
     (InitialState("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
     # 1 and 2 are requested, but only 2 arrives: 1 is lost and not requested again.
