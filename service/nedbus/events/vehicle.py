@@ -15,7 +15,7 @@ from . import detectors
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
 from .detectors import ChangeDetector, Fields, Finding
 from .event import WINDOW, Condition, Event, State, explain, state_of
-from .kinds import KINDS, kinds_of
+from .kinds import KINDS
 from .position import PositionDetector
 from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
 from .times import format_duration
@@ -255,9 +255,9 @@ class Vehicle:
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
             if current != address:  # reopen unused streams, and end conditions of the old one
-                self._preferred[group], kinds = address, kinds_of(BY_TOPIC[topic].name)
+                self._preferred[group], message = address, BY_TOPIC[topic].name
                 self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
-                self._end(address, lambda kind, _: kind in kinds)
+                self._end(address, lambda kind, _: KINDS[kind].message == message)
         if group is POSITIONS:
             self.main, self._position = address, PositionDetector()
             return self._position
@@ -285,8 +285,8 @@ class Vehicle:
         old, self._ekf = self._ekf, instance
         if old == instance:
             return
-        stream, kinds = Address(self.name, _EKF, instance), kinds_of(BY_TOPIC[_EKF].name)
-        self._end(stream, lambda kind, flag: kind in kinds or flag.startswith(f"{instance}:"))
+        stream, message = Address(self.name, _EKF, instance), BY_TOPIC[_EKF].name
+        self._end(stream, lambda kind, flag: KINDS[kind].message == message or flag.startswith(f"{instance}:"))
         for each in (old, instance):
             detector = self._detectors.get(replace(stream, instance=each))
             for found in () if detector is None else detector.again(detectors.HEALTHY):
