@@ -33,7 +33,6 @@ class Finding:
     """A change detected in one message; Vehicle turns it into an event.
 
     `severity`: None for the default of its kind.
-    `first`: text for the end of a condition that was already active in the first message.
     `initial`: True if it was active in the first message: its condition begins without an event.
     `age`: time since it began [s].
     `switch`: True to ignore it unless it begins an inactive condition or ends an active one.
@@ -45,7 +44,6 @@ class Finding:
     names: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     severity: Severity | None = None
-    first: str = ""
     initial: bool = False
     age: float = 0.0
     switch: bool = False
@@ -159,8 +157,7 @@ def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterat
         for (is_event, change), flags in sorted(found.items()):
             severity: Severity | None = "info" if kind.minor.issuperset(flags) else None
             text = (kind.begin if change == "begin" else kind.end).format(", ".join(map(kind.flags.__getitem__, flags)))
-            names = tuple(flags)
-            yield Finding(kind.name, change, text, names, severity=severity, first=kind.first, initial=not is_event)
+            yield Finding(kind.name, change, text, tuple(flags), severity=severity, initial=not is_event)
 
 
 def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:

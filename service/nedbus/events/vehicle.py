@@ -205,8 +205,8 @@ class Vehicle:
             if known := [each.since for each in held if not each.initial]:
                 lasted = max(0.0, changed - min(known))
                 text = f"{text} after {format_duration(lasted)}"
-            elif found.first:
-                text = found.first
+            elif kind.first:
+                text = kind.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
         event = Event(
             self.name, found.kind, found.change, severity, text, time, boot, topic, found.numbers, found.names, lasted
