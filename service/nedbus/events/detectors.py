@@ -166,7 +166,7 @@ def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
     if level is not None and text:
         is_bad, is_watch = level <= LogMessage.CRITICAL, level <= LogMessage.WARNING
         severity: Severity = "bad" if is_bad else "watch" if is_watch else "info"
-        yield Finding("text", "once", text, (rules.LEVELS.get(level, str(level)),), {"level": level}, severity=severity)
+        yield Finding("text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity)
 
 
 def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
