@@ -13,7 +13,6 @@ from .kinds import Kind, Severity, flagged
 
 Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
-_NONE: Final[frozenset[str]] = frozenset()
 _UNKNOWN_SATELLITES: Final = 255
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _INTERFERENCE: Final = ("jamming_indicator", "jamming_state", "spoofing_state")
@@ -91,7 +90,7 @@ class ChangeDetector:
         self._detect = detect
         self.last: object = None
         self._state: tuple[Any, ...] = ()
-        self.missing = _NONE
+        self.missing = frozenset[str]()
         self.stamp = self.earlier = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
@@ -258,8 +257,7 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
         text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
         yield Finding("battery", "begin", text, numbers=numbers, severity=severity, initial=not before)
     else:
-        text = f"battery no longer {rules.WARNINGS.get(was, was)}{left}"
-        yield Finding("battery", "end", text, numbers=numbers)
+        yield Finding("battery", "end", f"battery no longer {rules.WARNINGS.get(was, was)}{left}", numbers=numbers)
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:

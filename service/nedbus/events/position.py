@@ -126,9 +126,8 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         numbers |= values
         known.append(text.format(**values, size=math.hypot(*size), degrees=math.degrees(size[0])))
     is_small = not unknown and all(abs(each) < SMALL_RESET for name, each in numbers.items() if name != "heading")
-    severity: Severity | None = "info" if is_small else None
     text = f"reset of {', '.join(known + unknown)}"
-    return Finding("reset", "once", text, tuple(quantities), numbers, severity=severity)
+    return Finding("reset", "once", text, tuple(quantities), numbers, severity="info" if is_small else None)
 
 
 def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:

@@ -26,8 +26,7 @@ _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference; conditions come from the best one received.
-_RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
-_GROUPS: Final = (POSITIONS, _RECEIVERS)
+_GROUPS: Final = (POSITIONS, ("vehicle_gps_position", "sensor_gps"))
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = detectors.FieldReader(_SAMPLE)
 
