@@ -14,5 +14,4 @@ from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle,
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import CLOCKS, Times, format_duration, format_since, format_utc, unit_of
-from .vehicle import Vehicle
 from .verdict import Verdict, verdict_of
