@@ -91,7 +91,6 @@ def check_services(seen: Observation) -> Iterator[Finding]:
 
 
 def _published(seen: Observation) -> list[str]:
-    """Return the addresses that services report as published."""
     return sorted({brief(address) for source in seen.sources for address in source.addresses})
 
 
@@ -141,10 +140,9 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     for name, report in by_vehicle(seen.accounts).items():
         now, current = report.now, report.vehicles[name]
         if vehicle in (None, name) and current.severity != "info" and not current.is_forgotten(now):
-            severity: State = "wrong" if current.severity == "bad" else "warning"
             advice = f"see the events before it with 'nedbus why --vehicle {name}'"
             text = f"{current.text[:_MAX_TEXT]}{format_since(current.since, now)}"
-            yield Finding("vehicle", name, severity, text, advice)
+            yield Finding("vehicle", name, "wrong" if current.severity == "bad" else "warning", text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission
@@ -158,8 +156,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
         if seen.services:
             advice = "a service answers: see the findings on its sources; it may publish other vehicles"
         text = f"{'no vehicle' if vehicle is None else 'not'} found under {seen.prefix}/"
-        state: State = "warning" if vehicle is None else "wrong"
-        yield Finding("vehicle", vehicle or "", state, text, advice)
+        yield Finding("vehicle", vehicle or "", "warning" if vehicle is None else "wrong", text, advice)
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:

@@ -110,7 +110,6 @@ class Observation:
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
     def _add(self, samples: Iterable[RawSample]) -> None:
-        """Add received messages; ignore addresses beyond _MAX_KEYS."""
         for sample in samples:
             address = self._address_of(str(sample.key_expr))
             if address is None or (address not in self.delays and len(self.delays) >= _MAX_KEYS):
@@ -146,7 +145,6 @@ def _least(*ages: float | None) -> float | None:
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
-    """Parse keys, and skip invalid ones."""
     parsed = []
     for key in keys:
         with suppress(ValueError):  # AddressError or DecodeError

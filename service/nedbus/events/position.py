@@ -114,7 +114,6 @@ class PositionDetector(ChangeDetector):
 
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
-    """Return the finding of a reset, with the size of the step in each quantity if known."""
     numbers: dict[str, float] = {}
     known, unknown = [], []
     for name in quantities:
