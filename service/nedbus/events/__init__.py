@@ -1,8 +1,4 @@
-"""Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
-
-To add a kind of event for a flag of a message, add a row to KINDS (`kinds.py`). A kind that depends on more than a flag
-also needs a detector that yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
-"""
+"""Vehicle events and their explanations, derived from messages, live or from a file; no I/O."""
 
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR
