@@ -128,9 +128,8 @@ class Observation:
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
     """Return a function that drains up to one full ring of samples; deleting it ends the subscription."""
-    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
     with translate_zenoh_errors():
-        subscriber = session.declare_subscriber(key_expr, channel)
+        subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING))
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 
 

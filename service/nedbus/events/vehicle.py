@@ -109,8 +109,7 @@ class Vehicle:
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
         self._count("dropout", time, round(1e3 * seconds))
-        if self.main is not None:
-            self._main_time = max(self._main_time, time + seconds)
+        self._main_time = max(self._main_time, time + seconds)
 
     def reject(self, topic: str, reason: str, time: float) -> None:
         """Record a rejected message."""
