@@ -159,8 +159,7 @@ def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterat
             yield Finding(kind.name, change, text, tuple(flags), severity=severity, initial=not is_event)
 
 
-def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield a LogMessage with PX4's severity."""
+def _detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
     level, text = after["severity"], after["text"]
     if level is not None and text:
         is_bad, is_watch = level <= LogMessage.CRITICAL, level <= LogMessage.WARNING
@@ -168,8 +167,7 @@ def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
         yield Finding("text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity)
 
 
-def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield changes of fix type, number of satellites, jamming and spoofing in a SensorGps."""
+def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
     fix, was = after["fix_type"], before.get("fix_type")
     satellites, earlier = after["satellites_used"], before.get("satellites_used")
     if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
@@ -215,7 +213,7 @@ def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
     }
 
 
-def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
+def _detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the end of fake position fusion in an EstimatorStatusFlags if no other horizontal aiding replaces it."""
     was, now = ([name for name in rules.AIDING if fields.get(name)] for fields in (before, after))
     if was and not now and rules.FAKE_AIDING.keys() >= set(was):
@@ -223,8 +221,7 @@ def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
         yield Finding("not_aided", "once", text)
 
 
-def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield changes of arming state and flight mode in a VehicleStatus."""
+def _detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("arming_state"), after["arming_state"]
     if now is not None and (was is None or (was == _ARMED) != (now == _ARMED)):
         kind = "armed" if now == _ARMED else "disarmed"
@@ -235,16 +232,14 @@ def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
         yield Finding("mode", "once", f"mode changed from {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
 
-def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield takeoff and landing from a VehicleLandDetected."""
+def _detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("landed"), after["landed"]
     if was is not None and now is not None and was != now:
         kind, text = ("landed", "landing detected") if now else ("takeoff", "takeoff detected")
         yield Finding(kind, "once", text)
 
 
-def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield battery warnings from a BatteryStatus."""
+def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     known = ({"connected": True, "warning": 0} | before, after)
     was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
     if warning is None or was is None or was == warning:
@@ -284,10 +279,10 @@ def detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Find
 
 # Detection beyond flags, by message.
 _FURTHER: Final[Mapping[str, Detection]] = {
-    "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), detect_aiding),
-    "LogMessage": (("severity", "text"), (), detect_text),
-    "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), detect_gps),
-    "VehicleStatus": (("arming_state", "nav_state"), (), detect_status),
-    "BatteryStatus": (("warning", "connected"), ("remaining",), detect_battery),
-    "VehicleLandDetected": (("landed",), (), detect_landing),
+    "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), _detect_aiding),
+    "LogMessage": (("severity", "text"), (), _detect_text),
+    "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), _detect_gps),
+    "VehicleStatus": (("arming_state", "nav_state"), (), _detect_status),
+    "BatteryStatus": (("warning", "connected"), ("remaining",), _detect_battery),
+    "VehicleLandDetected": (("landed",), (), _detect_landing),
 }
