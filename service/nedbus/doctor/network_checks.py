@@ -41,8 +41,7 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
     yield reading
     vehicle = seen.vehicle
     if vehicle is None:
-        advice = "test it with 'nedbus doctor --vehicle 1'"
-        yield Finding("write", "", "unknown", "write permission not tested", advice)
+        yield Finding("write", "", "unknown", "write permission not tested", "test it with 'nedbus doctor --vehicle 1'")
     elif seen.verdict == "allowed":
         yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe arrived")
     elif seen.verdict == "denied":  # not a fault of a reader
@@ -122,8 +121,7 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
             yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
         advice = "check that the vehicle is on and its link is up; the source recovers automatically"
-        seen = f"no more messages of {list_names(stale)}"
-        yield Finding("source", name, "warning", seen, advice)
+        yield Finding("source", name, "warning", f"no more messages of {list_names(stale)}", advice)
     if source.rejected > 0:
         why = f": {list_names(source.rejections)}" if source.rejections else ""
         advice = "rejected messages are not published; see the service's log or the @rejected keys for reasons"

@@ -164,8 +164,7 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
     had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
     if has and not had:
         text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
-        numbers = {"latitude": after["ref_lat"], "longitude": after["ref_lon"]}
-        yield Finding("origin_set", "once", text, numbers=numbers)
+        yield Finding("origin_set", "once", text, numbers={"latitude": after["ref_lat"], "longitude": after["ref_lon"]})
     elif has and had:
         moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(after["ref_lat"], after["ref_lon"])
         distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
@@ -173,5 +172,4 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
         if distance >= 0.01 or abs(up) >= 0.01:
             text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
             severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
-            numbers = {"distance": distance, "up": up}
-            yield Finding("origin_moved", "once", text, numbers=numbers, severity=severity)
+            yield Finding("origin_moved", "once", text, numbers={"distance": distance, "up": up}, severity=severity)

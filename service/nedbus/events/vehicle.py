@@ -114,8 +114,7 @@ class Vehicle:
     def reject(self, topic: str, reason: str, time: float) -> None:
         """Record a rejected message."""
         if "rejected" not in self._bursts:
-            text = f"{topic} rejected: {reason}"
-            self.emit(Finding("rejected", "begin", text, names=(topic, reason)), topic, time)
+            self.emit(Finding("rejected", "begin", f"{topic} rejected: {reason}", names=(topic, reason)), topic, time)
         self._count("rejected", time, 1, topic)
 
     def settle(self, time: float) -> None:
@@ -179,8 +178,7 @@ class Vehicle:
             keys = {(event.kind, event.names), (event.kind, None)}
             if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
                 kinds.add(event.kind)
-                text = f"{event.text} (flapping)"
-                found.append(Condition(event.kind, event.severity, text, event.time, event))
+                found.append(Condition(event.kind, event.severity, f"{event.text} (flapping)", event.time, event))
         return state_of(dict.fromkeys(found))  # a condition with several flags counts once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
@@ -295,8 +293,7 @@ class Vehicle:
         self._on_ground = {key: each for key, each in self._on_ground.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
-            ended = Finding(each.kind, "end", text, each.begin.names, initial=each.initial)
-            self.emit(ended, new.topic, self.time)
+            self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:
         """Reset the state; report the reboot once, even if delayed messages from before it follow."""
