@@ -73,7 +73,6 @@ def _describe_settings(settings: Settings) -> Iterator[Finding]:
 
 
 def _check_sources(settings: Settings) -> Iterator[Finding]:
-    """Yield the mistakes in the sources, as reported by `nedbus check`."""
     for mistake in check_sources(settings, settings.routers) if settings.source else ():
         yield Finding("settings", mistake.where, "wrong", mistake.reason, "correct it and restart the service")
 

@@ -29,7 +29,7 @@ def check_mavlink(link: str) -> Iterator[Finding]:
     """Listen to a link for 3 s and yield the findings; raise ConfigError for an invalid link."""
     try:
         with closing(open_link(link, baud=_BAUD)) as opened:
-            senders, systems, faults = _listen(opened, TIMINGS.listen)
+            senders, systems, faults = _listen(opened)
     except SourceError as exc:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check address, port or device, and permissions"
@@ -49,24 +49,18 @@ def check_mavlink(link: str) -> Iterator[Finding]:
         for (system, component), fault in sorted(faults.items())
         if system not in systems or not ignore_reason(system, component)
     )
-    yield from limit_findings(
-        _check_system(f"{link} system {number}", link, messages, TIMINGS.listen)
-        for number, messages in sorted(systems.items())
-    )
-    yield from limit_findings(
-        _check_log(f"{link} system {number}", link, messages, TIMINGS.listen)
-        for number, messages in sorted(systems.items())
-        if any(map(_is_px4, messages))
-    )
+    ordered = sorted(systems.items())
+    yield from limit_findings(_check_system(link, number, messages) for number, messages in ordered)
+    yield from limit_findings(_check_log(link, number, each) for number, each in ordered if any(map(_is_px4, each)))
 
 
-def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[int, int], str]]:
+def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[int, int], str]]:
     """Count packets by sender, collect messages by system and faults by component; request SDLOG_BACKEND from PX4."""
     faults: dict[tuple[int, int], str] = {}
     both = DuplicateIds()
     senders: Counter[str] = Counter()
     systems: dict[int, list[Any]] = {}
-    end, next_heartbeat, parser = time.monotonic() + seconds, 0.0, None
+    end, next_heartbeat, parser = time.monotonic() + TIMINGS.listen, 0.0, None
     sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
     heartbeat = dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
@@ -101,11 +95,12 @@ def _is_px4(message: Any) -> bool:
     return bool(message.get_type() == "HEARTBEAT" and message.autopilot == dialect.MAV_AUTOPILOT_PX4)
 
 
-def _check_system(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
+def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
+    name = f"{link} system {number}"
     counts = Counter(message.get_type() for message in messages)
     types = list_names(type_ for type_, _ in counts.most_common())
     if counts[_POSITION]:
-        seen = f"{_POSITION} at {counts[_POSITION] / seconds:.0f} Hz, of {types}"
+        seen = f"{_POSITION} at {counts[_POSITION] / TIMINGS.listen:.0f} Hz, of {types}"
         advice = "" if counts["ODOMETRY"] else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
         return Finding("mavlink", name, "ok", seen, advice)
     seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}: {types}"
@@ -116,21 +111,22 @@ def _check_system(name: str, link: str, messages: Sequence[Any], seconds: float)
     return Finding("mavlink", name, "warning", seen, advice)
 
 
-def _check_log(name: str, link: str, messages: Sequence[Any], seconds: float) -> Finding:
+def _check_log(link: str, number: int, messages: Sequence[Any]) -> Finding:
     """Check whether a PX4 can send its ULog stream on this link, without requesting it."""
+    name = f"{link} system {number}"
     data = [message for message in messages if message.get_type().startswith("LOGGING_DATA")]
     if clients := {f"system {each.target_system} component {each.target_component}" for each in data}:
         seen = f"sends its ULog stream to {list_names(sorted(clients))}"
         advice = "PX4 streams to one client: it refuses 'nedbus serve' while another one receives, unless log=take"
         return Finding("mavlink", name, "ok" if f"system {_SYSTEM} " in seen else "warning", seen, advice)
     values = [each.param_value for each in messages if getattr(each, "param_id", "") == _BACKEND]
-    (backend,) = (
-        struct.unpack("<i", struct.pack("<f", values[-1])) if values else (_TO_MAVLINK,)
-    )  # PX4 sends integers as the bytes of a float
+    backend = _TO_MAVLINK
+    if values:  # PX4 sends integers as the bytes of a float
+        (backend,) = struct.unpack("<i", struct.pack("<f", values[-1]))
     if not backend & _TO_MAVLINK:
         seen = f"{_BACKEND} is {backend}: PX4 refuses to send its ULog stream"
         return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 (file and MAVLink), and restart PX4")
     size = sum(len(message.get_msgbuf()) for message in messages)
-    seen = f"a PX4; the link carries {size / seconds / 1000:.0f} kB/s"
+    seen = f"a PX4; the link carries {size / TIMINGS.listen / 1000:.0f} kB/s"
     advice = f"for all fields of all topics: 'nedbus serve --source \"mavlink:{link}?log=1\"': docs/live.md"
     return Finding("mavlink", name, "ok", seen, advice)

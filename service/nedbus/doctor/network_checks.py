@@ -41,8 +41,7 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
     yield reading
     vehicle = seen.vehicle
     if vehicle is None:
-        advice = "test it with 'nedbus doctor --vehicle 1'"
-        yield Finding("write", "", "unknown", "write permission not tested", advice)
+        yield Finding("write", "", "unknown", "write permission not tested", "test it with 'nedbus doctor --vehicle 1'")
     elif seen.verdict == "allowed":
         yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe arrived")
     elif seen.verdict == "denied":  # not a fault of a reader
@@ -91,7 +90,6 @@ def check_services(seen: Observation) -> Iterator[Finding]:
 
 
 def _published(seen: Observation) -> list[str]:
-    """Return the addresses that services report as published."""
     return sorted({brief(address) for source in seen.sources for address in source.addresses})
 
 
@@ -123,8 +121,7 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
             yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
         advice = "check that the vehicle is on and its link is up; the source recovers automatically"
-        seen = f"no more messages of {list_names(stale)}"
-        yield Finding("source", name, "warning", seen, advice)
+        yield Finding("source", name, "warning", f"no more messages of {list_names(stale)}", advice)
     if source.rejected > 0:
         why = f": {list_names(source.rejections)}" if source.rejections else ""
         advice = "rejected messages are not published; see the service's log or the @rejected keys for reasons"
@@ -141,10 +138,9 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     for name, report in by_vehicle(seen.accounts).items():
         now, current = report.now, report.vehicles[name]
         if vehicle in (None, name) and current.severity != "info" and not current.is_forgotten(now):
-            severity: State = "wrong" if current.severity == "bad" else "warning"
             advice = f"see the events before it with 'nedbus why --vehicle {name}'"
             text = f"{current.text[:_MAX_TEXT]}{format_since(current.since, now)}"
-            yield Finding("vehicle", name, severity, text, advice)
+            yield Finding("vehicle", name, "wrong" if current.severity == "bad" else "warning", text, advice)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission
@@ -158,8 +154,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
         if seen.services:
             advice = "a service answers: see the findings on its sources; it may publish other vehicles"
         text = f"{'no vehicle' if vehicle is None else 'not'} found under {seen.prefix}/"
-        state: State = "warning" if vehicle is None else "wrong"
-        yield Finding("vehicle", vehicle or "", state, text, advice)
+        yield Finding("vehicle", vehicle or "", "warning" if vehicle is None else "wrong", text, advice)
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:

@@ -95,8 +95,7 @@ class Observation:
                 # several publishers, or a storage, may answer
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
-        tokens = token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
-        others = {key for key in tokens if not key.startswith("@")}
+        others = {key for key in token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT) if not key.startswith("@")}
         self._add(take_messages())
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
@@ -110,7 +109,6 @@ class Observation:
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
     def _add(self, samples: Iterable[RawSample]) -> None:
-        """Add received messages; ignore addresses beyond _MAX_KEYS."""
         for sample in samples:
             address = self._address_of(str(sample.key_expr))
             if address is None or (address not in self.delays and len(self.delays) >= _MAX_KEYS):
@@ -129,9 +127,8 @@ class Observation:
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
     """Return a function that drains up to one full ring of samples; deleting it ends the subscription."""
-    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
     with translate_zenoh_errors():
-        subscriber = session.declare_subscriber(key_expr, channel)
+        subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING))
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 
 
@@ -146,7 +143,6 @@ def _least(*ages: float | None) -> float | None:
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
-    """Parse keys, and skip invalid ones."""
     parsed = []
     for key in keys:
         with suppress(ValueError):  # AddressError or DecodeError

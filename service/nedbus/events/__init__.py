@@ -1,8 +1,4 @@
-"""Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
-
-To add a kind of event for a flag of a message, add a row to KINDS (`kinds.py`). A kind that depends on more than a flag
-also needs a detector that yields its findings (`detectors.py`, `position.py` or `contradictions.py`).
-"""
+"""Vehicle events and their explanations, derived from messages, live or from a file; no I/O."""
 
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR
@@ -14,5 +10,4 @@ from .report import ACCOUNT_PARAMETER, AccountReport, VehicleReport, by_vehicle,
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import CLOCKS, Times, format_duration, format_since, format_utc, unit_of
-from .vehicle import Vehicle
 from .verdict import Verdict, verdict_of

@@ -13,7 +13,6 @@ from .kinds import Kind, Severity, flagged
 
 Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
-_NONE: Final[frozenset[str]] = frozenset()
 _UNKNOWN_SATELLITES: Final = 255
 _ARMED: Final = VehicleStatus.ARMING_STATE_ARMED
 _INTERFERENCE: Final = ("jamming_indicator", "jamming_state", "spoofing_state")
@@ -33,7 +32,6 @@ class Finding:
     """A change detected in one message; Vehicle turns it into an event.
 
     `severity`: None for the default of its kind.
-    `first`: text for the end of a condition that was already active in the first message.
     `initial`: True if it was active in the first message: its condition begins without an event.
     `age`: time since it began [s].
     `switch`: True to ignore it unless it begins an inactive condition or ends an active one.
@@ -45,7 +43,6 @@ class Finding:
     names: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     severity: Severity | None = None
-    first: str = ""
     initial: bool = False
     age: float = 0.0
     switch: bool = False
@@ -93,7 +90,7 @@ class ChangeDetector:
         self._detect = detect
         self.last: object = None
         self._state: tuple[Any, ...] = ()
-        self.missing = _NONE
+        self.missing = frozenset[str]()
         self.stamp = self.earlier = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
@@ -159,21 +156,18 @@ def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterat
         for (is_event, change), flags in sorted(found.items()):
             severity: Severity | None = "info" if kind.minor.issuperset(flags) else None
             text = (kind.begin if change == "begin" else kind.end).format(", ".join(map(kind.flags.__getitem__, flags)))
-            names = tuple(flags)
-            yield Finding(kind.name, change, text, names, severity=severity, first=kind.first, initial=not is_event)
+            yield Finding(kind.name, change, text, tuple(flags), severity=severity, initial=not is_event)
 
 
-def detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield a LogMessage with PX4's severity."""
+def _detect_text(_: Fields, after: Fields) -> Iterator[Finding]:
     level, text = after["severity"], after["text"]
     if level is not None and text:
         is_bad, is_watch = level <= LogMessage.CRITICAL, level <= LogMessage.WARNING
         severity: Severity = "bad" if is_bad else "watch" if is_watch else "info"
-        yield Finding("text", "once", text, (rules.LEVELS.get(level, str(level)),), {"level": level}, severity=severity)
+        yield Finding("text", "once", text, (rules.LEVELS[level],), {"level": level}, severity=severity)
 
 
-def detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield changes of fix type, number of satellites, jamming and spoofing in a SensorGps."""
+def _detect_gps(before: Fields, after: Fields) -> Iterator[Finding]:
     fix, was = after["fix_type"], before.get("fix_type")
     satellites, earlier = after["satellites_used"], before.get("satellites_used")
     if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
@@ -219,7 +213,7 @@ def _gps_levels(gps: Fields) -> dict[str, tuple[int | None, str, str, Fields]]:
     }
 
 
-def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
+def _detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the end of fake position fusion in an EstimatorStatusFlags if no other horizontal aiding replaces it."""
     was, now = ([name for name in rules.AIDING if fields.get(name)] for fields in (before, after))
     if was and not now and rules.FAKE_AIDING.keys() >= set(was):
@@ -227,8 +221,7 @@ def detect_aiding(before: Fields, after: Fields) -> Iterator[Finding]:
         yield Finding("not_aided", "once", text)
 
 
-def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield changes of arming state and flight mode in a VehicleStatus."""
+def _detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("arming_state"), after["arming_state"]
     if now is not None and (was is None or (was == _ARMED) != (now == _ARMED)):
         kind = "armed" if now == _ARMED else "disarmed"
@@ -239,16 +232,14 @@ def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
         yield Finding("mode", "once", f"mode changed from {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
 
-def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield takeoff and landing from a VehicleLandDetected."""
+def _detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
     was, now = before.get("landed"), after["landed"]
     if was is not None and now is not None and was != now:
         kind, text = ("landed", "landing detected") if now else ("takeoff", "takeoff detected")
         yield Finding(kind, "once", text)
 
 
-def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield battery warnings from a BatteryStatus."""
+def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
     known = ({"connected": True, "warning": 0} | before, after)
     was, warning = (0 if each["connected"] is False else cast("int | None", each["warning"]) for each in known)
     if warning is None or was is None or was == warning:
@@ -261,8 +252,7 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
         text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
         yield Finding("battery", "begin", text, numbers=numbers, severity=severity, initial=not before)
     else:
-        text = f"battery no longer {rules.WARNINGS.get(was, was)}{left}"
-        yield Finding("battery", "end", text, numbers=numbers)
+        yield Finding("battery", "end", f"battery no longer {rules.WARNINGS.get(was, was)}{left}", numbers=numbers)
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
@@ -289,10 +279,10 @@ def detect_unused(instance: int, before: Fields, after: Fields) -> Iterator[Find
 
 # Detection beyond flags, by message.
 _FURTHER: Final[Mapping[str, Detection]] = {
-    "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), detect_aiding),
-    "LogMessage": (("severity", "text"), (), detect_text),
-    "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), detect_gps),
-    "VehicleStatus": (("arming_state", "nav_state"), (), detect_status),
-    "BatteryStatus": (("warning", "connected"), ("remaining",), detect_battery),
-    "VehicleLandDetected": (("landed",), (), detect_landing),
+    "EstimatorStatusFlags": ((*rules.FAKE_AIDING,), (), _detect_aiding),
+    "LogMessage": (("severity", "text"), (), _detect_text),
+    "SensorGps": (("fix_type", "satellites_used", *_INTERFERENCE), (), _detect_gps),
+    "VehicleStatus": (("arming_state", "nav_state"), (), _detect_status),
+    "BatteryStatus": (("warning", "connected"), ("remaining",), _detect_battery),
+    "VehicleLandDetected": (("landed",), (), _detect_landing),
 }

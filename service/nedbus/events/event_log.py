@@ -30,7 +30,6 @@ MAX_GONE: Final = 50
 """Maximum number of gone vehicles remembered, unless more vehicles were ever present at once."""
 
 _SHARE: Final = 20  # events guaranteed to each vehicle while others have more
-_NONE: Final[frozenset[str]] = frozenset()
 
 
 class EventLog:
@@ -70,7 +69,7 @@ class EventLog:
         return self._common.conditions.get(("overload", ""))
 
     def add(
-        self, address: Address, message: object, time: float, *, missing: frozenset[str] = _NONE, lost: int = 0
+        self, address: Address, message: object, time: float, *, missing: frozenset[str] = frozenset(), lost: int = 0
     ) -> None:
         """Add a message: a model, a row, or a dict of fields.
 

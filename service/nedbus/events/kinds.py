@@ -196,8 +196,3 @@ def rank_vehicle(name: str, severity: Severity) -> tuple[int, str]:
 def flagged(message: str) -> list[Kind]:
     """Return the kinds detected from flags of a message."""
     return [kind for kind in KINDS.values() if kind.message == message and kind.flags]
-
-
-def kinds_of(message: str) -> frozenset[str]:
-    """Return the names of all kinds detected in a message."""
-    return frozenset(kind.name for kind in KINDS.values() if kind.message == message)

@@ -114,7 +114,6 @@ class PositionDetector(ChangeDetector):
 
 
 def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Finding:
-    """Return the finding of a reset, with the size of the step in each quantity if known."""
     numbers: dict[str, float] = {}
     known, unknown = [], []
     for name in quantities:
@@ -126,9 +125,8 @@ def _reset(quantities: Sequence[Quantity], before: Fields, after: Fields) -> Fin
         numbers |= values
         known.append(text.format(**values, size=math.hypot(*size), degrees=math.degrees(size[0])))
     is_small = not unknown and all(abs(each) < SMALL_RESET for name, each in numbers.items() if name != "heading")
-    severity: Severity | None = "info" if is_small else None
     text = f"reset of {', '.join(known + unknown)}"
-    return Finding("reset", "once", text, tuple(quantities), numbers, severity=severity)
+    return Finding("reset", "once", text, tuple(quantities), numbers, severity="info" if is_small else None)
 
 
 def _size_of_reset(name: Quantity, before: Fields, after: Fields) -> tuple[float, ...] | None:
@@ -166,8 +164,7 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
     had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
     if has and not had:
         text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
-        numbers = {"latitude": after["ref_lat"], "longitude": after["ref_lon"]}
-        yield Finding("origin_set", "once", text, numbers=numbers)
+        yield Finding("origin_set", "once", text, numbers={"latitude": after["ref_lat"], "longitude": after["ref_lon"]})
     elif has and had:
         moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(after["ref_lat"], after["ref_lon"])
         distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
@@ -175,5 +172,4 @@ def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
         if distance >= 0.01 or abs(up) >= 0.01:
             text = f"origin moved by {distance:.1f} m, {up:z.1f} m up"
             severity: Severity | None = "info" if max(distance, abs(up)) < SMALL_RESET else None
-            numbers = {"distance": distance, "up": up}
-            yield Finding("origin_moved", "once", text, numbers=numbers, severity=severity)
+            yield Finding("origin_moved", "once", text, numbers={"distance": distance, "up": up}, severity=severity)

@@ -95,7 +95,5 @@ FIXES: Final[Mapping[int, str]] = {
 WARNINGS: Final[Mapping[int, str]] = {
     1: "low", 2: "critical", 3: "emergency", 4: "failed", 6: "unhealthy", 7: "charging",
 }  # fmt: skip
-LEVELS: Final[Mapping[int, str]] = dict(
-    enumerate(("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"))
-)
+LEVELS: Final = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 """Names of LogMessage.severity, as in MAV_SEVERITY."""

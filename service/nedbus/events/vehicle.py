@@ -15,7 +15,7 @@ from . import detectors
 from .contradictions import REFERENCES, Comparison, ReferenceDetector
 from .detectors import ChangeDetector, Fields, Finding
 from .event import WINDOW, Condition, Event, State, explain, state_of
-from .kinds import KINDS, kinds_of
+from .kinds import KINDS
 from .position import PositionDetector
 from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, MAX_SINGLE, PAUSE, POSITIONS, RECENT
 from .times import format_duration
@@ -26,8 +26,7 @@ _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle; bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
 # Groups of topics in order of preference; conditions come from the best one received.
-_RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
-_GROUPS: Final = (POSITIONS, _RECEIVERS)
+_GROUPS: Final = (POSITIONS, ("vehicle_gps_position", "sensor_gps"))
 _SAMPLE: Final = ("timestamp_sample", "x", "y", "z")  # compared to find the primary EKF
 _read_sample: Final = detectors.FieldReader(_SAMPLE)
 
@@ -110,14 +109,12 @@ class Vehicle:
     def add_dropout(self, seconds: float, time: float) -> None:
         """Record a logging dropout that starts at `time`; it does not count as silence of the vehicle."""
         self._count("dropout", time, round(1e3 * seconds))
-        if self.main is not None:
-            self._main_time = max(self._main_time, time + seconds)
+        self._main_time = max(self._main_time, time + seconds)
 
     def reject(self, topic: str, reason: str, time: float) -> None:
         """Record a rejected message."""
         if "rejected" not in self._bursts:
-            text = f"{topic} rejected: {reason}"
-            self.emit(Finding("rejected", "begin", text, names=(topic, reason)), topic, time)
+            self.emit(Finding("rejected", "begin", f"{topic} rejected: {reason}", names=(topic, reason)), topic, time)
         self._count("rejected", time, 1, topic)
 
     def settle(self, time: float) -> None:
@@ -181,8 +178,7 @@ class Vehicle:
             keys = {(event.kind, event.names), (event.kind, None)}
             if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
                 kinds.add(event.kind)
-                text = f"{event.text} (flapping)"
-                found.append(Condition(event.kind, event.severity, text, event.time, event))
+                found.append(Condition(event.kind, event.severity, f"{event.text} (flapping)", event.time, event))
         return state_of(dict.fromkeys(found))  # a condition with several flags counts once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
@@ -205,8 +201,8 @@ class Vehicle:
             if known := [each.since for each in held if not each.initial]:
                 lasted = max(0.0, changed - min(known))
                 text = f"{text} after {format_duration(lasted)}"
-            elif found.first:
-                text = found.first
+            elif kind.first:
+                text = kind.first
         boot = None if self.boot is None else round(self.boot + time - self.time, 6)
         event = Event(
             self.name, found.kind, found.change, severity, text, time, boot, topic, found.numbers, found.names, lasted
@@ -255,9 +251,9 @@ class Vehicle:
                 detect = partial(self._detect_equal, instance)
                 return ChangeDetector(_SAMPLE, (), detect) if is_sought else None
             if current != address:  # reopen unused streams, and end conditions of the old one
-                self._preferred[group], kinds = address, kinds_of(BY_TOPIC[topic].name)
+                self._preferred[group], message = address, BY_TOPIC[topic].name
                 self._detectors = {each: found for each, found in self._detectors.items() if found and each != current}
-                self._end(address, lambda kind, _: kind in kinds)
+                self._end(address, lambda kind, _: KINDS[kind].message == message)
         if group is POSITIONS:
             self.main, self._position = address, PositionDetector()
             return self._position
@@ -285,8 +281,8 @@ class Vehicle:
         old, self._ekf = self._ekf, instance
         if old == instance:
             return
-        stream, kinds = Address(self.name, _EKF, instance), kinds_of(BY_TOPIC[_EKF].name)
-        self._end(stream, lambda kind, flag: kind in kinds or flag.startswith(f"{instance}:"))
+        stream, message = Address(self.name, _EKF, instance), BY_TOPIC[_EKF].name
+        self._end(stream, lambda kind, flag: KINDS[kind].message == message or flag.startswith(f"{instance}:"))
         for each in (old, instance):
             detector = self._detectors.get(replace(stream, instance=each))
             for found in () if detector is None else detector.again(detectors.HEALTHY):
@@ -297,8 +293,7 @@ class Vehicle:
         self._on_ground = {key: each for key, each in self._on_ground.items() if not is_over(*key)}
         for each in dict.fromkeys(each for key, each in self.conditions.items() if is_over(*key)):
             text = f"{each.text}: superseded by {new.stream}"
-            ended = Finding(each.kind, "end", text, each.begin.names, initial=each.initial)
-            self.emit(ended, new.topic, self.time)
+            self.emit(Finding(each.kind, "end", text, each.begin.names, initial=each.initial), new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:
         """Reset the state; report the reboot once, even if delayed messages from before it follow."""

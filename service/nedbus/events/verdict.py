@@ -109,7 +109,6 @@ def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[
 
 
 def _count(story: Story, stories: Iterable[Story]) -> str:
-    """Return " (one of N)" if there are several faults of this kind, else ""."""
     number = sum(each.spans[0].kind == story.spans[0].kind for each in stories)
     return f" (one of {number})" if number > 1 else ""
 

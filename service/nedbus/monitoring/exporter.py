@@ -1,7 +1,4 @@
-"""Metrics exporter that subscribes to streams, for networks without a nedbus service to scrape.
-
-Needs the extra `metrics`.
-"""
+"""Metrics exporter for networks without a nedbus service to scrape; needs the extra `metrics`."""
 
 import socket
 import threading

@@ -99,7 +99,5 @@ class Observer:
                     del healths[address]
                     with self._lock:
                         self.monitor.forget(address)
-        behind = ""
-        if self.event_log.overload is not None:
-            behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped"
+        behind = f"reader overloaded: {waiting} messages queued, {dropped} dropped" if self.event_log.overload else ""
         return Snapshot(now, healths, alive, rejected, link, behind)
