@@ -118,8 +118,6 @@ class RecordingReader(ExitStack):
 
 
 class _RecordedFile:
-    """One MCAP file open for reading, with the schemas and channels known so far."""
-
     def __init__(self, path: Path, vehicle: str) -> None:
         self.name = path.name
         self._vehicle = vehicle

@@ -46,7 +46,6 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
-"""All kinds of source, by name."""
 
 
 @dataclass(frozen=True, slots=True)
