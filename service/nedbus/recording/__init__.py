@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .alignment import align
     from .arrays import Flight, addresses_of, missing_of
     from .flight_files import check_recording, distinct_names, find_format, format_of, matching, open_flight
-    from .mcap_reader import RecordedMessage, RecordedStream, RecordingReader
+    from .mcap_reader import RecordedMessage, RecordingReader
     from .mcap_writer import RecordingWriter
     from .plot import MAX_STREAMS, draw
     from .reading import read
@@ -27,7 +27,7 @@ else:
         ("", "flight_files"): "check_recording distinct_names find_format format_of matching open_flight",
         ("", "ulog_reader"): "UlogReader",
         ("", "utc"): "UtcOffset utc_of",
-        ("mcap", "mcap_reader"): "RecordedMessage RecordedStream RecordingReader",
+        ("mcap", "mcap_reader"): "RecordedMessage RecordingReader",
         ("mcap", "recorder"): "Recorder",
         ("mcap", "mcap_writer"): "RecordingWriter",
         ("plot", "plot"): "MAX_STREAMS draw",

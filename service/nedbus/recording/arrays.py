@@ -210,7 +210,6 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
 
 
 def _decode_fields(definition: Definition[Any], chunk: Sequence[Any]) -> _Decoded:
-    """Validate messages whose fields are given by name."""
     decoded = _Decoded.empty(definition, len(chunk))
     for index, each in enumerate(chunk):
         with suppress(ValidationError):

@@ -33,8 +33,6 @@ READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryErro
 """Errors that the mcap package and the decompressors raise for a damaged file."""
 
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
-"""Magic number of zstd frames."""
-
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
 _SURPLUS: Final = range(_RECORD_HEAD.size)  # bytes that may follow a record's known fields: too few for another record
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, uncompressed size, CRC, length of the compression name
@@ -220,7 +218,6 @@ def _unpack_chunk(record: bytes) -> bytes:
 
 
 def _describe(chunk: bytes, offset: int) -> str:
-    """Return byte offset and time range of a chunk as text."""
     if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
         return f"at byte {offset}"
     start, end, *_ = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)

@@ -118,8 +118,6 @@ class RecordingReader(ExitStack):
 
 
 class _RecordedFile:
-    """One MCAP file open for reading, with the schemas and channels known so far."""
-
     def __init__(self, path: Path, vehicle: str) -> None:
         self.name = path.name
         self._vehicle = vehicle
@@ -212,10 +210,10 @@ class _RecordedFile:
             if self._definition_budget < 0:
                 raise ValueError("the definitions in this file exceed the limit, which is the size of 250 PX4 topics")
             self._definition_budget -= len(schema.data) // 256
-            known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
-            self._definition_budget -= 32 + len(read_msg(text))
-            definition = known or define_msg(schema.name.rpartition("/")[2], text)
-            types = {field.name: field.type for field in read_msg(text)} if known else definition.types
+            text = schema.data.decode(errors="replace")
+            types = {field.name: field.type for field in read_msg(text)}
+            self._definition_budget -= 32 + len(types)
+            definition = ros2_types().get(schema.name) or define_msg(schema.name.rpartition("/")[2], text)
             same = (each for each in definition.layouts.values() if [*each.types.items()] == [*types.items()])
             self._layouts[schema.id] = definition, next(same, None) or self._own_layout(definition, types, topic)
         return self._layouts[schema.id]

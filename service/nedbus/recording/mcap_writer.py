@@ -74,7 +74,7 @@ class RecordingWriter:
             with _writing(self.path):
                 sync_folder(self.path)
         except OutputError:
-            self._file.close()
+            self._file.raw.close()
             self.path.unlink(missing_ok=True)
             raise
         self._schemas: dict[tuple[str, str], int] = {}  # by type and text
@@ -146,9 +146,9 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
-        if self._file.closed:
+        if self._file.raw.closed:
             return
-        with closing(self._file), _writing(self.path):
+        with closing(self._file.raw), _writing(self.path):
             self._writer.finish()
             self._file.sync(end=b"")
 
@@ -157,7 +157,7 @@ class RecordingWriter:
 
     def __exit__(self, *exc: object) -> None:
         if isinstance(exc[1], OutputError):
-            self._file.close()  # finishing the file would fail again
+            self._file.raw.close()  # finishing the file would fail again
         else:
             self.close()
 
@@ -196,7 +196,6 @@ def _encode_log(vehicle: str, message: LogMessage, time_ns: int) -> bytes:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Translate an OSError in the block to OutputError."""
     try:
         yield
     except OSError as exc:
@@ -207,10 +206,9 @@ class _AppendFile:
     """An append-only file for the MCAP writer; after each `sync` it ends with a valid footer."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("xb", buffering=0)
+        self.raw = path.open("xb", buffering=0)
         self._pending = bytearray()
         self._offset = 0
-        self.closed = False
 
     def write(self, data: bytes) -> int:
         self._pending += data
@@ -230,21 +228,17 @@ class _AppendFile:
         self._pending.clear()
         try:
             self._write_at_offset(pending + end)
-            self._file.truncate(self._offset + len(pending) + len(end))
+            self.raw.truncate(self._offset + len(pending) + len(end))
         except OSError:
-            self._file.truncate(self._offset)
+            self.raw.truncate(self._offset)
             self._write_at_offset(_END)
             raise
-        os.fsync(self._file.fileno())
+        os.fsync(self.raw.fileno())
         self._offset += len(pending)
-        if not os.fstat(self._file.fileno()).st_nlink:
+        if not os.fstat(self.raw.fileno()).st_nlink:
             raise OSError(errno.ESTALE, "the file was deleted while it was being written")
 
     def _write_at_offset(self, data: bytes) -> None:
         rest = memoryview(data)
         while rest:
-            rest = rest[os.pwrite(self._file.fileno(), rest, self._offset + len(data) - len(rest)) :]
-
-    def close(self) -> None:
-        self.closed = True
-        self._file.close()
+            rest = rest[os.pwrite(self.raw.fileno(), rest, self._offset + len(data) - len(rest)) :]

@@ -74,7 +74,7 @@ class _Mark(NamedTuple):
 
 def draw(
     streams: Sequence[tuple[Address, MessageArray]],
-    path: str | Path,
+    path: Path,
     *,
     title: str,
     events: Iterable[Event] = (),
@@ -90,14 +90,14 @@ def draw(
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
-    if Path(path).suffix.lower() not in _SUFFIXES:
+    if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(str(path), f"not an image format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
-        with atomic_write(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
-            figure = draw_figure(streams, title=title, events=events, times=times)
-            figure.savefig(part)  # a glyph that the font lacks is only a warning
+        # A glyph that the font lacks is only a warning.
+        with atomic_write(path, replace=True) as part, warnings.catch_warnings(action="ignore"):
+            draw_figure(streams, title=title, events=events, times=times).savefig(part)
     except OSError as exc:
-        raise OutputError(Path(path), exc) from exc
+        raise OutputError(path, exc) from exc
 
 
 def draw_figure(

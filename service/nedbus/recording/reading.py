@@ -29,31 +29,25 @@ _Files = FlightPath | Sequence[FlightPath]
 _Topics = list[str] | tuple[str, ...]
 
 
-class _StreamFilter(TypedDict, total=False):
+class _Filter(TypedDict, total=False):
     vehicle: str | int
     instance: int | None
 
 
 @overload
-def read(
-    path: str | Path, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_StreamFilter]
-) -> MessageArray: ...
+def read(path: FlightPath, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_Filter]) -> MessageArray: ...
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_StreamFilter]) -> pd.DataFrame: ...
+def read(path: FlightPath, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_Filter]) -> pd.DataFrame: ...
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_StreamFilter]) -> pl.DataFrame: ...
+def read(path: FlightPath, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_Filter]) -> pl.DataFrame: ...
 @overload
 def read(
-    path: _Files, topic: _Topics, *, dataframe: None = None, **stream: Unpack[_StreamFilter]
+    path: _Files, topic: _Topics, *, dataframe: None = None, **stream: Unpack[_Filter]
 ) -> dict[str, MessageArray]: ...
 @overload
-def read(
-    path: _Files, topic: _Topics, *, dataframe: Pandas, **stream: Unpack[_StreamFilter]
-) -> dict[str, pd.DataFrame]: ...
+def read(path: _Files, topic: _Topics, *, dataframe: Pandas, **stream: Unpack[_Filter]) -> dict[str, pd.DataFrame]: ...
 @overload
-def read(
-    path: _Files, topic: _Topics, *, dataframe: Polars, **stream: Unpack[_StreamFilter]
-) -> dict[str, pl.DataFrame]: ...
+def read(path: _Files, topic: _Topics, *, dataframe: Polars, **stream: Unpack[_Filter]) -> dict[str, pl.DataFrame]: ...
 def read(
     path: _Files,
     topic: str | _Topics = DEFAULT_TOPIC,

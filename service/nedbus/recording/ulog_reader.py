@@ -104,7 +104,6 @@ class UlogReader:
             raise SourceError(str(self._path), (exc.strerror or str(exc)).lower()) from exc
 
     def _process(self, record: ulog.Record) -> None:
-        """Process a record that is not a message."""
         if isinstance(record, ulog.Header):
             self.start = record.timestamp
         elif isinstance(record, ulog.Information):

@@ -76,7 +76,6 @@ def utc_of(
 
 
 def _find_utc(streams: Mapping[str, MessageArray], boot_utc: int = 0) -> UtcOffset | None:
-    """Return the offset from the best source among these streams, or None."""
     unix = sum(int(np.sum(is_unix_time(messages["timestamp"]))) for messages in streams.values())
     if unix > sum(map(len, streams.values())) / 2:
         return UtcOffset("timestamp", 0, unix, 0)

@@ -35,9 +35,8 @@ def convert(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[i
     try:
         with atomic_write(path) as part:
             return _write(run, part, source=source, on_progress=on_progress)
-    except OSError as exc:
-        cause = exc.__cause__ if isinstance(exc, OutputError) else exc
-        raise OutputError(path, cause if isinstance(cause, OSError) else exc) from exc
+    except OSError as exc:  # an OutputError names the temporary file
+        raise OutputError(path, exc.__cause__ if isinstance(exc.__cause__, OSError) else exc) from exc
 
 
 def _write(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:

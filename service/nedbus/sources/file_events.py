@@ -73,15 +73,11 @@ class Flights:
         return tuple(found)
 
     @cached_property
-    def times(self) -> Times:
+    def times(self) -> Times:  # lazy, since it loads NumPy
         """The UTC offset of each vehicle whose messages contain UTC."""
-        return Times(offsets={name: utc.offset_us / 1e6 for name, utc in self._utc.items()})
-
-    @cached_property
-    def _utc(self) -> dict[str, recording.UtcOffset]:  # lazy, since it loads NumPy
         names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
         found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
-        return {name: utc for name, utc in found if utc is not None}
+        return Times(offsets={name: utc.offset_us / 1e6 for name, utc in found if utc is not None})
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages in chronological order; raise SourceError for several files if one has no UTC."""
@@ -96,9 +92,9 @@ class Flights:
         """Return the Unix time of the start of a file [s]."""
         ahead = list(islice(run.messages, _LOOKAHEAD))
         run.messages = chain(ahead, run.messages)
-        known = ((self._utc.get(names[each.address.vehicle]), each) for each in ahead if not each.error)
-        times = ((utc.unix_us(cast("int", each.fields["timestamp"])), each.due) for utc, each in known if utc)
-        found = [float(unix) / 1e6 - due for unix, due in times]
+        known = ((each, cast("int", each.fields["timestamp"]) / 1e6) for each in ahead if not each.error)
+        times = ((self.times.utc_of_boot(names[each.address.vehicle], boot), each.due) for each, boot in known)
+        found = [utc - due for utc, due in times if utc is not None]
         if not found:
             raise SourceError(str(path), "no message provides UTC, which merging several files requires: read it alone")
         return median(found)

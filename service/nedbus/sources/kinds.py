@@ -46,7 +46,6 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
-"""All kinds of source, by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +114,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
 
 def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
     """Return the source text of a file, such as `ulog:flight.ulg?vehicle=7`; raise ConfigError for other suffixes."""
-    name = format_of(path)
-    return _join(name, SOURCE_KINDS[name], str(path), {key: value for key, value in options.items() if value})
+    return _join(format_of(path), str(path), {key: value for key, value in options.items() if value})
 
 
 def _text_of_table(table: Mapping[str, object]) -> str:
@@ -131,7 +129,7 @@ def _text_of_table(table: Mapping[str, object]) -> str:
     target = options.pop(target_name, "")
     if not isinstance(target, str) or not kind.accepts(target):
         raise ConfigError(f"source {name!r}", f'it needs {target_name} = "..."', key=target_name)
-    return _join(str(name), kind, target, {key: _text_of_value(value) for key, value in options.items()})
+    return _join(str(name), target, {key: _text_of_value(value) for key, value in options.items()})
 
 
 def _text_of_value(value: object) -> str:
@@ -143,8 +141,8 @@ def _text_of_value(value: object) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
-def _join(name: str, kind: SourceKind, target: str, options: Mapping[str, str]) -> str:
+def _join(kind: str, target: str, options: Mapping[str, str]) -> str:
     """Return the text of a source, with % and ? escaped in a path."""
-    path = target.replace("%", "%25").replace("?", "%3F") if kind.target == "FILE" else target
+    path = target.replace("%", "%25").replace("?", "%3F") if SOURCE_KINDS[kind].target == "FILE" else target
     query = urlencode(options, safe=":,/")
-    return f"{name}:{path}?{query}" if query else f"{name}:{path}"
+    return f"{kind}:{path}?{query}" if query else f"{kind}:{path}"

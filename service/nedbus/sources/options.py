@@ -9,10 +9,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from nedbus_msgs import ANY, DEFAULT, MESSAGES, RELEASES, TOPICS, check_vehicle, get_topic
 
 
-def _parse_vehicles(text: object) -> object:
+def _parse_vehicles(text: str) -> Mapping[str, str]:
     """Parse `NAME:VEHICLE,NAME:VEHICLE`."""
-    if not isinstance(text, str):
-        return text
     parts = [part.strip().rpartition(":") for part in text.split(",")]
     vehicles = {name.strip("/"): vehicle for name, _, vehicle in parts}
     for vehicle in vehicles.values():

@@ -56,16 +56,18 @@ Vector = tuple[float, ...]  # north, east, down
 
 
 class Truth(NamedTuple):
-    """The truth in local NED: position [m], velocity, acceleration, heading [rad]; latitude, longitude, altitude."""
+    """The truth at a time since the start [s]: timestamp [us], motion in local NED [SI units], origin [deg, m]."""
 
+    time: float
+    timestamp: int
     position: Vector
     velocity: Vector
     acceleration: Vector
     heading: float
-    origin: tuple[float, float, float] = _REFERENCE
+    origin: tuple[float, float, float]
 
 
-def truth_at(time: float, direction: float, origin: tuple[float, float, float] = _REFERENCE) -> Truth:
+def truth_at(time: float, direction: float, origin: tuple[float, float, float]) -> Truth:
     """Return the truth at a time [s] since the start; `direction` [rad] rotates the figures."""
     positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
     axes = list(zip(*positions, strict=True))
@@ -73,7 +75,7 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float] =
     acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
     moving = math.hypot(velocity[0], velocity[1]) > 0.5
     heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(direction + math.pi / 4)
-    return Truth(positions[1], velocity, acceleration, heading, origin)
+    return Truth(time, _BOOT + round(time * 1e6), positions[1], velocity, acceleration, heading, origin)
 
 
 def _position(time: float, direction: float) -> Vector:
@@ -89,18 +91,15 @@ def _position(time: float, direction: float) -> Vector:
 
 
 class _State(NamedTuple):
-    """State of an estimate: errors [SI units], dead reckoning [s], counts and deltas of resets."""
+    """State of an estimate: errors [SI units], dead reckoning [s], validity, counts and deltas of resets."""
 
     position: tuple[float, float, float]
     velocity: tuple[float, float, float]
     heading: float
     dead_reckoning: float
+    xy_valid: bool
     counters: Mapping[str, int]
     deltas: Mapping[str, Any]
-
-    @property
-    def xy_valid(self) -> bool:
-        return self.dead_reckoning < _MAX_DEAD_RECKONING
 
 
 class Estimator:
@@ -117,17 +116,13 @@ class Estimator:
         self._north, self._east = math.cos(direction), math.sin(direction)  # direction of the drift
         self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
 
-    def xy_valid(self, time: float) -> bool:
-        """Return whether horizontal position and velocity are valid."""
-        return self._at(time).xy_valid
-
-    def fields(self, time: float, truth: Truth) -> dict[str, object]:
+    def fields(self, truth: Truth) -> dict[str, object]:
         """Return the local position; its limits are infinite, as EKF2 sends them."""
-        state = self._at(time)
+        state = self._at(truth.time)
         position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
         velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
         return {
-            **_motion(time, position, velocity, truth, has_origin=time >= _ORIGIN_SET),
+            **_motion(position, velocity, truth, has_origin=truth.time >= _ORIGIN_SET),
             **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
             **{f"delta_{name}": delta for name, delta in state.deltas.items()},
             **{f"{name}_reset_counter": count for name, count in state.counters.items()},
@@ -139,28 +134,43 @@ class Estimator:
             **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
         }  # fmt: skip
 
-    def attitude(self, time: float, truth: Truth) -> dict[str, object]:
+    def attitude(self, truth: Truth) -> dict[str, object]:
         """Return the attitude of a multicopter whose thrust causes the acceleration, without wind."""
-        state, (ax, ay, az) = self._at(time), truth.acceleration
+        state, (ax, ay, az) = self._at(truth.time), truth.acceleration
         cos, sin = math.cos(truth.heading), math.sin(truth.heading)
         forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
         roll = math.atan2(right, math.hypot(forward, up))
         q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + state.heading)
         delta = euler_to_quaternion(0.0, 0.0, state.deltas["heading"])
-        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"]}
+        return {
+            "timestamp_sample": truth.timestamp - _DELAY,
+            "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"],
+        }  # fmt: skip
 
-    def global_fields(self, time: float, truth: Truth) -> dict[str, object]:
+    def global_fields(self, truth: Truth) -> dict[str, object]:
         """Return the global position, which exists once the origin is known."""
-        state = self._at(time)
+        state = self._at(truth.time)
         x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
         (latitude, longitude), altitude = MapProjection(*truth.origin[:2]).reproject(x, y), truth.origin[2]
         return {
-            **_timestamps(time),
+            "timestamp_sample": truth.timestamp - _DELAY,
             "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
             "lat_lon_valid": state.xy_valid, "alt_valid": True, "delta_alt": -state.deltas["z"], "delta_terrain": 0.0,
             "lat_lon_reset_counter": state.counters["xy"], "alt_reset_counter": state.counters["z"],
             **self._deviations(state),
             "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
+        }  # fmt: skip
+
+    def status(self, truth: Truth) -> dict[str, object]:
+        """Return the status: take-off, then a mission; without a valid position, a failsafe that holds altitude."""
+        failsafe, is_mission = not self._at(truth.time).xy_valid, truth.time >= _CLIMB
+        flown = _Status.NAVIGATION_STATE_AUTO_MISSION if is_mission else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
+        mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
+        return {
+            "armed_time": _ARMED, "takeoff_time": _BOOT, "arming_state": _Status.ARMING_STATE_ARMED,
+            "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
+            "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
+            "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
         }  # fmt: skip
 
     def _at(self, time: float) -> _State:
@@ -175,6 +185,7 @@ class Estimator:
             velocity=(*speed, 0.0),
             heading=0.0 if _HEADING_RESET <= lap_time < _HEADING_DISTURBED else self._heading_error,
             dead_reckoning=dead_reckoning,
+            xy_valid=dead_reckoning < _MAX_DEAD_RECKONING,
             counters={"xy": outages, "z": steps, "vxy": outages, "vz": 0, "heading": alignments},
             deltas={
                 "xy": (-corrected[0], -corrected[1]), "vxy": slowed, "vz": 0.0,
@@ -195,31 +206,26 @@ class Estimator:
         }  # fmt: skip
 
 
-def truth_fields(time: float, truth: Truth) -> dict[str, object]:
+def truth_fields(truth: Truth) -> dict[str, object]:
     """Return the groundtruth message: variances and limits are 0, as simulators send them."""
     return {
         **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
-        **_motion(time, truth.position, truth.velocity, truth, has_origin=True),
+        **_motion(truth.position, truth.velocity, truth, has_origin=True),
         **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
         "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
         "heading": truth.heading, "unaided_heading": truth.heading,
     }  # fmt: skip
 
 
-def _timestamps(time: float) -> dict[str, object]:
-    timestamp = _BOOT + round(time * 1e6)
-    return {"timestamp": timestamp, "timestamp_sample": timestamp - _DELAY}
-
-
 def _motion(
-    time: float, position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool
+    position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool
 ) -> dict[str, object]:
     """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
     latitude, longitude, altitude = truth.origin if has_origin else (math.nan,) * 3
     names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
     in_range = distance < _SENSOR_RANGE
     return {
-        **_timestamps(time),
+        "timestamp_sample": truth.timestamp - _DELAY,
         **dict(zip(names, (*position, *velocity, *truth.acceleration), strict=True)), "z_deriv": velocity[2],
         "xy_global": has_origin, "z_global": has_origin,
         "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6) if has_origin else 0,
@@ -230,58 +236,43 @@ def _motion(
     }  # fmt: skip
 
 
-def status(estimator: Estimator, time: float, _: Truth) -> dict[str, object]:
-    """Return the status: take-off, then a mission; without a valid position, a failsafe that holds altitude."""
-    failsafe = not estimator.xy_valid(time)
-    flown = _Status.NAVIGATION_STATE_AUTO_MISSION if time >= _CLIMB else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
-    mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
-    return {
-        "timestamp": _BOOT + round(time * 1e6), "armed_time": _ARMED, "takeoff_time": _BOOT,
-        "arming_state": _Status.ARMING_STATE_ARMED,
-        "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
-        "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
-        "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
-    }  # fmt: skip
-
-
-def land_detected(time: float, truth: Truth) -> dict[str, object]:
+def land_detected(truth: Truth) -> dict[str, object]:
     """Return the land detector's output: landed until take-off."""
     (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
     return {
-        "timestamp": _BOOT + round(time * 1e6),
         **dict.fromkeys(("landed", "maybe_landed", "ground_contact", "at_rest"), landed),
         "vertical_movement": abs(vz) > 0.5, "horizontal_movement": math.hypot(vx, vy) > 1.5,
         "close_to_ground_or_skipped_check": truth.position[2] > -1.0,
     }  # fmt: skip
 
 
-def home(time: float, truth: Truth) -> dict[str, object]:
+def home(truth: Truth) -> dict[str, object]:
     """Return the home position, with global coordinates once the origin is known."""
-    known = time >= _ORIGIN_SET
+    known = truth.time >= _ORIGIN_SET
     latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
     return {
-        "timestamp": _BOOT + round(time * 1e6), "lat": latitude, "lon": longitude, "alt": altitude,
+        "lat": latitude, "lon": longitude, "alt": altitude,
         "x": 0.0, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": truth.heading,
         "valid_hpos": known, "valid_alt": known, "valid_lpos": True, "valid_attitude": True,
         "update_count": 1 + known,
     }  # fmt: skip
 
 
-def battery(time: float, _: Truth) -> dict[str, object]:
+def battery(truth: Truth) -> dict[str, object]:
     """Return the state of a battery that is discharged by a constant current."""
-    discharged = _CURRENT * (time % _ENDURANCE) / 3.6
+    discharged = _CURRENT * (truth.time % _ENDURANCE) / 3.6
     remaining = 1.0 - discharged / _CAPACITY
     return {
-        "timestamp": _BOOT + round(time * 1e6), "connected": True, "id": 1, "scale": 1.0,
+        "connected": True, "id": 1, "scale": 1.0,
         "voltage_v": 14.0 + 2.8 * remaining, "current_a": _CURRENT, "current_average_a": _CURRENT,
         "discharged_mah": discharged, "remaining": remaining, "capacity": round(_CAPACITY),
         "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0, "cell_count": 4,
     }  # fmt: skip
 
 
-def gps(time: float, truth: Truth) -> dict[str, object]:
+def gps(truth: Truth) -> dict[str, object]:
     """Return a noisy GNSS fix, or no fix before the origin is set and during the outage."""
-    now, is_started = _BOOT + round(time * 1e6), time >= _ORIGIN_SET
+    time, is_started = truth.time, truth.time >= _ORIGIN_SET
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
     north, east, down = (
         value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
@@ -290,18 +281,18 @@ def gps(time: float, truth: Truth) -> dict[str, object]:
     altitude = truth.origin[2] - down if fix else math.nan
     vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
     return {
-        "timestamp": now, "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
+        "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
         "latitude_deg": latitude, "longitude_deg": longitude,
         "altitude_msl_m": altitude, "altitude_ellipsoid_m": altitude,
         "eph": 0.9 if fix else 100.0, "epv": 1.8 if fix else 100.0, "s_variance_m_s": 0.4 if fix else 100.0,
         "hdop": 0.7 if fix else 100.0, "vdop": 1.1 if fix else 100.0, "satellites_used": 14 if fix else 0,
         "vel_ned_valid": fix, "vel_n_m_s": vx, "vel_e_m_s": vy, "vel_d_m_s": vz,
         "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
-        "time_utc_usec": _BOOT_UTC + now if is_started else 0,
+        "time_utc_usec": _BOOT_UTC + truth.timestamp if is_started else 0,
     }  # fmt: skip
 
 
-Fields = Callable[[float, Truth], dict[str, object]]  # (time since the start [s], truth) to the fields of a message
+Fields = Callable[[Truth], dict[str, object]]  # the fields of a message except `timestamp`
 
 
 def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
@@ -343,7 +334,7 @@ def _streams(vehicle: str, seed: int, end: int) -> dict[Address, tuple[range, Fi
         at("vehicle_attitude"): (range(0, end, 2), first.attitude),
         at("vehicle_global_position"): (range(origin, end, 10), first.global_fields),
         at("sensor_gps", 0): (range(0, end, 10), gps),
-        at("vehicle_status"): (range(0, end, 50), partial(status, first)),
+        at("vehicle_status"): (range(0, end, 50), first.status),
         at("vehicle_land_detected"): (range(0, end, 100), land_detected),
         at("battery_status", 0): (range(0, end, 100), battery),
         at("home_position"): (range(0, min(end, origin + 1), origin), home),
@@ -363,4 +354,4 @@ def _messages(
         now = truth_at(time, direction, origin)
         for address, (when, fields) in chosen.items():
             if tick in when:
-                yield SourceMessage(time, address, absent[address] | fields(time, now))
+                yield SourceMessage(time, address, absent[address] | fields(now) | {"timestamp": now.timestamp})

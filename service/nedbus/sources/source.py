@@ -112,7 +112,6 @@ class LiveSource(Protocol):
 
         Raises SourceError if the source cannot be opened or the connection breaks.
         """
-        ...
 
 
 Source = ReplaySource | LiveSource

@@ -2,12 +2,11 @@
 
 import re
 import struct
-from enum import Enum, auto
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from .layout import Formats
-from .records import (  # fmt: skip
+from .records import (
     EXACT_SIZES,
     READERS,
     SYNC,
@@ -36,12 +35,8 @@ _CANDIDATE = re.compile(rb"(?s)D|S/s\x13 |A...[A-Za-z]|F[A-Za-z]\w|[IP]%b|[MQ].%
 """The type of a record, and enough of its content to rule out most other bytes."""
 _CONTEXT: Final = 16  # maximum bytes of a candidate
 
-
-class _Validity(Enum):
-    VALID = auto()  # a record whose content matches its type and size
-    UNKNOWN = auto()  # unknown type, message id or content: validity depends on the following bytes
-    INVALID = auto()
-    INCOMPLETE = auto()  # more bytes are needed
+_Validity = Literal["valid", "unknown", "invalid", "incomplete"]
+"""Valid: the content matches type and size. Unknown: the following bytes decide. Incomplete: more bytes are needed."""
 
 
 class _Inspection(NamedTuple):
@@ -150,32 +145,32 @@ class UlogParser:
     def _consume_record(self, at: int, *, is_end: bool) -> int | None:
         """Consume a record; return the position after it, None if more bytes are needed."""
         inspected = self._inspect(at)
-        if inspected.validity is _Validity.INCOMPLETE and not (is_end and self._verify):
+        if inspected.validity == "incomplete" and not (is_end and self._verify):
             return self._truncate(at) if is_end else None
-        if not self._verify or (inspected.validity is _Validity.VALID and inspected.record is not None):
+        if not self._verify or (inspected.validity == "valid" and inspected.record is not None):
             return self._emit(at, inspected)
-        if inspected.validity is _Validity.VALID:
+        if inspected.validity == "valid":
             following = self._inspect(inspected.stop).validity
-            if following is _Validity.VALID:
+            if following == "valid":
                 return self._emit(at, inspected)
-            if following is _Validity.INCOMPLETE and not is_end:
+            if following == "incomplete" and not is_end:
                 return None
         return self._accept_unknown(at, is_end=is_end)
 
     def _accept_unknown(self, at: int, *, is_end: bool) -> int | None:
         """Accept records of unknown content if their lengths lead to the next valid chain; otherwise start a search."""
         start, found = self._find(at + 1, at + 1 + 2 * _WINDOW, is_end=is_end)
-        if found is _Validity.INCOMPLETE:
+        if found == "incomplete":
             return None
         passed: list[tuple[int, _Inspection]] = []
         place, inspected = at, self._inspect(at)
-        while place < start and inspected.validity in (_Validity.VALID, _Validity.UNKNOWN):
+        while place < start and inspected.validity in ("valid", "unknown"):
             passed.append((place, inspected))
             place, inspected = inspected.stop, self._inspect(inspected.stop)
-        if place == start if found is _Validity.VALID else is_end and self._is_tail(place):
+        if place == start if found == "valid" else is_end and self._is_tail(place):
             for each in passed:
                 self._emit(*each)
-            return start if found is _Validity.VALID else self._truncate(place)
+            return start if found == "valid" else self._truncate(place)
         self._damage = self._offset + at
         return at + 1
 
@@ -185,10 +180,10 @@ class UlogParser:
         number = (at - begun - 1) // _WINDOW
         window = begun + 1 + number * _WINDOW
         start, found = self._find(at, window + (_WINDOW if number < 2 else _SAMPLE), is_end=is_end)
-        if found is _Validity.VALID:
+        if found == "valid":
             self._end_damage()
             return start
-        return None if found is _Validity.INCOMPLETE else min(window + _WINDOW, len(self._buffer))
+        return None if found == "incomplete" else min(window + _WINDOW, len(self._buffer))
 
     def _end_damage(self) -> None:
         if self._damage is not None:
@@ -200,26 +195,26 @@ class UlogParser:
         limit = 1 + max(0, stop - start) // _MIN_DISTANCE
         for found in islice(_CANDIDATE.finditer(self._buffer, start + 2, stop + _CONTEXT), limit):
             at = found.start() - 2
-            validity = self._validate_chain(at, is_end=is_end) if at < stop else _Validity.INVALID
-            if validity is not _Validity.INVALID:
+            validity = self._validate_chain(at, is_end=is_end) if at < stop else "invalid"
+            if validity != "invalid":
                 return at, validity
         is_whole = is_end or len(self._buffer) >= stop + _CONTEXT
-        return min(stop, len(self._buffer)), _Validity.INVALID if is_whole else _Validity.INCOMPLETE
+        return min(stop, len(self._buffer)), "invalid" if is_whole else "incomplete"
 
     def _validate_chain(self, at: int, *, is_end: bool) -> _Validity:
         """Check that a valid record begins here and leads to another one; a sync message needs no other."""
         inspected = self._inspect(at)
-        if inspected.validity is _Validity.INCOMPLETE and not is_end:
-            return _Validity.INCOMPLETE
-        if inspected.validity is not _Validity.VALID or isinstance(inspected.record, Sync):
-            return _Validity.VALID if isinstance(inspected.record, Sync) else _Validity.INVALID
+        if inspected.validity == "incomplete" and not is_end:
+            return "incomplete"
+        if inspected.validity != "valid" or isinstance(inspected.record, Sync):
+            return "valid" if isinstance(inspected.record, Sync) else "invalid"
         for _ in range(_MAX_SKIPPED):
             place, inspected = inspected.stop, self._inspect(inspected.stop)
-            if inspected.validity is _Validity.INCOMPLETE and is_end:
-                return _Validity.VALID if self._is_tail(place) else _Validity.INVALID
-            if inspected.validity is not _Validity.UNKNOWN:
+            if inspected.validity == "incomplete" and is_end:
+                return "valid" if self._is_tail(place) else "invalid"
+            if inspected.validity != "unknown":
                 return inspected.validity
-        return _Validity.INVALID
+        return "invalid"
 
     def _inspect(self, at: int) -> _Inspection:
         buffer = self._buffer
@@ -229,17 +224,17 @@ class UlogParser:
         is_partial = stop > len(buffer) or not kind
         # Record types are printable characters, also in later versions; without `verify` the length is trusted.
         if kind and not b"!" <= kind <= b"~" and (self._verify or not is_partial):
-            return _Inspection(_Validity.INVALID, stop)
+            return _Inspection("invalid", stop)
         if is_partial:
-            return _Inspection(_Validity.INCOMPLETE, stop)
+            return _Inspection("incomplete", stop)
         if known is not None:  # a sync message inside the record means that bytes are missing
-            return _Inspection(_Validity.UNKNOWN if self._verify and SYNC in buffer[at:stop] else _Validity.VALID, stop)
+            return _Inspection("unknown" if self._verify and SYNC in buffer[at:stop] else "valid", stop)
         try:
             record = READERS[kind[0]](buffer[content:stop])
         except (ValueError, LookupError, struct.error):
-            return _Inspection(_Validity.UNKNOWN, stop)
+            return _Inspection("unknown", stop)
         is_valid = EXACT_SIZES.get(kind[0], stop - content) == stop - content
-        return _Inspection(_Validity.VALID if is_valid else _Validity.UNKNOWN, stop, record)
+        return _Inspection("valid" if is_valid else "unknown", stop, record)
 
     def _is_tail(self, at: int) -> bool:
         """Return whether the log may end here, inside or after a record."""
@@ -262,12 +257,12 @@ class UlogParser:
                 self._records.extend(self._apply(inspected.record))
             except ValueError as exc:
                 reason = str(exc)
-        elif inspected.validity is _Validity.VALID:
+        elif inspected.validity == "valid":
             subscription, _, used = self._known[self._buffer[at : at + _DATA_HEADER]]
             self._records.append(Data(subscription, self._buffer[at + _DATA_HEADER : at + used]))
         elif kind == ord("D"):
             self.undecodable += 1
-        elif kind in READERS or inspected.validity is _Validity.INVALID:
+        elif kind in READERS or inspected.validity == "invalid":
             reason = f"the record at byte {self._offset + at} is damaged"
         if reason:
             self._records.append(Damage(reason))

@@ -101,22 +101,9 @@ class Damage(NamedTuple):
     is_end: bool = False
 
 
-Record = (
-    Header
-    | Format
-    | Information
-    | Parameter
-    | Subscription
-    | Unsubscription
-    | Data
-    | LoggedText
-    | Sync
-    | Dropout
-    | Damage
-)
-
-
-_UNRESOLVED: Final = PayloadLayout((), 0, 0)
+_Definition = Format | Information | Parameter
+_Logged = Subscription | Unsubscription | Data | LoggedText | Sync | Dropout
+Record = Header | _Definition | _Logged | Damage
 
 
 def read_header(data: bytes) -> Header:
@@ -152,7 +139,6 @@ def _key_and_value(content: bytes) -> tuple[str, Value]:
 
 
 def _text(content: bytes, tag: int | None = None) -> LoggedText:
-    """Parse a logged string: level, timestamp, text."""
     level, timestamp = struct.unpack_from("<BQ", content)
     if not 0x30 <= level <= 0x37 or len(content) > _MAX_TEXT:
         raise ValueError
@@ -164,7 +150,7 @@ def _subscription(content: bytes) -> Subscription:
     name = content[3:].decode("ascii")
     if not _NAME.fullmatch(name):
         raise ValueError
-    return Subscription(message_id, multi_id, name, _UNRESOLVED)
+    return Subscription(message_id, multi_id, name, PayloadLayout((), 0, 0))  # resolved by the parser
 
 
 def _sync(content: bytes) -> Sync:

@@ -91,6 +91,19 @@ def test_definition_that_matches_no_release_raises(tmp_path: Path) -> None:
         nedbus.read(write_bag(tmp_path / "a.mcap", definition=text))
 
 
+def test_message_whose_timestamp_is_not_first_is_read(tmp_path: Path) -> None:
+    """A message that only the file defines is decoded in the order of its definition."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("px4_msgs/msg/Wind", "ros2msg", b"float32 north\nuint64 timestamp\n")
+        channel = writer.register_channel("/fmu/out/wind", "cdr", schema)
+        writer.add_message(channel, 1, b"\x00\x01\x00\x00" + WIND + bytes(4) + (7).to_bytes(8, "little"), 1)
+        writer.finish()
+    assert nedbus.read(path, "wind").tolist() == [(7, 3.5)]
+
+
 FLAGS = {
     "repeat_schemas": (True, False), "repeat_channels": (True, False), "use_statistics": (True, False),
     "use_summary_offsets": (True, False), "enable_crcs": (True, False), "has_extras": (True, False),
