@@ -16,6 +16,7 @@ from .io_thread import CallThread
 _DRAIN: Final = 2.0  # s for which process exit waits for pending closes
 _START_PAUSE: Final = 0.005  # s between checks whether a thread has started
 _closer = CallThread("nedbus-closer")
+atexit.register(_closer.drain, _DRAIN)  # a thread still in Zenoh at interpreter exit aborts the process
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 
 
@@ -63,12 +64,6 @@ def _close_later(close: Callable[[], object]) -> None:
         _closer.put(close)
     else:  # the process is exiting and no longer waits for threads
         close()
-
-
-@atexit.register
-def _drain() -> None:
-    """Wait for pending closes: a thread still in Zenoh at interpreter exit aborts the process."""
-    _closer.drain(_DRAIN)
 
 
 def _after_fork() -> None:
