@@ -1,6 +1,5 @@
 """Stream health: rate, jitter, latency, age, gaps, order, reboots, resets and flags, and the stream's state; no I/O.
 
-Used by `nedbus hz`, the status of services and scripts.
 Rates and ages use a monotonic clock, because the wall clock may be set at any time.
 """
 

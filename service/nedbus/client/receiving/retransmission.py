@@ -48,9 +48,8 @@ class Retransmission:
         Return a key with newly readable messages, or "", and the seconds until the next poll.
         `drained`: the queue holds everything that had arrived before this call.
         """
-        if (
-            drained and now >= self._next_heartbeat_poll
-        ):  # else messages announced by heartbeats may still be in the ring
+        # Unless the ring was drained, messages that heartbeats announce may still be in it.
+        if drained and now >= self._next_heartbeat_poll:
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._queue.on_heartbeat(key, publisher, number)
