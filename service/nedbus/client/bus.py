@@ -5,8 +5,6 @@ import weakref
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
-from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Unpack, overload
 
@@ -18,7 +16,6 @@ from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLoc
 
 from .closing import Finalizer
 from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_accounts, find_services
-from .protocol import LIVE
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
@@ -131,13 +128,8 @@ class Bus(AbstractContextManager["Bus"]):
         """
         selection = Selection(topic_of(message, topic), vehicle_name(vehicle), instance)
         key_expr = selection.key_expr(prefix=self.prefix)
-        decoder = Decoder(self._layouts, prefix=self.prefix)
-        samples: list[Sample[Any]] = []
         answers = query(self._session, key_expr, timeout=timeout)
-        for raw, sample in decoder.read(answers):
-            sample.retained = True
-            sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
-            samples.append(sample)
+        samples = list(Decoder(self._layouts, prefix=self.prefix).read(answers))
         samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
         newest = {sample.address: sample for sample in samples}  # the last sample of each address wins
         return [newest[address] for address in sorted(newest)]
@@ -150,8 +142,9 @@ class Bus(AbstractContextManager["Bus"]):
         next call waits again.
         """
         publishers = self.publishers(timeout=timeout)
-        by_vehicle = groupby(sorted(publishers), key=attrgetter("vehicle"))
-        vehicles = Vehicles({vehicle: list(group) for vehicle, group in by_vehicle})
+        vehicles = Vehicles()
+        for address in sorted(publishers):
+            vehicles.setdefault(address.vehicle, []).append(address)
         vehicles.complete = publishers.complete
         return vehicles
 
