@@ -47,7 +47,7 @@ class Bus(AbstractContextManager["Bus"]):
         self._zenoh = session = open_client(self.routers, timeout=timeout, tls=self._tls, stop=stop)
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
-        self._directory = VehicleDirectory(Selection().alive_key_expr(prefix=prefix), prefix=prefix)
+        self._directory = VehicleDirectory(Selection(), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         closing = ExitStack()  # runs in reverse order; closing the session ends an open query for layouts

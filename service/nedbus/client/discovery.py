@@ -23,7 +23,7 @@ from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
 from nedbus.transport import MAX_REPLY_BYTES, LivelinessTokens, RawSample, Session, query, translate_zenoh_errors
-from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
+from nedbus_msgs import ANY, REJECTED, Address, Selection, address_of_alive_key, status_key
 
 _log = logging.getLogger(__name__)
 
@@ -50,10 +50,10 @@ class Vehicles(dict[str, list[Address]]):
 
 
 class VehicleDirectory:
-    """Addresses and their publishers, from the liveliness tokens on a key expression; subscribes on the first call."""
+    """Addresses of a selection and their publishers, from liveliness tokens; subscribes on the first call."""
 
-    def __init__(self, key_expr: str, *, prefix: str) -> None:
-        self._prefix, self._key_expr = prefix, key_expr
+    def __init__(self, selection: Selection, *, prefix: str) -> None:
+        self._prefix, self._key_expr = prefix, selection.alive_key_expr(prefix=prefix)
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: LivelinessTokens | None = None

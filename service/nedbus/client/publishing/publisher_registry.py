@@ -75,8 +75,8 @@ class PublisherRegistry:
             vehicle, prefix = address.vehicle, self.prefix
             if vehicle not in self._rate_listeners:
                 selection = Selection(vehicle=vehicle)
-                tokens, rates = selection.alive_key_expr(prefix=prefix), selection.rate_key_expr(ANY, prefix=prefix)
-                self._directories[vehicle] = VehicleDirectory(tokens, prefix=prefix)
+                rates = selection.rate_key_expr(ANY, prefix=prefix)
+                self._directories[vehicle] = VehicleDirectory(selection, prefix=prefix)
                 self._rate_listeners[vehicle] = MatchingListener(self._session, rates)
             listener = self._rate_listeners[vehicle]
             publisher = self.publishers[address] = Publisher(
