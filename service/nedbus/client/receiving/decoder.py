@@ -14,6 +14,7 @@ import zenoh
 
 from nedbus import clock
 from nedbus.client.protocol import LIVE
+from nedbus.client.rate_gate import RateGate
 from nedbus.client.sample import Sample
 from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
@@ -23,8 +24,6 @@ from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, Provenanc
 from .layout_lookup import LayoutLookup
 
 if TYPE_CHECKING:
-    from nedbus.client.rate_gate import RateGate
-
     from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
