@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Unpack, overload
+from typing import Any, Unpack, overload
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import AccountReport
@@ -22,8 +22,6 @@ from .publishing.query_server import QueryServer
 from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver, find_schemas
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import Subscription
-
-_CONFIRM_TIMEOUT: Final = 2.0  # s for a slow router to process the declarations of a publisher; usually milliseconds
 
 
 class Bus(AbstractContextManager["Bus"]):
@@ -193,7 +191,7 @@ class Bus(AbstractContextManager["Bus"]):
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)
         # Matches nothing: after a query for the session's own token, Zenoh 1.10 sometimes lists that token forever.
-        token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=_CONFIRM_TIMEOUT)
+        token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=2.0)  # usually milliseconds
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:

@@ -7,16 +7,13 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from typing import Final
 
 from nedbus.transport import is_forked
 
 from .io_thread import CallThread
 
-_DRAIN: Final = 2.0  # s for which process exit waits for pending closes
-_START_PAUSE: Final = 0.005  # s between checks whether a thread has started
 _closer = CallThread("nedbus-closer")
-atexit.register(_closer.drain, _DRAIN)  # a thread still in Zenoh at interpreter exit aborts the process
+atexit.register(_closer.drain, timeout=2.0)  # a thread still in Zenoh at interpreter exit aborts the process
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 
 
@@ -27,7 +24,7 @@ def join_thread(thread: threading.Thread, timeout: float) -> None:
         try:
             thread.join(left)
         except RuntimeError:  # not started
-            time.sleep(_START_PAUSE)
+            time.sleep(0.005)
         else:
             return
 

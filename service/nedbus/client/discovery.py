@@ -31,7 +31,6 @@ _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rej
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
 _MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
-_POLL: Final = 0.002  # s between polls for tokens
 
 
 class Publishers(Counter[Address]):
@@ -76,7 +75,7 @@ class VehicleDirectory:
                         _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
                 if not self._tokens.is_listing or time.monotonic() >= end:
                     break
-                time.sleep(_POLL)
+                time.sleep(0.002)
             publishers = Publishers(self._addresses.values())
             publishers.complete = self._tokens.complete
             if self._tokens.is_listing and timeout and not self._logged:
