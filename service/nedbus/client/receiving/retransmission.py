@@ -1,8 +1,6 @@
 """Retransmission requests in mode `every`, sent to each publisher by its exact key and repeated for 20 s.
 
-Zenoh's own recovery sends one query with the subscription's key expression, which routers match against every
-publisher's cache: with 1,000 publishers a router restart caused a query storm that left gaps unfilled.
-Here at most 64 requests are open, and a gap holds back only later messages of the same publisher.
+The reasons for not using Zenoh's own recovery are in docs/explanation/decisions/03-own-recovery.md.
 """
 
 import logging
