@@ -10,7 +10,7 @@ from contextlib import AbstractAsyncContextManager
 from functools import partial, wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar, Unpack, cast, overload
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar, Unpack, cast, overload
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_client_settings
@@ -21,9 +21,6 @@ from .bus import Bus
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import M_co, Mode, Query, Sample, Subscribe
 from .subscription import AsyncSubscription
-
-_WAKE_INTERVAL: Final = 1.0  # s between checks for Ctrl-C while connecting
-_MAX_QUERIES: Final = 32  # concurrent queries of a bus, each in a thread; others wait
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -53,7 +50,7 @@ class AsyncBus:
     def __init__(self, open_bus: Callable[[threading.Event], Bus]) -> None:
         self._open_bus = open_bus
         self._bus: Bus | None = None
-        self._threads = ThreadPoolExecutor(_MAX_QUERIES, "nedbus-async")
+        self._threads = ThreadPoolExecutor(32, "nedbus-async")  # calls at a time; others wait
 
     @property
     def _blocking(self) -> Bus:
@@ -141,7 +138,7 @@ class AsyncBus:
         opening = asyncio.create_task(self._in_thread(self._open_bus, cancelled))
         try:
             while not opening.done():  # asyncio can miss a Ctrl-C just before it blocks: wake it regularly
-                await asyncio.wait({opening}, timeout=_WAKE_INTERVAL)
+                await asyncio.wait({opening}, timeout=1.0)
             self._bus = opening.result()
         except asyncio.CancelledError:
             cancelled.set()  # otherwise the thread keeps connecting and blocks interpreter exit

@@ -7,15 +7,13 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from typing import Final
 
 from nedbus.transport import is_forked
 
 from .io_thread import CallThread
 
-_DRAIN: Final = 2.0  # s for which process exit waits for pending closes
-_START_PAUSE: Final = 0.005  # s between checks whether a thread has started
 _closer = CallThread("nedbus-closer")
+atexit.register(_closer.drain, timeout=2.0)  # a thread still in Zenoh at interpreter exit aborts the process
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 
 
@@ -26,7 +24,7 @@ def join_thread(thread: threading.Thread, timeout: float) -> None:
         try:
             thread.join(left)
         except RuntimeError:  # not started
-            time.sleep(_START_PAUSE)
+            time.sleep(0.005)
         else:
             return
 
@@ -63,12 +61,6 @@ def _close_later(close: Callable[[], object]) -> None:
         _closer.put(close)
     else:  # the process is exiting and no longer waits for threads
         close()
-
-
-@atexit.register
-def _drain() -> None:
-    """Wait for pending closes: a thread still in Zenoh at interpreter exit aborts the process."""
-    _closer.drain(_DRAIN)
 
 
 def _after_fork() -> None:

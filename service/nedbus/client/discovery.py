@@ -23,7 +23,7 @@ from nedbus.errors import AddressError
 from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json, joined
 from nedbus.log_event import about
 from nedbus.transport import MAX_REPLY_BYTES, LivelinessTokens, RawSample, Session, query, translate_zenoh_errors
-from nedbus_msgs import ANY, REJECTED, Address, address_of_alive_key, status_key
+from nedbus_msgs import ANY, REJECTED, Address, Selection, address_of_alive_key, status_key
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ _MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rej
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: parsed JSON needs up to 32 times its length
 _MAX_REPORTS: Final = 1000  # queued reports; beyond that the oldest are dropped
-_POLL: Final = 0.002  # s between polls for tokens
 
 
 class Publishers(Counter[Address]):
@@ -50,10 +49,10 @@ class Vehicles(dict[str, list[Address]]):
 
 
 class VehicleDirectory:
-    """Addresses and their publishers, from the liveliness tokens on a key expression; subscribes on the first call."""
+    """Addresses of a selection and their publishers, from liveliness tokens; subscribes on the first call."""
 
-    def __init__(self, key_expr: str, *, prefix: str) -> None:
-        self._prefix, self._key_expr = prefix, key_expr
+    def __init__(self, selection: Selection, *, prefix: str) -> None:
+        self._prefix, self._key_expr = prefix, selection.alive_key_expr(prefix=prefix)
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: LivelinessTokens | None = None
@@ -76,7 +75,7 @@ class VehicleDirectory:
                         _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
                 if not self._tokens.is_listing or time.monotonic() >= end:
                     break
-                time.sleep(_POLL)
+                time.sleep(0.002)
             publishers = Publishers(self._addresses.values())
             publishers.complete = self._tokens.complete
             if self._tokens.is_listing and timeout and not self._logged:

@@ -1,6 +1,5 @@
 """Stream health: rate, jitter, latency, age, gaps, order, reboots, resets and flags, and the stream's state; no I/O.
 
-Used by `nedbus hz`, the status of services and scripts.
 Rates and ages use a monotonic clock, because the wall clock may be set at any time.
 """
 
@@ -33,7 +32,6 @@ _SMOOTHING: Final = 0.05  # smoothing factor of the usual interval and the usual
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 _MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
-_COUNTER_MODULUS: Final = 256  # modulus of reset counters
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
 _MAX_STREAMS: Final = 4096  # per monitor
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
@@ -185,9 +183,9 @@ class StreamHealth:
         self._received = received
         rebooted, counters = self._add_time(int(timestamp)), tuple(seen[len(DOUBT_FLAGS) :])
         if counters != self._counters:
-            if self._counters and not rebooted:  # a reboot restarts the counters
+            if self._counters and not rebooted:  # a reboot restarts the counters, which are uint8
                 for quantity, before, after in zip(self._resets, self._counters, counters, strict=True):
-                    self._resets[quantity] += (after - before) % _COUNTER_MODULUS
+                    self._resets[quantity] += (after - before) % 256
             self._counters = counters
         if latency is not None:
             window.latencies.append(latency)

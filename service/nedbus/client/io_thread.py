@@ -90,11 +90,10 @@ class CallThread:
 
     def start(self) -> None:
         """Start the thread unless it is running."""
-        if self._thread is None or not self._thread.is_alive():
-            with _start:
-                if self._thread is None or not self._thread.is_alive():
-                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-                    self._thread.start()
+        with _start:
+            if self._thread is None or not self._thread.is_alive():
+                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread.start()
 
     def put(self, call: Callable[[], object]) -> None:
         """Queue a call; the thread must have been started."""

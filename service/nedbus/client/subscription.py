@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from functools import partial
-from typing import TYPE_CHECKING, Final, Generic, Self
+from typing import TYPE_CHECKING, Generic, Self
 
 from typing_extensions import TypeVar
 
@@ -23,7 +23,6 @@ from .sample import Counts, M_co, Sample
 if TYPE_CHECKING:
     from .receiving.batch import Batch
 
-_YIELD_AFTER: Final = 64  # samples after which other tasks of the event loop get a turn
 _T = TypeVar("_T")
 
 
@@ -177,7 +176,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
     async def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
         self._received += 1
-        if self._received % _YIELD_AFTER == 0:
+        if self._received % 64 == 0:
             await asyncio.sleep(0)  # otherwise a reader that never waits would starve other tasks
         try:
             async with asyncio.timeout(timeout):

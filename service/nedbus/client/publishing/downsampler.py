@@ -18,7 +18,6 @@ from nedbus_msgs import ANY, Address, Topic, get_topic
 
 from .writer import Heartbeats, Writer
 
-_CACHE: Final = 20  # s of messages in the history cache
 _LINGER: Final = 60_000_000_000  # ns for which an unmatched writer is kept, so returning readers can recover messages
 
 
@@ -92,7 +91,7 @@ class _Stream:
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, topic: Topic) -> None:
         self.writer: Writer | None = None
         self._listener = MatchingListener(heartbeats.session, key)
-        self._open = partial(Writer, heartbeats, key, topic, cache=_CACHE * rate)
+        self._open = partial(Writer, heartbeats, key, topic, cache=20 * rate)  # 20 s
         self._rate, self._gate = rate, RateGate(rate)
         self._matched_at = 0
 

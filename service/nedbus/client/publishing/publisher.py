@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence, Set
 from contextlib import AbstractContextManager, suppress
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import zenoh
@@ -53,7 +52,7 @@ class Publisher(AbstractContextManager["Publisher"]):
         self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._new_timestamp = heartbeats.session.new_timestamp
-        self._on_close = partial(registry.forget, address)
+        self._registry = registry
         self._owner = owner  # keeps the bus open
         self.definition = definition
         self._codec = codec_of(definition)
@@ -155,7 +154,7 @@ class Publisher(AbstractContextManager["Publisher"]):
                     self.flush(timeout)
         finally:
             self._writer.close()
-            self._on_close()
+            self._registry.forget(self.address)
             self._downsampler.close()
             with suppress(zenoh.ZError):  # the session is already closed
                 self._token.undeclare()

@@ -17,7 +17,7 @@ from nedbus.client.discovery import VehicleDirectory
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
-from nedbus.transport import Session, token_keys, translate_zenoh_errors
+from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, short_hash
 
 from .downsampler import MatchingListener
@@ -28,7 +28,6 @@ from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-_TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to reply with its tokens; usually milliseconds
 _MAX_UNUSED: Final = 64  # definitions kept after their publisher closed, for readers with unread messages
 _FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
 
@@ -76,8 +75,8 @@ class PublisherRegistry:
             vehicle, prefix = address.vehicle, self.prefix
             if vehicle not in self._rate_listeners:
                 selection = Selection(vehicle=vehicle)
-                tokens, rates = selection.alive_key_expr(prefix=prefix), selection.rate_key_expr(ANY, prefix=prefix)
-                self._directories[vehicle] = VehicleDirectory(tokens, prefix=prefix)
+                rates = selection.rate_key_expr(ANY, prefix=prefix)
+                self._directories[vehicle] = VehicleDirectory(selection, prefix=prefix)
                 self._rate_listeners[vehicle] = MatchingListener(self._session, rates)
             listener = self._rate_listeners[vehicle]
             publisher = self.publishers[address] = Publisher(
@@ -110,13 +109,6 @@ class PublisherRegistry:
             text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
             _log.warning(text, name, extra=about("duplicate"))
         return shared
-
-    def confirm(self, address: Address) -> None:
-        """Wait until the router has processed all declarations of an address, with a query that matches nothing.
-
-        After a query for the session's own token, Zenoh 1.10 sometimes lists that token forever.
-        """
-        token_keys(self._session, f"{self.prefix}/{address.vehicle}/@alive", timeout=_TOKENS_TIMEOUT)
 
     def has_subscriber(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import zenoh
 
 from nedbus import clock
+from nedbus.client.protocol import LIVE
+from nedbus.client.rate_gate import RateGate
 from nedbus.client.sample import Sample
 from nedbus.errors import AddressError, DecodeError, UnknownLayoutError
 from nedbus.log_event import about
@@ -22,8 +24,6 @@ from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, Provenanc
 from .layout_lookup import LayoutLookup
 
 if TYPE_CHECKING:
-    from nedbus.client.rate_gate import RateGate
-
     from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
@@ -90,8 +90,8 @@ class Decoder:
             stream.size = stream.codec.size
         return stream
 
-    def read(self, answers: Sequence[RawSample]) -> Iterator[tuple[RawSample, Sample[Any]]]:
-        """Yield the valid samples of a query, each with its Zenoh sample; wait for lookups of definitions."""
+    def read(self, answers: Sequence[RawSample]) -> Iterator[Sample[Any]]:
+        """Yield the valid samples among the replies to a query for last messages; wait for lookups of definitions."""
         received = clock.utc_ns()
         opened = [(raw, str(raw.key_expr), raw.payload.to_bytes()) for raw in answers]
         for raw, key, payload in opened:
@@ -107,7 +107,9 @@ class Decoder:
                 self.reject(key, exc, stream)
             else:
                 if sample := self.decode((stream, payload, raw, 0, received), rows=False):
-                    yield raw, sample
+                    sample.retained = True
+                    sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
+                    yield sample
 
     def codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True) -> Codec[Any] | None:
         """Return the codec of a sample; None if no publisher has its definition.

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Final, TypeVar
+from typing import Final
 
 import zenoh
 
@@ -38,7 +38,6 @@ _MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes t
 _BUSY_PAUSE: Final = 0.001  # s
 _MAX_DIGITS: Final = 10  # digits of a sequence number
 _JOIN_TIMEOUT: Final = 3.0  # s, long enough on a busy machine
-_T = TypeVar("_T")
 
 
 class Receiver:
@@ -214,7 +213,7 @@ class Receiver:
             pass
 
 
-def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
+def drain(handler: zenoh.Handler[zenoh.Sample], batch: list[zenoh.Sample]) -> list[zenoh.Sample]:
     """Append all received items to `batch`, up to the capacity of the ring, and return it."""
     try:
         while len(batch) < RING_CAPACITY and (item := handler.try_recv()) is not None:

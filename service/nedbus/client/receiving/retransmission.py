@@ -1,8 +1,6 @@
 """Retransmission requests in mode `every`, sent to each publisher by its exact key and repeated for 20 s.
 
-Zenoh's own recovery sends one query with the subscription's key expression, which routers match against every
-publisher's cache: with 1,000 publishers a router restart caused a query storm that left gaps unfilled.
-Here at most 64 requests are open, and a gap holds back only later messages of the same publisher.
+The reasons for not using Zenoh's own recovery are in docs/explanation/decisions/03-own-recovery.md.
 """
 
 import logging
@@ -48,9 +46,8 @@ class Retransmission:
         Return a key with newly readable messages, or "", and the seconds until the next poll.
         `drained`: the queue holds everything that had arrived before this call.
         """
-        if (
-            drained and now >= self._next_heartbeat_poll
-        ):  # else messages announced by heartbeats may still be in the ring
+        # Unless the ring was drained, messages that heartbeats announce may still be in it.
+        if drained and now >= self._next_heartbeat_poll:
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._queue.on_heartbeat(key, publisher, number)
