@@ -165,7 +165,7 @@ class FoxgloveServer:
 
     def _close_unpublished(self) -> None:
         """Close the channels of addresses that are no longer published."""
-        published = {address for addresses in self._bus.vehicles().values() for address in addresses}
+        published = self._bus.publishers()
         if not self._bus.connected:
             return  # without a link the list of vehicles is incomplete
         for address, definition in [stream for stream in self._fields if stream[0] not in published]:

@@ -154,8 +154,7 @@ class Ros2Bridge:
             del self._withdrawn[address]
             self._held.pop(address, None)
             self._late_filter.forget(address)
-        published = [address for addresses in self._bus.vehicles().values() for address in addresses]
-        addresses = list(filter(self._is_bridged, published))
+        addresses = list(filter(self._is_bridged, self._bus.publishers()))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
         nodes, own = dict[transport.TopicKey, str](), self._zid  # other nodes, by the topic they publish
