@@ -57,7 +57,7 @@ class JsonFormatter(TextFormatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the JSON object of a record."""
-        about = about_of(record)
+        about: About | None = getattr(record, "about", None)  # None for records of other packages
         fields: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
             "level": record.levelname.lower(),
@@ -84,12 +84,6 @@ class JournalFormatter(logging.Formatter):
         """Return the line or lines of a record."""
         priority = next(number for level, number in _PRIORITIES if record.levelno >= level)
         return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
-
-
-def about_of(record: logging.LogRecord) -> About | None:
-    """Return the structured fields of a log call; None for records of other packages."""
-    about = getattr(record, "about", None)
-    return about if isinstance(about, About) else None
 
 
 @dataclass(slots=True, eq=False)
@@ -128,7 +122,7 @@ class RateLimit(logging.Filter):
         """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
         now = self._now()
         self.report(lambda bucket: bucket.refill(now))
-        about = about_of(record)
+        about: About | None = getattr(record, "about", None)
         event = about.event if about else None
         if event is not None and not EVENTS[event].limited:
             return True
