@@ -236,9 +236,7 @@ class Ros2Bridge:
 
 @dataclass(slots=True, eq=False)
 class _Ros2Publisher:
-    """A published ROS 2 topic: publisher, gid, last sequence number, and liveliness token."""
-
     gid: bytes
     publisher: zenoh.Publisher
     token: zenoh.LivelinessToken
-    sequence: int = 0
+    sequence: int = 0  # of the last message
