@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from nedbus.client import (
@@ -175,9 +174,7 @@ class Fleet:
         for collection in (self.streams, self._left_out, self._rejected, self._reports):
             collection.clear()
 
-    def update(
-        self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus] = MappingProxyType({})
-    ) -> None:
+    def update(self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus]) -> None:
         """Update `snapshot`; `states`, `logs`: states and ULog streams by vehicle."""
         self.reject(now.rejected)
         time, alive = now.time, now.alive
