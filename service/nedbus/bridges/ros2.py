@@ -141,7 +141,7 @@ class Ros2Bridge:
             has_rate = get_topic(sample.topic).rate > 0
             if has_rate and not self._late_filter.admits(sample, arrived=time.monotonic_ns()):
                 continue
-            if self._arbiter.publishes(sample.address):
+            if sample.address in self._arbiter.published:
                 self._put(sample)
             elif not has_rate and sample.topic in self._types:
                 self._held[sample.address] = sample
