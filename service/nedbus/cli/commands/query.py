@@ -17,18 +17,7 @@ from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, heal
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.events import format_duration
 from nedbus.timings import TIMINGS
-from nedbus_msgs import (
-    ANY,
-    BY_TOPIC,
-    DEFAULT_TOPIC,
-    MESSAGES,
-    TOPICS,
-    Definition,
-    Message,
-    Selection,
-    definition_of,
-    get_topic,
-)
+from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
@@ -166,7 +155,7 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
         pass
     except ConnectError as exc:
         reason = f"and no publisher can be queried: {exc}"
-    near = get_close_matches(topic, [*MESSAGES, *BY_TOPIC], 3, _SIMILAR)
+    near = get_close_matches(topic, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
     raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
 
