@@ -1,7 +1,6 @@
 """Commands that send one query: list, get, info, schema."""
 
 import json
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -37,13 +36,12 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
     """
     selection = Selection(ANY, vehicle)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
-    published = Counter({each: count for each, count in everything.items() if selection.matches(each)})
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []
-    for address in sorted(published | newest.keys()):
+    for address in sorted({*filter(selection.matches, everything), *newest}):
         sample = newest.get(address)
         health = health_of_last(sample) if sample else None
-        state = stream_state(health, publishers=published[address]) if health else None
+        state = stream_state(health, publishers=everything[address]) if health else None
         age = health.age if health else None
         is_stored = sample is not None and sample.stored
         if json_output:
