@@ -44,12 +44,8 @@ class TextFormatter(logging.Formatter):
         return super().formatMessage(record)
 
     def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - overrides logging
-        """Return the last part of a traceback."""
-        return super().formatException(ei)[-_MAX_TRACEBACK:]
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line or lines of a record."""
-        return printable(super().format(record))
+        """Return the last part of a traceback, printable."""
+        return printable(super().formatException(ei)[-_MAX_TRACEBACK:])
 
 
 class JsonFormatter(TextFormatter):
@@ -69,7 +65,7 @@ class JsonFormatter(TextFormatter):
             if value is not None:
                 fields[key] = to_text(value, MAX_TEXT) if isinstance(value, str) else value
         if record.exc_info:
-            fields["exception"] = printable(self.formatException(record.exc_info))
+            fields["exception"] = self.formatException(record.exc_info)
         return json.dumps(fields)
 
 
