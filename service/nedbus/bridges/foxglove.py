@@ -164,8 +164,7 @@ class FoxgloveServer:
         return messages.Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
 
     def _close_unpublished(self) -> None:
-        """Close the channels of addresses that are no longer published."""
-        published = {address for addresses in self._bus.vehicles().values() for address in addresses}
+        published = self._bus.publishers()
         if not self._bus.connected:
             return  # without a link the list of vehicles is incomplete
         for address, definition in [stream for stream in self._fields if stream[0] not in published]:

@@ -72,7 +72,6 @@ class _PublisherClock:
         self._since = arrived
 
     def lateness(self, sent: int, arrived: int) -> int:
-        """Return the lateness of a sample [ns]."""
         if 0 <= sent - self._sent < _STALLED:
             # Zenoh's timestamps never decrease: after a clock is set back they stall until it catches up.
             self._before += arrived - self._arrived

@@ -87,7 +87,7 @@ class Ros2Bridge:
             if found := definition.layout_of_release(layout):
                 type_hash = hash_of(found, ros2_type(definition)) if hashed else transport.NO_HASH
                 self._types[topic] = definition, found, type_hash
-        self._node = f"nedbus_{os.getpid()}"
+        self._zid, self._node = str(session.info.zid()), f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
         self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter still has its clock
@@ -141,7 +141,7 @@ class Ros2Bridge:
             has_rate = get_topic(sample.topic).rate > 0
             if has_rate and not self._late_filter.admits(sample, arrived=time.monotonic_ns()):
                 continue
-            if self._arbiter.publishes(sample.address):
+            if sample.address in self._arbiter.published:
                 self._put(sample)
             elif not has_rate and sample.topic in self._types:
                 self._held[sample.address] = sample
@@ -154,15 +154,14 @@ class Ros2Bridge:
             del self._withdrawn[address]
             self._held.pop(address, None)
             self._late_filter.forget(address)
-        published = [address for addresses in self._bus.vehicles().values() for address in addresses]
-        addresses = list(filter(self._is_bridged, published))
+        addresses = list(filter(self._is_bridged, self._bus.publishers()))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the replies are incomplete
-        nodes, own = dict[transport.TopicKey, str](), self._zid  # other nodes, by the topic they publish
+        nodes: dict[transport.TopicKey, str] = {}  # other nodes, by the topic they publish
         for text in transport.token_keys(self._session, transport.px4_publishers_key_expr(self._domain), timeout=0.5):
             with suppress(DecodeError):
                 token = transport.PublisherToken.parse(text)
-                if token.session != own:
+                if token.session != self._zid:
                     nodes.setdefault(token.key, token.node)
         others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
         for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
@@ -230,16 +229,10 @@ class Ros2Bridge:
             _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
         return False
 
-    @property
-    def _zid(self) -> str:
-        return str(self._session.info.zid())
-
 
 @dataclass(slots=True, eq=False)
 class _Ros2Publisher:
-    """A published ROS 2 topic: publisher, gid, last sequence number, and liveliness token."""
-
     gid: bytes
     publisher: zenoh.Publisher
     token: zenoh.LivelinessToken
-    sequence: int = 0
+    sequence: int = 0  # of the last message

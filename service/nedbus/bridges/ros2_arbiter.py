@@ -33,6 +33,7 @@ class Ros2Arbiter:
 
     The topics of every vehicle except "1" have a namespace: the one in `namespaces`, else the vehicle's name, with the
     prefix `px4_` unless it starts with a letter.
+    `published`: the topic of each published address.
 
     Raises AddressError for a namespace that is invalid in ROS 2.
     """
@@ -42,7 +43,7 @@ class Ros2Arbiter:
             if not _NAMESPACE.fullmatch(namespace.strip("/")):
                 raise AddressError("namespace", namespace, "a letter, then letters, digits and _, with / between names")
         self._namespaces = {"1": "", **namespaces}
-        self._published: dict[Address, str] = {}
+        self.published: dict[Address, str] = {}
         self._deferred: dict[Address, float] = {}  # when another node's publisher was last seen [s]
         self._conflicts: set[Address] = set()
 
@@ -63,31 +64,27 @@ class Ros2Arbiter:
         `now`: time on any monotonic clock [s].
         """
         present = set(addresses)
-        gone = sorted(self._published.keys() - present)
-        decisions = [Decision("withdraw", address, self._published.pop(address)) for address in gone]
+        gone = sorted(self.published.keys() - present)
+        decisions = [Decision("withdraw", address, self.published.pop(address)) for address in gone]
         self._deferred = {address: seen for address, seen in self._deferred.items() if address in present}
         self._conflicts &= present
         decided = (self._decide(address, other_nodes.get(address), now) for address in sorted(present))
         return decisions + [decision for decision in decided if decision]
-
-    def publishes(self, address: Address) -> bool:
-        """Return whether an address is published."""
-        return address in self._published
 
     def _decide(self, address: Address, other_node: str | None, now: float) -> Decision | None:
         topic = self.topic_of(address)
         if other_node is not None:
             is_new = address not in self._deferred
             self._deferred[address] = now
-            self._published.pop(address, None)
+            self.published.pop(address, None)
             return Decision("defer", address, topic, other_node) if is_new else None
-        if address in self._published or now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over:
+        if address in self.published or now - self._deferred.get(address, -math.inf) <= TIMINGS.take_over:
             return None
-        owner = next((each for each, published in self._published.items() if published == topic), None)
+        owner = next((each for each, published in self.published.items() if published == topic), None)
         if owner is None:
             self._deferred.pop(address, None)
             self._conflicts.discard(address)
-            self._published[address] = topic
+            self.published[address] = topic
             return Decision("publish", address, topic)
         if address in self._conflicts:
             return None

@@ -58,10 +58,10 @@ class Background:
             plot.image_rgba([self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image")
         lines = [list(zip(*(project(*point) for point in ring), strict=True)) for ring in self.rings]
         source = ColumnDataSource({"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]})
-        plot.multi_line("east", "north", source=source, color=style.quiet, line_width=1.5, level="underlay")
+        plot.multi_line("east", "north", source=source, color=style.colours["quiet"], line_width=1.5, level="underlay")
         points = [line for line in lines if len(line[0]) == 1]
         easts, norths = [east[0] for east, _ in points], [north[0] for _, north in points]
-        plot.scatter(easts, norths, marker="cross", color=style.quiet, level="underlay")
+        plot.scatter(easts, norths, marker="cross", color=style.colours["quiet"], level="underlay")
 
     def _read_image(self, path: Path) -> None:
         from PIL import Image

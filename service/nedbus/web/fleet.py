@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import count
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from nedbus.client import (
@@ -106,9 +105,9 @@ class VehicleView:
     @property
     def has_position(self) -> bool:
         """True while valid positions are received."""
-        last = self.main.stream.last
-        if self.main.silence is not None or last is None or not is_position(self.main.address):
+        if self.main.silence is not None or not is_position(self.main.address):
             return False
+        last = self.main.stream.last
         return bool(last.message.xy_valid) or "xy_valid" in last.provenance.missing
 
 
@@ -152,16 +151,15 @@ class Fleet:
         while self._gone:
             self.streams.pop(self._gone.pop(), None)
         address = sample.address
-        stream = self.streams.get(address)
-        if stream is None:
-            if len(self.streams) >= MAX_STREAMS and not (is_position(address) and self._evict(time)):
-                if len(self._left_out) < MAX_STREAMS:
-                    self._left_out.add(address)
-                return
-            stream = self.streams[address] = PageStream(self.origin, self._long)
-            self._left_out.discard(address)
         is_estimate = is_position(address) and address.topic != TRUTH
-        stream.add(sample, time, self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None)
+        truth = self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None
+        if stream := self.streams.get(address):
+            stream.add(sample, time, truth)
+        elif len(self.streams) < MAX_STREAMS or (is_position(address) and self._evict(time)):
+            self.streams[address] = PageStream(sample, time, truth, self.origin, self._long)
+            self._left_out.discard(address)
+        elif len(self._left_out) < MAX_STREAMS:
+            self._left_out.add(address)
 
     def reject(self, reports: Sequence[RejectionReport]) -> None:
         """Add reports of rejected messages."""
@@ -176,9 +174,7 @@ class Fleet:
         for collection in (self.streams, self._left_out, self._rejected, self._reports):
             collection.clear()
 
-    def update(
-        self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus] = MappingProxyType({})
-    ) -> None:
+    def update(self, now: Snapshot, states: Mapping[str, State], logs: Mapping[str, LogStreamStatus]) -> None:
         """Update `snapshot`; `states`, `logs`: states and ULog streams by vehicle."""
         self.reject(now.rejected)
         time, alive = now.time, now.alive
@@ -188,8 +184,6 @@ class Fleet:
             self._left_out.intersection_update(alive)
         views: dict[str, list[StreamView]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
-            if stream.last is None:
-                continue
             health = now.healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
             view = StreamView(address, stream, health, state, self._rejected[address])
@@ -218,8 +212,7 @@ def _status(views: Sequence[StreamView]) -> dict[str, StatusValue]:
 
     def value_of(topic: str, describe: Callable[[Any], str]) -> StatusValue:
         view = known.get((topic, 0))
-        last = None if view is None else view.stream.last
-        return StatusValue() if view is None or last is None else StatusValue(describe(last.message), view.silence)
+        return StatusValue() if view is None else StatusValue(describe(view.stream.last.message), view.silence)
 
     gps = "vehicle_gps_position" if ("vehicle_gps_position", 0) in known else "sensor_gps"
     return {

@@ -71,7 +71,7 @@ class Map:
         labels = self._labels(placed, chosen, frame)
         replace(self.marks, [self._marker(each, position, labels.get(each.vehicle)) for each, position in placed])
         self.shown = [each.vehicle for each, _ in placed]
-        ephs = [each.main.stream.last.message.eph for each, _ in focused if each.main.stream.last is not None]
+        ephs = [each.main.stream.last.message.eph for each, _ in focused]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
         replace(self._ring, [{"east": at.east, "north": at.north, "radius": radius} for _, at in focused])
         if self._background is not None and overview.origin.projection is not None:
@@ -89,7 +89,7 @@ class Map:
         self.shown_events = [event for event, _ in placed]
         marks = [
             {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.words[:80],
-             "colour": self._style.grades[event.severity]}
+             "colour": self._style.colours[event.severity]}
             for event, at in placed
         ]  # fmt: skip
         replace(self.events, marks)
@@ -139,19 +139,18 @@ class Map:
 
     def _marker(self, view: VehicleView, at: Position, is_left: bool | None) -> dict[str, Any]:
         """Return a marker shaped by grade: filled at the current position, open at the last valid position."""
-        last = view.main.stream.last
-        heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
-        colour = self._style.vehicle_colour(view.number)
+        heading = getattr(view.main.stream.last.message, "heading", math.nan)
+        colours, colour = self._style.colours, self._style.vehicle_colour(view.number)
         return {
             "east": round(at.east, 3), "north": round(at.north, 3), "angle": round(math.pi / 2 - heading, 3),
-            "shape": MARKERS[view.grade], "colour": colour, "fill": colour if view.has_position else self._style.ground,
-            "edge": colour if view.grade == "ok" else self._style.grades[view.grade],
+            "shape": MARKERS[view.grade], "colour": colour, "fill": colour if view.has_position else colours["ground"],
+            "edge": colour if view.grade == "ok" else colours[view.grade],
             "label": "" if is_left is None else view.vehicle, "name": view.vehicle, "words": view.state.text,
             "align": "right" if is_left else "left", "offset": -11 if is_left else 11,
         }  # fmt: skip
 
     def _draw(self) -> figure:
-        style, tracks = self._style, self._tracks.source
+        colours, tracks = self._style.colours, self._tracks.source
         plot = figure(
             match_aspect=True, sizing_mode="stretch_both", x_axis_label="east [m]", y_axis_label="north [m]",
             tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom", height=100, css_classes=["map"],
@@ -161,14 +160,15 @@ class Map:
         for axis in (plot.x_range, plot.y_range):
             axis.update(renderers=[frame], range_padding=0)
         *valid, doubtful, truth = LINE_TYPES
-        plot.line("east", truth, source=tracks, color=style.truth, line_dash="dotted", line_width=2)
+        plot.line("east", truth, source=tracks, color=colours["truth"], line_dash="dotted", line_width=2)
         for number, name in enumerate(valid):
-            plot.line("east", name, source=tracks, color=style.vehicle_colour(number), line_width=1.5)
-        plot.line("east", doubtful, source=tracks, color=style.grades["watch"], line_dash="dashed", line_width=2)
+            plot.line("east", name, source=tracks, color=self._style.vehicle_colour(number), line_width=1.5)
+        plot.line("east", doubtful, source=tracks, color=colours["watch"], line_dash="dashed", line_width=2)
         plot.circle(
-            "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=style.text, line_dash="dashed"
-        )
-        plot.scatter("east", "north", source=self._ring, size=30, fill_alpha=0, color=style.text, line_width=1.5)
+            "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=colours["text"],
+            line_dash="dashed",
+        )  # fmt: skip
+        plot.scatter("east", "north", source=self._ring, size=30, fill_alpha=0, color=colours["text"], line_width=1.5)
         marked = plot.scatter(
             "east", "north", source=self.events, marker="marker", size=9, color="colour", nonselection_alpha=1.0
         )
@@ -182,7 +182,7 @@ class Map:
         )  # fmt: skip
         plot.text(
             "east", "north", text="label", source=self.marks, x_offset="offset", y_offset=-5, text_align="align",
-            text_font_size="11px", text_color=style.text,
+            text_font_size="11px", text_color=colours["text"],
         )  # fmt: skip
         plot.add_layout(ScaleBar(range=plot.x_range, unit="m", location="bottom_left"))
         plot.add_tools(

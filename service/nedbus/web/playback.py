@@ -143,7 +143,7 @@ class Player:
             self._add(index)
         self._next = max(self._next, end)
         states = {name: state_at(spans, self.time) for name, spans in self.recording.timeline.spans.items()}
-        self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states)
+        self.fleet.update(Snapshot(self.time, self._monitor.snapshot(round(self.time * 1e9))), states, {})
 
     def _add(self, index: int) -> None:
         due, (address, entry) = self.recording.dues[index], self.recording.entries[index]

@@ -219,23 +219,22 @@ class _HostCheck(NullAuth):
     """Reject requests with a foreign Host header before each response; all viewers are the same user."""
 
     login_url = "/"  # required by Bokeh, never used
-    get_user_async: Any = None
 
     def __init__(self, options: PageOptions) -> None:
-        async def check(handler: RequestHandler) -> str:
-            _check_host(handler, options)
-            if handler.request.path.endswith("/ws"):  # without a valid token, Bokeh would log a traceback
-                name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
-                try:
-                    is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
-                except Exception:  # noqa: BLE001 - Bokeh does not translate the errors of its decoders
-                    is_valid = False
-                if not is_valid:
-                    raise HTTPError(403, reason="WebSocket without a valid page token")
-            return "viewer"
-
-        self.get_user_async = check
         super().__init__()
+        self._options = options
+
+    async def get_user_async(self, handler: RequestHandler) -> str:  # type: ignore[override] # a property in Bokeh
+        _check_host(handler, self._options)
+        if handler.request.path.endswith("/ws"):  # without a valid token, Bokeh would log a traceback
+            name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
+            try:
+                is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
+            except Exception:  # noqa: BLE001 - Bokeh does not translate the errors of its decoders
+                is_valid = False
+            if not is_valid:
+                raise HTTPError(403, reason="WebSocket without a valid page token")
+        return "viewer"
 
 
 def _check_host(handler: RequestHandler, options: PageOptions) -> None:

@@ -95,17 +95,19 @@ class PageStream:
     `last`: the last sample; `time`: its arrival time [s]; `valid`: the last valid position, if any.
     """
 
-    def __init__(self, origin: Origin, long: tuple[int, float] = LONG) -> None:
+    def __init__(
+        self, sample: Sample[Any], time: float, truth: PageStream | None, origin: Origin, long: tuple[int, float]
+    ) -> None:
         self.minute, self.long = History(POINTS, _STEP), History(*long)
-        self.last: Sample[Any] | None = None
-        self.time = -math.inf
+        self.last = sample
         self.valid: Position | None = None
         self.origin = origin
         self._tracker = ResetTracker()
         self._state: object = None
         self._sampled = self._sampled_long = -math.inf
+        self.add(sample, time, truth)
 
-    def add(self, sample: Sample[Any], time: float, truth: PageStream | None = None) -> None:
+    def add(self, sample: Sample[Any], time: float, truth: PageStream | None) -> None:
         """Add a sample received at `time` [s]; `truth`: the ground truth stream of its vehicle."""
         before, self.last, self.time = self.last, sample, time
         if not is_position(sample.address):
@@ -114,7 +116,7 @@ class PageStream:
         if state == self._state:
             if time - self._sampled < _STEP:
                 return
-        elif before is not None:
+        elif self._state is not None:
             self._tracker.add(before.message)  # the tracker needs the last message before the change
         self._state, self._sampled = state, time
         message, missing = sample.message, sample.provenance.missing
@@ -148,7 +150,7 @@ class PageStream:
 
 def _distance(position: Position, message: VehicleLocalPosition, truth: PageStream | None) -> float:
     """Return the distance to the ground truth, extrapolated to the same time [m]; NaN if there is none."""
-    if truth is None or truth.last is None or not math.isfinite(position.north):
+    if truth is None or not math.isfinite(position.north):
         return math.nan
     real = truth.last.message
     other = truth.origin.locate(real)

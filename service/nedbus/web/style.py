@@ -29,29 +29,18 @@ def read_asset(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """Colours of the page, its CSS and its plots; text has a contrast ratio of at least 4.5 (WCAG 2 AA)."""
+    """Colours of the page, its CSS and its plots; text has a contrast ratio of at least 4.5 (WCAG 2 AA).
+
+    `colours`: by CSS variable, with one for each grade; `vehicles`: by number.
+    """
 
     name: str
-    ground: str
-    panel: str
-    line: str
-    text: str
-    quiet: str
-    grades: Mapping[str, str]
-    fills: Mapping[str, str]
+    colours: Mapping[str, str]
     vehicles: tuple[str, ...]
-    truth: str
-    chosen: str
 
     def vehicle_colour(self, number: int) -> str:
         """Return the colour of a vehicle, by its number."""
         return self.vehicles[number % PALETTE]
-
-    @property
-    def colours(self) -> dict[str, str]:
-        """Colours by name in CSS and in the plot theme."""
-        plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
-        return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
 
 
 @cache
@@ -65,14 +54,16 @@ def panels() -> jinja2.Template:
 
 
 DARK: Final = Style(
-    "dark", "#0f1419", "#182028", "#26303a", "#d8dee6", "#94a1ae",
-    {"bad": "#ff8a80", "watch": "#ffb74d", "ok": "#66d17a", "info": "#94a1ae"},
-    {"bad": "#5c1a1a", "watch": "#553a08", "ok": "#123a1d"},
-    ("#6cb6ff", "#c9a0ff", "#5ad1d1", "#ff9ed2", "#9fb4ff", "#c5b38a", "#8fa8b8", "#e0e0ff"), "#8b98a5", "#1d3650",
+    "dark",
+    {"ground": "#0f1419", "panel": "#182028", "line": "#26303a", "text": "#d8dee6", "quiet": "#94a1ae",
+     "truth": "#8b98a5", "chosen": "#1d3650", "bad": "#ff8a80", "watch": "#ffb74d", "ok": "#66d17a", "info": "#94a1ae",
+     "bad-fill": "#5c1a1a", "watch-fill": "#553a08", "ok-fill": "#123a1d"},
+    ("#6cb6ff", "#c9a0ff", "#5ad1d1", "#ff9ed2", "#9fb4ff", "#c5b38a", "#8fa8b8", "#e0e0ff"),
 )  # fmt: skip
 LIGHT: Final = Style(
-    "light", "#ffffff", "#eef2f5", "#d5dce2", "#17202a", "#55626f",
-    {"bad": "#b3261e", "watch": "#8a5000", "ok": "#1b6e2c", "info": "#55626f"},
-    {"bad": "#fbdcda", "watch": "#fbe8c8", "ok": "#d9f2de"},
-    ("#0b5cad", "#7b3fb5", "#0a7a7a", "#b0357f", "#3949ab", "#6b5a2a", "#4a6272", "#5c5c9e"), "#6b7885", "#cfe3f7",
+    "light",
+    {"ground": "#ffffff", "panel": "#eef2f5", "line": "#d5dce2", "text": "#17202a", "quiet": "#55626f",
+     "truth": "#6b7885", "chosen": "#cfe3f7", "bad": "#b3261e", "watch": "#8a5000", "ok": "#1b6e2c", "info": "#55626f",
+     "bad-fill": "#fbdcda", "watch-fill": "#fbe8c8", "ok-fill": "#d9f2de"},
+    ("#0b5cad", "#7b3fb5", "#0a7a7a", "#b0357f", "#3949ab", "#6b5a2a", "#4a6272", "#5c5c9e"),
 )  # fmt: skip

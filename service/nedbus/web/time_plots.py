@@ -45,7 +45,7 @@ class TimelinePlot:
         self.shown: list[Event] = []
         self._spans = table("begin", "end", "row", "colour")
         self._now = table("time")
-        self._style = style
+        self._colours = style.colours
         self._ticker = FixedTicker()
         self.range = Range1d()
         options: dict[str, Any] = {"y_range": Range1d(), "height": 100, "css_classes": ["time"], "title": _LEGEND}
@@ -55,10 +55,10 @@ class TimelinePlot:
         self.figure.ygrid.grid_line_color = None
         self.figure.hbar("row", 0.28, "end", "begin", source=self._spans, color="colour", alpha=0.75)
         marks = self.figure.scatter(
-            "time", "row", source=self.marks, marker="marker", size=11, fill_color="colour", line_color=style.ground,
-            nonselection_alpha=1.0,
+            "time", "row", source=self.marks, marker="marker", size=11, fill_color="colour",
+            line_color=style.colours["ground"], nonselection_alpha=1.0,
         )  # fmt: skip
-        self.figure.vspan(x="time", source=self._now, line_color=style.text, line_dash="dotted")
+        self.figure.vspan(x="time", source=self._now, line_color=style.colours["text"], line_dash="dotted")
         self.figure.add_tools(HoverTool(renderers=[marks], tooltips="@vehicle: @words"), TapTool(renderers=[marks]))
 
     def update(
@@ -80,16 +80,15 @@ class TimelinePlot:
         hidden = len(names) - _MAX_ROWS + 1 if len(names) > _MAX_ROWS else 0
         names = names[: len(names) - hidden]
         rows = {name: len(names) - index for index, name in enumerate(names)}
-        colours = self._style.grades
         self.shown = [event for event in events if event.vehicle in rows]
         marks = [
             {"time": event.time * 1e3, "row": rows[event.vehicle], "marker": MARKERS[event.severity],
-             "colour": colours[event.severity], "words": event.words[:100], "vehicle": event.vehicle}
+             "colour": self._colours[event.severity], "words": event.words[:100], "vehicle": event.vehicle}
             for event in self.shown
         ]  # fmt: skip
         replace(self.marks, marks)
         bars = [
-            {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": colours[span.severity],
+            {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": self._colours[span.severity],
              "end": (end if span.until is None else min(end, span.until)) * 1e3}
             for name, span in held if name in rows
         ]  # fmt: skip
@@ -133,7 +132,7 @@ class Plots:
 
     def mark_events(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
         """Mark the events of the vehicle and shade its conditions; active ones end at `end` [s]."""
-        colours = self._style.grades
+        colours = self._style.colours
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [
             {"begin": span.since * 1e3, "end": (end if span.until is None else span.until) * 1e3,
@@ -149,7 +148,8 @@ class Plots:
             legend: dict[str, Any] = {"legend_label": name} if len(names) > 1 else {}
             plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
             if name in _TRUTH_COLUMNS:
-                plot.line("time", name, source=self._truth, color=self._style.truth, line_dash="dotted", line_width=1.5)
+                truth = self._style.colours["truth"]
+                plot.line("time", name, source=self._truth, color=truth, line_dash="dotted", line_width=1.5)
         plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
         plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
         plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)

@@ -46,12 +46,12 @@ def test_namespace_invalid_in_ros_2_is_rejected(namespace: str) -> None:
 def test_address_is_published_once_and_withdrawn_when_gone() -> None:
     """Only changes return decisions: an address is published once, and withdrawn once it is gone."""
     arbiter = make()
-    assert not arbiter.publishes(ONE)
+    assert ONE not in arbiter.published
     assert arbiter.update([ONE], {}, now=0.0) == [Decision("publish", ONE, TOPIC)]
-    assert arbiter.publishes(ONE)
+    assert ONE in arbiter.published
     assert arbiter.update([ONE], {}, now=1.0) == []
     assert arbiter.update([], {}, now=2.0) == [Decision("withdraw", ONE, TOPIC)]
-    assert not arbiter.publishes(ONE)
+    assert ONE not in arbiter.published
     assert arbiter.update([], {}, now=3.0) == []
 
 
@@ -60,10 +60,10 @@ def test_topic_of_another_node_is_not_published(published: bool) -> None:
     """A topic that another node publishes, such as PX4 itself, is not published, and reported once."""
     arbiter = make()
     arbiter.update([ONE] if published else [], {}, now=0.0)
-    assert arbiter.publishes(ONE) is published
+    assert (ONE in arbiter.published) is published
     assert arbiter.update([ONE], {ONE: "px4"}, now=1.0) == [Decision("defer", ONE, TOPIC, "px4")]
     assert arbiter.update([ONE], {ONE: "px4"}, now=2.0) == []
-    assert not arbiter.publishes(ONE)
+    assert ONE not in arbiter.published
 
 
 def test_topic_is_taken_over_after_a_delay() -> None:
@@ -94,7 +94,7 @@ def test_addresses_with_the_same_topic_conflict() -> None:
         Decision("conflict", second, topic, str(first)),
     ]
     assert arbiter.update([first, second], {}, now=1.0) == []
-    assert (arbiter.publishes(first), arbiter.publishes(second)) == (True, False)
+    assert [*arbiter.published] == [first]
     assert actions(arbiter, [second], now=2.0) == [("withdraw", topic), ("publish", topic)]
     # A later address does not displace a published one, whatever their order.
     assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]

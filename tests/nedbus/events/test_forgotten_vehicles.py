@@ -61,7 +61,7 @@ class World:
         self.output.expire_stale()
         snapshot, event_log = self.reader.poll(), self.reader.event_log
         states = {name: event_log.state(name, self.now) for name in event_log.vehicles}
-        self.fleet.update(snapshot, states)
+        self.fleet.update(snapshot, states, {})
 
     def sizes(self) -> dict[str, int]:
         """Return the number of objects by kind of state."""

@@ -334,17 +334,18 @@ def test_open_marker_stays_at_the_last_valid_position(sim: SimulatedFleet) -> No
     sim.fly(3, WING, QUAD, x=4.0, y=2.0)
     page = Page(sim)
     assert page.marks["wing"]["shape"] == "circle"
-    assert page.marks["wing"]["fill"] == page.marks["wing"]["colour"] != DARK.ground
+    assert page.marks["wing"]["fill"] == page.marks["wing"]["colour"] != DARK.colours["ground"]
     sim.add(xy_valid=False)
     page.refresh()
-    assert (page.marks["wing"]["shape"], page.marks["wing"]["fill"]) == ("square", DARK.ground), "at once"
+    assert (page.marks["wing"]["shape"], page.marks["wing"]["fill"]) == ("square", DARK.colours["ground"]), "at once"
     sim.fly(3, WING, x=99.0, xy_valid=False)
     page.refresh(alive=[WING])
     assert page.marks["wing"]["words"] == "xy not valid"
     assert page.marks["quad"]["words"].startswith("gone")
     for mark in page.marks.values():
-        assert (mark["shape"], mark["fill"], mark["north"], mark["east"]) == ("square", DARK.ground, 4.0, 2.0)
-        assert mark["edge"] == DARK.grades["bad"]
+        assert (mark["shape"], mark["fill"]) == ("square", DARK.colours["ground"])
+        assert (mark["north"], mark["east"]) == (4.0, 2.0)
+        assert mark["edge"] == DARK.colours["bad"]
 
 
 def test_selection_survives_reordering(sim: SimulatedFleet) -> None:
@@ -788,14 +789,15 @@ def contrast(one: str, other: str) -> float:
 @pytest.mark.parametrize("style", [DARK, LIGHT], ids=lambda style: style.name)
 def test_colours_have_sufficient_contrast(style: Style) -> None:
     """Text has a contrast ratio of 4.5 to its background, marks and lines 3; no vehicle has the colour of a state."""
-    for ground in (style.ground, style.panel, style.chosen):
-        for text in (style.text, style.quiet, *(style.grades[grade] for grade in ("bad", "watch", "ok"))):
-            assert contrast(text, ground) >= 4.5, (text, ground)
-    for grade, fill in style.fills.items():
-        assert contrast(style.grades[grade], fill) >= 4.5, grade
-    for colour in (*style.vehicles, style.truth):
-        assert contrast(colour, style.ground) >= 3, colour
-    assert not set(style.vehicles) & set(style.grades.values())
+    colours = style.colours
+    for ground in ("ground", "panel", "chosen"):
+        for text in ("text", "quiet", "bad", "watch", "ok"):
+            assert contrast(colours[text], colours[ground]) >= 4.5, (text, ground)
+    for grade in ("bad", "watch", "ok"):
+        assert contrast(colours[grade], colours[f"{grade}-fill"]) >= 4.5, grade
+    for colour in (*style.vehicles, colours["truth"]):
+        assert contrast(colour, colours["ground"]) >= 3, colour
+    assert not set(style.vehicles) & set(colours.values())
 
 
 # Live vehicles of a real bus
@@ -859,9 +861,9 @@ def test_page_survives_a_router_restart() -> None:
         router.close()
         until(lambda: f"no link to {where}" in page.panel("head"), "the alarm")
         assert page.grades == {"wing": "ok"}
-        assert page.marks["wing"]["fill"] == DARK.ground
+        assert page.marks["wing"]["fill"] == DARK.colours["ground"]
         router = open_router(listen=(where,))
-        until(lambda: page.marks["wing"]["fill"] != DARK.ground, "the vehicle again")
+        until(lambda: page.marks["wing"]["fill"] != DARK.colours["ground"], "the vehicle again")
         until(lambda: "no link to" not in page.panel("head"), "the alarm to end")
         texts = [
             event.text.partition(" after")[0] for event in page.viewer._timeline.events if event.kind == "link_down"

@@ -281,7 +281,6 @@ def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
 
 
 def _require_vehicle(where: object, names: Collection[str], vehicle: str) -> None:
-    """Raise ConfigError if `vehicle` is neither one of `names` nor "*"."""
     if vehicle != ANY and vehicle not in names:
         check_vehicle(vehicle)
         shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"

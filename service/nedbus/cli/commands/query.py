@@ -1,7 +1,6 @@
 """Commands that send one query: list, get, info, schema."""
 
 import json
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -17,18 +16,7 @@ from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, heal
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus.events import format_duration
 from nedbus.timings import TIMINGS
-from nedbus_msgs import (
-    ANY,
-    BY_TOPIC,
-    DEFAULT_TOPIC,
-    MESSAGES,
-    TOPICS,
-    Definition,
-    Message,
-    Selection,
-    definition_of,
-    get_topic,
-)
+from nedbus_msgs import ANY, DEFAULT_TOPIC, MESSAGES, TOPICS, Definition, Message, Selection, definition_of, get_topic
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
@@ -48,13 +36,12 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
     """
     selection = Selection(ANY, vehicle)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
-    published = Counter({each: count for each, count in everything.items() if selection.matches(each)})
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []
-    for address in sorted(published | newest.keys()):
+    for address in sorted({*filter(selection.matches, everything), *newest}):
         sample = newest.get(address)
         health = health_of_last(sample) if sample else None
-        state = stream_state(health, publishers=published[address]) if health else None
+        state = stream_state(health, publishers=everything[address]) if health else None
         age = health.age if health else None
         is_stored = sample is not None and sample.stored
         if json_output:
@@ -166,7 +153,7 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
         pass
     except ConnectError as exc:
         reason = f"and no publisher can be queried: {exc}"
-    near = get_close_matches(topic, [*MESSAGES, *BY_TOPIC], 3, _SIMILAR)
+    near = get_close_matches(topic, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
     raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
 

@@ -10,7 +10,7 @@ import typer
 
 from nedbus import __version__
 from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
-from nedbus.cli.output.progress import ProgressLog
+from nedbus.cli.output.progress import log_progress
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
 from nedbus.daemon import Daemon
@@ -68,11 +68,11 @@ def serve(
     if daemon.role == "router" and any(each.startswith("tls/") for each in daemon.endpoints):
         log_refusals()
     pages = serve_pages(settings.http, service_pages(daemon)) if settings.http is not None else nullcontext()
-    progress = ProgressLog(daemon)
+    progress = log_progress(daemon)
     with pages, Notifier(daemon) as notifier:
 
         def tick() -> None:
-            progress.update()
+            next(progress)
             notifier.tick()
 
         def stop() -> None:

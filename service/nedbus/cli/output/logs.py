@@ -44,12 +44,8 @@ class TextFormatter(logging.Formatter):
         return super().formatMessage(record)
 
     def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - overrides logging
-        """Return the last part of a traceback."""
-        return super().formatException(ei)[-_MAX_TRACEBACK:]
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line or lines of a record."""
-        return printable(super().format(record))
+        """Return the last part of a traceback, printable."""
+        return printable(super().formatException(ei)[-_MAX_TRACEBACK:])
 
 
 class JsonFormatter(TextFormatter):
@@ -57,7 +53,7 @@ class JsonFormatter(TextFormatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the JSON object of a record."""
-        about = about_of(record)
+        about: About | None = getattr(record, "about", None)  # None for records of other packages
         fields: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
             "level": record.levelname.lower(),
@@ -69,7 +65,7 @@ class JsonFormatter(TextFormatter):
             if value is not None:
                 fields[key] = to_text(value, MAX_TEXT) if isinstance(value, str) else value
         if record.exc_info:
-            fields["exception"] = printable(self.formatException(record.exc_info))
+            fields["exception"] = self.formatException(record.exc_info)
         return json.dumps(fields)
 
 
@@ -84,12 +80,6 @@ class JournalFormatter(logging.Formatter):
         """Return the line or lines of a record."""
         priority = next(number for level, number in _PRIORITIES if record.levelno >= level)
         return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
-
-
-def about_of(record: logging.LogRecord) -> About | None:
-    """Return the structured fields of a log call; None for records of other packages."""
-    about = getattr(record, "about", None)
-    return about if isinstance(about, About) else None
 
 
 @dataclass(slots=True, eq=False)
@@ -128,7 +118,7 @@ class RateLimit(logging.Filter):
         """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
         now = self._now()
         self.report(lambda bucket: bucket.refill(now))
-        about = about_of(record)
+        about: About | None = getattr(record, "about", None)
         event = about.event if about else None
         if event is not None and not EVENTS[event].limited:
             return True

@@ -4,8 +4,10 @@ import logging
 import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Final
 
@@ -25,35 +27,23 @@ _HINT: Final = """In a second terminal:
   {nedbus} get{where}   all fields of the last message"""
 
 
-class ProgressLog:
-    """Log the progress of a daemon; `update` is called several times a second.
+def log_progress(daemon: Daemon) -> Iterator[None]:
+    """Log the progress of a daemon when a report is due; to be advanced several times a second.
 
     Once the daemon is ready, commands to try in a second terminal are written to stderr.
     """
-
-    def __init__(self, daemon: Daemon) -> None:
-        self._daemon = daemon
-        self._hinted = False
-        self._reports = 0
-        self._reported = time.monotonic()
-        self._counts: dict[str, int] = {}  # messages published by each source up to the last report
-
-    def update(self) -> None:
-        """Log a report if one is due."""
-        if not self._daemon.ready.is_set():
-            return
-        if not self._hinted:
-            self._hinted = True
-            if not is_log_structured() and not self._daemon.until_done:
-                write_stderr(suggested_commands(self._daemon.endpoints))
-        elapsed = time.monotonic() - self._reported
-        if elapsed < TIMINGS.reports[min(self._reports, len(TIMINGS.reports) - 1)]:
-            return
-        self._reported += elapsed
-        self._reports += 1
-        for status in self._daemon.sources:
-            count = status.published - self._counts.get(status.source, 0)
-            self._counts[status.source] = status.published
+    reported, counts = time.monotonic(), Counter[str]()  # time of the last report, and messages by source until then
+    while not daemon.ready.is_set():
+        yield
+    if not is_log_structured() and not daemon.until_done:
+        write_stderr(suggested_commands(daemon.endpoints))
+    for interval in chain(TIMINGS.reports, repeat(TIMINGS.reports[-1])):
+        while (elapsed := time.monotonic() - reported) < interval:
+            yield
+        reported += elapsed
+        for status in daemon.sources:
+            count = status.published - counts[status.source]
+            counts[status.source] = status.published
             if status.state == "running":
                 name = status.source.rstrip(":")
                 text = f"{status.published} messages"
