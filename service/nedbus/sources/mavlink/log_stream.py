@@ -217,14 +217,11 @@ class LogFile:
     def write(self, data: bytes) -> None:
         """Append bytes of the stream; only whole records reach the file."""
         self._partial += data
-        end = position = 0
-        if self._begins and len(self._partial) >= _FILE_HEADER:
-            end = position = _FILE_HEADER
-            self._begins = False
-        while not self._begins and position + _RECORD_HEADER <= len(self._partial):
-            position += _RECORD_HEADER + int.from_bytes(self._partial[position : position + 2], "little")
-            if position <= len(self._partial):
-                end = position
+        end, stop = 0, _FILE_HEADER if self._begins else 0
+        while stop <= len(self._partial):
+            end = stop
+            stop += _RECORD_HEADER + int.from_bytes(self._partial[stop : stop + 2], "little")
+        self._begins = self._begins and not end
         self._append(bytes(self._partial[:end]))
         del self._partial[:end]
 
