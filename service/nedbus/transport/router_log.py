@@ -93,9 +93,8 @@ class Uplinks:
     def _explain(self, endpoint: str) -> str:
         if not endpoint.startswith(("tls/", "quic/")):
             return ""
-        if self._tls is None:
-            return " (no certificates are configured: set tls_ca, tls_certificate and tls_key)"
-        explanation = self._tls.explain()
+        missing = "no certificates are configured: set tls_ca, tls_certificate and tls_key"
+        explanation = self._tls.explain() if self._tls else missing
         return f" ({explanation})" if explanation else ""
 
 
