@@ -11,6 +11,7 @@ import random
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
 from nedbus.client import PublisherRegistry
@@ -136,11 +137,9 @@ class WritePermission:
 
 
 def _routers_of(session: Session) -> set[str]:
-    try:
-        with translate_zenoh_errors():
-            return {str(zid) for zid in session.info.routers_zid()}
-    except NedbusError:
-        return set()
+    with suppress(NedbusError), translate_zenoh_errors():
+        return {str(zid) for zid in session.info.routers_zid()}
+    return set()
 
 
 def _list_vehicles(vehicles: Sequence[str]) -> str:
