@@ -124,6 +124,7 @@ class SourceOutput:
         if message.error is not None:
             self._reject_invalid(message, _NO_MESSAGE, message.error)
             return
+        stream.publisher.relabel(message.source or self._kind)
         start = time.perf_counter()
         try:
             fields = upgrade_fields(stream.publisher.definition, message.fields)
@@ -173,8 +174,6 @@ class SourceOutput:
             self._republish_retained(message)
             stream = self._streams[address]
         stream.last_received, stream.last = self._now(), message
-        if stream.publisher is not None:
-            stream.publisher.relabel(message.source or self._kind)
         self.publish(message)
 
     def expire_stale(self) -> bool:
