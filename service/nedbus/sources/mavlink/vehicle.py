@@ -23,7 +23,6 @@ _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS
 _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
 _FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose messages
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
-_FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
@@ -169,7 +168,7 @@ class Vehicle:
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
-                heading = math.radians(message.hdg % _FULL_TURN / 100)
+                heading = math.radians(message.hdg / 100)
                 self._store("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
             case "ATTITUDE" if math.isfinite(message.yaw):
                 self._store("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
