@@ -13,6 +13,7 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
+from nedbus_msgs.frames import wrap
 
 from .fields import CONVERSIONS, is_reboot
 
@@ -168,10 +169,9 @@ class Vehicle:
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
-                heading = math.radians(message.hdg / 100)
-                self._store("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
+                self._store("heading", now + _VALUE_TIMEOUT, heading=wrap(math.radians(message.hdg / 100)))
             case "ATTITUDE" if math.isfinite(message.yaw):
-                self._store("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
+                self._store("yaw", now + _VALUE_TIMEOUT, heading=wrap(message.yaw))
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
