@@ -20,7 +20,7 @@ from nedbus.recording import RecordingReader
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.fields import CONVERSIONS
 from nedbus.sources.mavlink.log_stream import LogStream
-from nedbus.sources.mavlink.reader import LinkReader, LogReceiver
+from nedbus.sources.mavlink.reader import COMPONENT, SYSTEM, LinkReader, LogReceiver
 from nedbus.sources.mavlink.vehicle import Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import (
@@ -49,7 +49,7 @@ MAVLINK_KINDS: Final = (
     *(getattr(dialect, f"MAVLINK_MSG_ID_{name}") for name in CONVERSIONS if name != "HEARTBEAT"),
 )  # fmt: skip
 """Ids of the messages that `frames` makes."""
-MAVLINK_IDS: Final = (245, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
+MAVLINK_IDS: Final = (SYSTEM, COMPONENT)
 """System and component of the client of the log stream."""
 _MAX_PIECES: Final = 40  # of a log: feeding single bytes would take too long
 _RAW: Final = 255  # kind of an item: raw bytes without a frame
@@ -177,9 +177,8 @@ def parse_mavlink(data: bytes) -> int:
     """
     options = MavlinkOptions(log=frozenset({"1", "take"}), topics=("*",))
     link: Any = _Link(frames(data))
-    system, component = MAVLINK_IDS
     reader = LinkReader(link, name="fuzz")
-    receiver = LogReceiver(reader, options, lambda *_: None, system=system, component=component)
+    receiver = LogReceiver(reader, options, lambda *_: None)
     vehicles: dict[int, Vehicle] = {}
     logs: dict[int, LogStream] = {}
     count = 0

@@ -136,8 +136,7 @@ class Arrays(Generic[M]):
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
         """Encode messages as CDR without validating them, one payload per element; the model must have all fields."""
-        cdr = self._cdr(layout)
-        payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), cdr)
+        payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), self._cdr(layout))
         for name in layout.types:
             payloads[name] = array[name]
         return payloads

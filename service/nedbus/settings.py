@@ -281,10 +281,9 @@ def _read_toml(path: Path) -> dict[str, object]:
     except tomllib.TOMLDecodeError as exc:
         position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
         reason = re.sub(r" \(at .*\)", "", str(exc))
-        if position is None:  # the error is "at end of document"
-            lines = text.splitlines() or [""]
-            raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
-        raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
+        # Otherwise the error is "at end of document".
+        line, column = map(int, position.groups()) if position else position_at(text, len(text.rstrip("\n")))
+        raise ConfigError.in_file(path, reason, line=line, column=column) from exc
 
 
 def _find_key(text: str, name: str) -> _Position:

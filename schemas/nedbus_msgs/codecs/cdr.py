@@ -74,12 +74,10 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
     try:
         return HEADER + cdr.body.pack(*cdr.validation.flatten(cdr.validation.validate(row)))
     except ValidationError as exc:
-        name = list(layout.types)[int(exc.errors()[0]["loc"][0])]
-        raise EncodeError(f"{name}: {fields[name]!r:.40} is not a {layout.types[name]}", definition.name) from None
+        name, problem = list(layout.types)[int(exc.errors()[0]["loc"][0])], "is not a"
     except OverflowError:
-        name, _ = next(cdr.validation.overflows(fields))
-        reason = f"{name}: {fields[name]!r:.40} is beyond the range of {layout.types[name]}"
-        raise EncodeError(reason, definition.name) from None
+        (name, _), problem = next(cdr.validation.overflows(fields)), "is beyond the range of"
+    raise EncodeError(f"{name}: {fields[name]!r:.40} {problem} {layout.types[name]}", definition.name)
 
 
 @cached_on_owner

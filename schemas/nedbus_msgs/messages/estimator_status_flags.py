@@ -16,11 +16,8 @@ class EstimatorStatusFlags(Message):
     """
 
     TOPICS = (
-        Topic(
-            "estimator_status_flags", 1.0, "each EKF2 instance",
-            instances=True, on_change=True, plain_first=True,
-        ),
-    )  # fmt: skip
+        Topic("estimator_status_flags", 1.0, "each EKF2 instance", instances=True, on_change=True, plain_first=True),
+    )
     LAYOUTS = (
         Layout("1.13", """
             1.14, without cs_fake_pos cs_fake_hgt cs_gravity_vector,

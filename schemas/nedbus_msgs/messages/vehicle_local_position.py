@@ -1,7 +1,4 @@
-"""VehicleLocalPosition: position and velocity of a vehicle, and their accuracy.
-
-Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition.msg` (1.16 to main).
-"""
+"""VehicleLocalPosition: position and velocity of a vehicle, and their accuracy."""
 
 from collections.abc import Collection, Mapping
 from typing import ClassVar, Final

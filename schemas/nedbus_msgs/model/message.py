@@ -2,17 +2,16 @@
 
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from .declaration import Layout, RenamedField, Topic
-from .definition import Definition, register
+from .definition import Definition, M, register
 from .px4_types import FieldType, Timestamp, decode_text, field_type
 from .rules import Rule, violations
 
-_M = TypeVar("_M", bound="Message")
 _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
@@ -150,7 +149,7 @@ def _to_python(value: Any, kind: FieldType | None) -> object:
     return value
 
 
-def fill(message: _M, values: dict[str, object], given: Set[str]) -> _M:
+def fill(message: M, values: dict[str, object], given: Set[str]) -> M:
     """Set the fields of a new message to valid, rounded values, without validating them; return the message."""
     _set_dict(message, values)
     _set_fields_set(message, given)

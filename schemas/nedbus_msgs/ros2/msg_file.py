@@ -12,7 +12,7 @@ from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
 from nedbus_msgs.model.rules import InRange
 
-from .types import ARRAY, NESTED, PACKAGE, FieldDescription, describe_field, type_hash
+from .types import NESTED, PACKAGE, describe_field, type_hash
 
 _FIELD = re.compile(
     r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})\s*"
@@ -140,11 +140,12 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
         yield MsgField(prefix + line.name, _type_of(line), line.comment)
 
 
-def _describe(line: _Line, parts: Mapping[str, object]) -> FieldDescription:
+def _describe(line: _Line, parts: Mapping[str, object]) -> Mapping[str, object]:
     count = _LENGTH.fullmatch(line.length)
     if line.base in parts and (count or not line.length):
-        return line.name, NESTED + (ARRAY if count else 0), int(count[1]) if count else 0, f"{PACKAGE}/{line.base}"
-    return describe_field(line.name, _type_of(line))
+        return describe_field(line.name, NESTED, int(count[1]) if count else 0, f"{PACKAGE}/{line.base}")
+    kind = _type_of(line)
+    return describe_field(line.name, BASES[kind.base].ros2, kind.length or 0)
 
 
 def _type_of(line: _Line) -> FieldType:

@@ -8,14 +8,11 @@ from typing import Any, Final
 
 from nedbus_msgs.model.declaration import Layout
 from nedbus_msgs.model.definition import MESSAGES, Definition
-from nedbus_msgs.model.px4_types import BASES, FieldType
+from nedbus_msgs.model.px4_types import BASES
 
 PACKAGE: Final = "px4_msgs/msg"
-ARRAY: Final = 48  # offset of fixed-size arrays in type_description_interfaces/msg/FieldType
 NESTED: Final = 1  # type id of a nested message
-FieldDescription = tuple[str, int, int, str]
-"""A field in a type description: name, type id, array length, and name of the nested type."""
-
+_ARRAY: Final = 48  # offset of fixed-size arrays in type_description_interfaces/msg/FieldType
 _RIHS01: Final = "RIHS01_"
 
 
@@ -43,32 +40,22 @@ def ros2_types() -> Mapping[str, Definition[Any]]:
 
 def hash_of(layout: Layout, ros2_type: str) -> str:
     """Return the RIHS01 hash (REP 2016) of a ROS 2 type with the fields of a layout: `RIHS01_` and 64 hex digits."""
-    return type_hash((ros2_type, [describe_field(name, kind) for name, kind in layout.types.items()]))
+    fields = [describe_field(name, BASES[kind.base].ros2, kind.length or 0) for name, kind in layout.types.items()]
+    return type_hash((ros2_type, fields))
 
 
-def type_hash(*types: tuple[str, Sequence[FieldDescription]]) -> str:
+def type_hash(*types: tuple[str, Sequence[Mapping[str, object]]]) -> str:
     """Return the RIHS01 hash of a type, given by name and fields, followed by its nested types sorted by name."""
-    root, *referenced = [
-        {
-            "type_name": type_name,
-            "fields": [
-                {
-                    "name": name,
-                    "type": {"type_id": kind, "capacity": capacity, "string_capacity": 0, "nested_type_name": nested},
-                }
-                for name, kind, capacity, nested in fields
-            ],
-        }
-        for type_name, fields in types
-    ]
+    root, *referenced = [{"type_name": name, "fields": fields} for name, fields in types]
     content = {"type_description": root, "referenced_type_descriptions": referenced}
     return _RIHS01 + sha256(json.dumps(content).encode()).hexdigest()
 
 
-def describe_field(name: str, kind: FieldType) -> FieldDescription:
-    """Return a field as part of a type description."""
-    capacity = kind.length or 0
-    return name, BASES[kind.base].ros2 + (ARRAY if capacity else 0), capacity, ""
+def describe_field(name: str, type_id: int, length: int, nested: str = "") -> Mapping[str, object]:
+    """Return a field of a type description; `length`: that of an array, else 0; `nested`: type of a nested message."""
+    type_id += _ARRAY if length else 0
+    kind = {"type_id": type_id, "capacity": length, "string_capacity": 0, "nested_type_name": nested}
+    return {"name": name, "type": kind}
 
 
 def definition_text(definition: Definition[Any], layout: Layout) -> str:

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
@@ -108,11 +108,10 @@ class SourceOutput:
             stream.publisher = None
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
-    def release(self, *, keep: Iterable[Address] = ()) -> None:
+    def release(self, *, keep: Container[Address] = ()) -> None:
         """Close the publishers of all addresses except `keep`."""
-        kept = set(keep)
         for address, stream in self._streams.items():
-            if address not in kept and stream.publisher is not None:
+            if address not in keep and stream.publisher is not None:
                 stream.publisher.close()
                 stream.publisher = None
 
@@ -124,6 +123,7 @@ class SourceOutput:
         if message.error is not None:
             self._reject_invalid(message, _NO_MESSAGE, message.error)
             return
+        stream.publisher.relabel(message.source or self._kind)
         start = time.perf_counter()
         try:
             fields = upgrade_fields(stream.publisher.definition, message.fields)
@@ -173,8 +173,6 @@ class SourceOutput:
             self._republish_retained(message)
             stream = self._streams[address]
         stream.last_received, stream.last = self._now(), message
-        if stream.publisher is not None:
-            stream.publisher.relabel(message.source or self._kind)
         self.publish(message)
 
     def expire_stale(self) -> bool:

@@ -11,6 +11,7 @@ import random
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
 from nedbus.client import PublisherRegistry
@@ -115,8 +116,7 @@ class WritePermission:
             _log.info("the router accepts %s now", _list_vehicles(accepted), extra=about("access_granted"))
         if any(verdict == "denied" and self._denials[vehicle] < _CONFIRMED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
-        are_allowed = bool(verdicts) and set(verdicts.values()) == {"allowed"}
-        return TIMINGS.probe_pause if are_allowed else TIMINGS.probe_unsure
+        return TIMINGS.probe_pause if set(verdicts.values()) == {"allowed"} else TIMINGS.probe_unsure
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
         """Return the verdict for each vehicle, or no verdicts if the two sessions share no router."""
@@ -136,11 +136,9 @@ class WritePermission:
 
 
 def _routers_of(session: Session) -> set[str]:
-    try:
-        with translate_zenoh_errors():
-            return {str(zid) for zid in session.info.routers_zid()}
-    except NedbusError:
-        return set()
+    with suppress(NedbusError), translate_zenoh_errors():
+        return {str(zid) for zid in session.info.routers_zid()}
+    return set()
 
 
 def _list_vehicles(vehicles: Sequence[str]) -> str:

@@ -27,9 +27,7 @@ _log = logging.getLogger(__name__)
 _LINK_TIMEOUT: Final = 3.0  # s before a link that does not come up is logged
 _EXIT_TIMEOUT: Final = 1.0  # s; a child process may hold the pipe open
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
-_REFUSED: Final = re.compile(
-    r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: "
-)  # only warnings of a listener have a hint
+_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # only listeners give a hint
 _REASONS: Final = {  # by substring of Zenoh's text
     "certificate expired": "its certificate has expired",
     "BadSignature": "its certificate is signed by another CA",
@@ -93,9 +91,8 @@ class Uplinks:
     def _explain(self, endpoint: str) -> str:
         if not endpoint.startswith(("tls/", "quic/")):
             return ""
-        if self._tls is None:
-            return " (no certificates are configured: set tls_ca, tls_certificate and tls_key)"
-        explanation = self._tls.explain()
+        missing = "no certificates are configured: set tls_ca, tls_certificate and tls_key"
+        explanation = self._tls.explain() if self._tls else missing
         return f" ({explanation})" if explanation else ""
 
 

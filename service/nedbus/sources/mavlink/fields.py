@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from nedbus_msgs import MESSAGES
-from nedbus_msgs.frames import euler_to_quaternion, quaternion_to_euler
+from nedbus_msgs.frames import euler_to_quaternion, quaternion_to_euler, wrap
 
 _U16: Final = 2**16 - 1  # "unknown" in most fields of this type
 _WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # MAV_BATTERY_CHARGE_STATE to `warning`
@@ -49,7 +49,7 @@ def _gps(message: Any) -> dict[str, object]:
         "s_variance_m_s": _number(message.vel_acc, 1e3, 0),
         "hdop": _number(message.eph, 100, _U16), "vdop": _number(message.epv, 100, _U16),
         "vel_m_s": _number(message.vel, 100, _U16), "cog_rad": None if course is None else math.radians(course),
-        "heading": None if heading is None else math.remainder(math.radians(heading), math.tau),
+        "heading": None if heading is None else wrap(math.radians(heading)),
         "satellites_used": None if message.satellites_visible == 255 else message.satellites_visible,
     }  # fmt: skip
 

@@ -201,13 +201,14 @@ class LogStream:
                 if chunk.lost:
                     self._file.mark_gap(now - (self._last_chunk or now))
                 self._file.write(chunk.data)
-        except OutputError as exc:
+        except OSError as exc:
+            error = OutputError(self._file.path if self._file else Path(exc.filename), exc)
             self.close()
-            _log.error("%s: the ULog stream is no longer saved: %s", self._name, exc, extra=about("log_stream"))
+            _log.error("%s: the ULog stream is no longer saved: %s", self._name, error, extra=about("log_stream"))
 
 
 class LogFile:
-    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OutputError, such as on a full disk."""
+    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OSError, such as on a full disk."""
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)
@@ -217,44 +218,32 @@ class LogFile:
     def write(self, data: bytes) -> None:
         """Append bytes of the stream; only whole records reach the file."""
         self._partial += data
-        end = position = 0
-        if self._begins and len(self._partial) >= _FILE_HEADER:
-            end = position = _FILE_HEADER
-            self._begins = False
-        while not self._begins and position + _RECORD_HEADER <= len(self._partial):
-            position += _RECORD_HEADER + int.from_bytes(self._partial[position : position + 2], "little")
-            if position <= len(self._partial):
-                end = position
-        self._append(bytes(self._partial[:end]))
+        end, stop = 0, _FILE_HEADER if self._begins else 0
+        while stop <= len(self._partial):
+            end = stop
+            stop += _RECORD_HEADER + int.from_bytes(self._partial[stop : stop + 2], "little")
+        self._begins = self._begins and not end
+        self._file.write(self._partial[:end])
         del self._partial[:end]
 
     def mark_gap(self, seconds: float) -> None:
         """Discard the record that the gap truncated, and write a dropout of this duration."""
         self._partial.clear()
         if not self._begins:
-            self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+            self._file.write(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
 
     def close(self) -> None:
         """Close the file. Idempotent."""
         with suppress(OSError):
             self._file.close()
 
-    def _append(self, data: bytes) -> None:
-        try:
-            self._file.write(data)
-        except OSError as exc:
-            raise OutputError(self.path, exc) from exc
-
 
 def _create(folder: Path, vehicle: str) -> tuple[Path, BinaryIO]:
+    folder.mkdir(parents=True, exist_ok=True)
     name = f"{vehicle}_{clock.now():%Y-%m-%d_%H-%M-%S}"
     path = folder / f"{name}.ulg"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for number in range(2, _MAX_SAME_NAME):
-            with suppress(FileExistsError):
-                return path, path.open("xb", buffering=0)
-            path = folder / f"{name}_{number}.ulg"
-        return path, path.open("xb", buffering=0)
-    except OSError as exc:
-        raise OutputError(path, exc) from exc
+    for number in range(2, _MAX_SAME_NAME):
+        with suppress(FileExistsError):
+            return path, path.open("xb", buffering=0)
+        path = folder / f"{name}_{number}.ulg"
+    return path, path.open("xb", buffering=0)

@@ -18,6 +18,10 @@ from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
 
+# Ids of a companion computer: its loss, unlike that of a ground station, triggers no failsafe.
+SYSTEM: Final = 245
+COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
+
 _MAX_BUFFER: Final = 2**16  # bytes that the parser of a TCP or serial link may buffer
 _MAX_WAITING: Final = 16_384  # messages queued for `read`; later ones are dropped, and counted as lost
 _MAX_READ: Final = 100  # messages per call
@@ -93,17 +97,8 @@ class LogReceiver:
     `send`: sends a MAVLink message to a peer, without blocking. `vehicles`: by system id, from the first heartbeat on.
     """
 
-    def __init__(
-        self,
-        reader: LinkReader,
-        options: MavlinkOptions,
-        send: Callable[[Any, Peer], object],
-        *,
-        system: int,
-        component: int,
-    ) -> None:
+    def __init__(self, reader: LinkReader, options: MavlinkOptions, send: Callable[[Any, Peer], object]) -> None:
         self._reader, self._options, self._send = reader, options, send
-        self._ids = system, component
         self.vehicles: dict[int, _Vehicle] = {}
         self._waiting: SimpleQueue[Received | Rejection | Exception] = SimpleQueue()
         self._stop = threading.Event()
@@ -154,7 +149,7 @@ class LogReceiver:
         if kind.startswith("LOGGING_DATA"):
             target = message.target_system, message.target_component
             if vehicle is None or not vehicle.client.accepts(*target):
-                if target != self._ids:
+                if target != (SYSTEM, COMPONENT):
                     return received
                 where = f"{self._reader.name} system {received.system}"
                 return Rejection(where, f"{kind} of a stream that was not requested")
@@ -167,8 +162,7 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
         elif kind == "HEARTBEAT":
             if vehicle is None:
-                system, component = self._ids
-                client = LogStreamClient(self._options.log, system=system, component=component)
+                client = LogStreamClient(self._options.log, system=SYSTEM, component=COMPONENT)
                 vehicle = self.vehicles[received.system] = _Vehicle(received.system, client, received.peer)
             vehicle.peer = received.peer
             armed = bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)

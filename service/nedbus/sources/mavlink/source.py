@@ -22,16 +22,13 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 from .fields import CONVERSIONS
 from .link import AUTOPILOT, DuplicateIds, Link, Peer, open_link, parse_link
 from .log_stream import LogStream
-from .reader import LinkReader, LogReceiver, Received
+from .reader import COMPONENT, SYSTEM, LinkReader, LogReceiver, Received
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
 _STATUS_INTERVAL: Final = 1.0  # s between status reports of ULog streams
-# Ids of a companion computer: its loss, unlike that of a ground station, triggers no failsafe.
-_SYSTEM: Final = 245
-_COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 
 class MavlinkSource:
@@ -67,16 +64,14 @@ class _LinkSession:
 
     def __init__(self, link: Link, options: MavlinkOptions, *, name: str) -> None:
         self._link, self._options, self._name = link, options, name
-        self._sender = dialect.MAVLink(None, _SYSTEM, _COMPONENT)
+        self._sender = dialect.MAVLink(None, SYSTEM, COMPONENT)
         self._sending = threading.Lock()
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
         self._senders = DuplicateIds()
         self._logs: dict[int, LogStream] = {}
         reader = LinkReader(link, name=name)
-        self._receiver: LogReceiver | None = None
-        if options.log:
-            self._receiver = LogReceiver(reader, options, self._send, system=_SYSTEM, component=_COMPONENT)
+        self._receiver = LogReceiver(reader, options, self._send) if options.log else None
         self._read = (self._receiver or reader).read
 
     def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
@@ -134,9 +129,8 @@ class _LinkSession:
         if isinstance(converted, SourceMessage) and converted.rebooted:
             address = Address(converted.address.vehicle, DEFAULT_TOPIC)
             _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
-        if log is None or converted is None or converted.address is None or not log.delivers(converted.address):
-            return converted
-        return None
+        is_streamed = log and converted and converted.address and log.delivers(converted.address)
+        return None if is_streamed else converted
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""

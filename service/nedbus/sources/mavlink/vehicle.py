@@ -13,6 +13,7 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
+from nedbus_msgs.frames import wrap
 
 from .fields import CONVERSIONS, is_reboot
 
@@ -23,7 +24,6 @@ _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS
 _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
 _FIRST_ROUNDS: Final = 3  # initial transmissions of each request, because links lose messages
 _REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
-_FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
 _UNKNOWN_HEADING: Final = 65535
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
@@ -169,10 +169,9 @@ class Vehicle:
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
-                heading = math.radians(message.hdg % _FULL_TURN / 100)
-                self._store("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
+                self._store("heading", now + _VALUE_TIMEOUT, heading=wrap(math.radians(message.hdg / 100)))
             case "ATTITUDE" if math.isfinite(message.yaw):
-                self._store("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
+                self._store("yaw", now + _VALUE_TIMEOUT, heading=wrap(message.yaw))
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3

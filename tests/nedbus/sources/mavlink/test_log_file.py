@@ -13,7 +13,6 @@ from typing import Final
 import pytest
 from pyulog import ULog
 
-from nedbus.errors import OutputError
 from nedbus.sources.mavlink.log_stream import LogFile
 from tests.flights.ulogs import write_log
 from tests.nedbus.ulog.test_parser import small_log
@@ -76,7 +75,7 @@ def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:
         each.close()
     assert len({each.path for each in files}) == 3
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
+    with pytest.raises(OSError, match="file"):
         LogFile(tmp_path / "file" / "logs", "1")
 
 

@@ -71,7 +71,7 @@ def test_same_first_message_begins_new_stream_after_reboot() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
     ):
         options, reader = MavlinkOptions(log=frozenset({"1"})), LinkReader(link, name="link")
-        receiver = LogReceiver(reader, options, lambda *_: None, system=ids[0], component=ids[1])
+        receiver = LogReceiver(reader, options, lambda *_: None)
         with closing(receiver):
             messages: list[Any] = [heartbeat, header, header, *times, heartbeat, header]
             for message in messages:
