@@ -1,1 +1,1 @@
-"""Tests of nedbus: real sessions, real processes."""
+"""Tests of nedbus with real sessions and real processes."""

@@ -43,7 +43,7 @@ def test_flag_overrides_environment_overrides_file(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.parametrize("is_async", [False, True])
 def test_connect_with_endpoint_ignores_unrelated_settings(tmp_path: Path, endpoint: str, *, is_async: bool) -> None:
-    """With an endpoint only `prefix` and, for tls/, the TLS files are read from ./nedbus.toml."""
+    """With an endpoint, `connect` reads only `prefix` and, for tls/, the TLS files from ./nedbus.toml."""
 
     async def connect_async(where: str | None, prefix: str | None) -> str:
         async with nedbus.connect_async(where, prefix=prefix) as bus:
@@ -69,7 +69,7 @@ def test_connect_with_endpoint_ignores_unrelated_settings(tmp_path: Path, endpoi
 
 
 def test_settings_file_is_found_by_flag_variable_or_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file is --config, else NEDBUS_CONFIG, else ./nedbus.toml."""
+    """The settings file is --config, otherwise NEDBUS_CONFIG, otherwise ./nedbus.toml."""
     for name in ("a", "b", "nedbus"):
         (tmp_path / f"{name}.toml").write_text(f'prefix = "{name}"\n')
     assert load_settings().prefix == "nedbus"
@@ -205,7 +205,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_invalid_tls_file_raises_without_a_router(keys: Path, ca: str, certificate: str, key: str, reason: str) -> None:
-    """Swapped, empty, damaged or mismatched TLS files raise without a router."""
+    """Swapped, empty, damaged or mismatched TLS files raise ConfigError, even without a router."""
     with pytest.raises(ConfigError) as info:
         nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls=Tls(keys / ca, keys / certificate, keys / key))
     assert reason in str(info.value)
@@ -256,7 +256,7 @@ def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.
 
 
 def test_serve_help_lists_every_source() -> None:
-    """`nedbus serve --help` is generated from the table of sources."""
+    """`nedbus serve --help` lists every kind of source."""
     help_ = run_command("serve", "--help", COLUMNS="300")
     assert help_.exit_code == 0
     assert all(f" {name}:{kind.target or ''}" in help_.out for name, kind in SOURCE_KINDS.items())
@@ -272,7 +272,7 @@ def test_listen_error_includes_the_system_error(endpoint: str) -> None:
 
 @pytest.mark.parametrize("endpoint", ["7447", "localhost:7447", "foo/localhost:7447", "tcp/", ""])
 def test_malformed_endpoint_raises(endpoint: str) -> None:
-    """The error explains the syntax of Zenoh endpoints."""
+    """The error for a malformed endpoint explains the syntax of Zenoh endpoints."""
     with pytest.raises(ConfigError, match=r"write PROTOCOL/HOST:PORT, as in tcp/127\.0\.0\.1:7447"):
         open_client((endpoint,), timeout=0)
     with pytest.raises(ConfigError, match="is not an endpoint"):

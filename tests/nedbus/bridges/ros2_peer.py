@@ -28,7 +28,7 @@ PAIRS = ("delta_xy", "delta_vxy")
 
 
 def talk(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any) -> None:
-    """Publish each row once there is a subscriber."""
+    """Wait for a subscriber, then publish each row."""
     publisher = ROS2Publisher(topic=topic, msg_type=TYPE, msg_definition=definition, **options)
     while not publisher.pub.matching_status.matching:
         time.sleep(0.01)

@@ -62,7 +62,7 @@ class Client:
         return {}
 
     def receive_soon(self) -> None:
-        """Receive the next frame if there is one."""
+        """Receive the next frame if it arrives within 0.1 s."""
         with suppress(TimeoutError):
             self.receive(0.1)
 
@@ -118,7 +118,7 @@ def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpo
 def test_message_without_nominal_rate_reaches_the_first_subscriber(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:
-    """A home position is sent once and creates its channel, so it is kept for the first subscriber."""
+    """A home position is sent only once, before its channel can have subscribers, so it is kept for the first one."""
     url = f"ws://127.0.0.1:{free_port()}"
     process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
@@ -162,7 +162,7 @@ def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
     [
         ((1.0, 0.0, 0.0, 0.0), 0, math.nan, (0, 1, 0), (-1, 0, 0)),  # north, level
         ((HALF, 0.0, 0.0, HALF), 500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # east
-        ((-HALF, 0.0, 0.0, -HALF), -500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # the same
+        ((-HALF, 0.0, 0.0, -HALF), -500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # the same rotation
         ((HALF, 0.0, HALF, 0.0), 0, 0.0, (0, 0, 1), (-1, 0, 0)),  # north, and the nose up
         ((HALF, HALF, 0.0, 0.0), 0, 0.0, (0, 1, 0), (0, 0, 1)),  # north, and the right wing down
         ((HALF, HALF, 0.0, 0.0), 500_001, math.pi / 2, (1, 0, 0), (0, 1, 0)),  # too old, so the heading is used
@@ -172,7 +172,7 @@ def test_poses_and_locations_are_published(bus: nedbus.Bus) -> None:
 def test_orientation_falls_back_to_heading_without_recent_attitude(
     q: tuple[float, ...], age: int, heading: float, forward: tuple[int, ...], left: tuple[int, ...]
 ) -> None:
-    """The attitude q, which rotates FRD to NED, is used within 0.5 s of the position, else the heading."""
+    """The orientation is the attitude q (FRD to NED) if it is within 0.5 s of the position, otherwise the heading."""
     attitude = VehicleAttitude.model_validate({"timestamp": 10_000_000 - age, "q": q})
     x, y, z, w = orientation_of(message(10_000_000, heading=heading), attitude)
     assert (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)) == pytest.approx(forward, abs=1e-6)

@@ -41,7 +41,7 @@ def test_constant_clock_offset_is_ignored(ahead: float) -> None:
 
 
 def test_recovered_samples_are_held_back_and_counted() -> None:
-    """After 10 s without a link a burst of recovered samples arrives; only those of the last second are current."""
+    """After 10 s without a link, a burst of recovered samples arrives; only samples of the last second are current."""
     late = LateFilter()
     assert all(admitted(late, *((each / 100, each / 100) for each in range(200))))
     burst = admitted(late, *((2 + each / 100, 12 + each / 2000) for each in range(1000)))
@@ -53,7 +53,7 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
 
 
 def test_slowly_recovered_samples_are_held_back() -> None:
-    """Over a slow link the backlog shrinks slowly; its samples are also held back."""
+    """Samples of a backlog that shrinks only slowly, over a slow link, are also held back."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))
@@ -79,7 +79,7 @@ def test_clock_set_back_is_accepted_within_two_minutes() -> None:
 
 
 def test_stalled_zenoh_timestamps_are_current() -> None:
-    """Zenoh's timestamps never decrease: if a clock is set back they stall, and all samples are current."""
+    """Zenoh's timestamps never decrease: if a clock is set back, they stall, and all samples are current."""
     late = LateFilter()
     admitted(late, *((each / 100, each / 100) for each in range(200)))
     assert all(admitted(late, *((1.99, each / 100) for each in range(200, 2_000))))
@@ -96,7 +96,7 @@ def test_clock_drift_does_not_make_samples_late() -> None:
     assert 10 * late._limit < DRIFT
 
 
-def test_restarted_publisher_has_a_new_clock() -> None:
+def test_sample_of_a_restarted_publisher_is_current() -> None:
     """Samples of a vehicle that restarts with a clock from 1970, or was forgotten, are current at once."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
@@ -113,7 +113,7 @@ def test_sample_without_a_timestamp_is_current() -> None:
 
 
 def test_report_names_one_address_and_counts_the_others() -> None:
-    """A report is one line for any number of vehicles."""
+    """A report of late messages is one line, however many vehicles have sent them."""
     late = LateFilter()
     for name in "abc":
         assert not late.admits(sample(NOW, address=Address(name, ONE.topic), retained=True), arrived=0)

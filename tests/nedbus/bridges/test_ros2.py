@@ -109,12 +109,12 @@ def peer(start: Start, endpoint: str, tmp_path: Path) -> Peer:
 
 
 def as_json(fields: dict[str, object]) -> str:
-    """Return fields as JSON, in which NaN equals NaN."""
+    """Return fields as JSON, so that NaN equals NaN."""
     return json.dumps(fields, sort_keys=True)
 
 
 def test_message_of_a_ros2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus) -> None:
-    """Messages of a ROS 2 node arrive field by field; the layout is found by its type hash."""
+    """All fields of the messages of a ROS 2 node are received; the layout is found by its type hash."""
     rows = [downgrade(each, "1.14") for each in flight()]
     with bus.subscribe(mode="every") as subscription:
         run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
@@ -130,7 +130,7 @@ def test_message_of_a_ros2_node_is_received(run_nedbus: Start, peer: Peer, endpo
 def test_ros2_node_receives_messages_and_lists_topics(
     run_bridge: RunBridge, peer: Peer, zenoh_session: Session, bus: nedbus.Bus, layout: str
 ) -> None:
-    """Messages of the bridge arrive at a ROS 2 node field by field, and the node lists their topics."""
+    """A ROS 2 node receives all fields of the messages that the bridge publishes, and lists their topics."""
     messages = flight()
     expected = [downgrade(each, layout) for each in messages]
     publisher = bus.publisher(VLP, vehicle="7")
@@ -177,7 +177,7 @@ def test_messages_have_the_layout_of_the_release(
 ) -> None:
     """Key, type hash and CDR fields of every topic in a real log match the selected release.
 
-    Messages that the release lacks are logged once. Streams without a nominal rate have their last message published.
+    Messages that the release lacks are logged once. The last message of streams without a nominal rate is published.
     """
     last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE_MESSAGES}").messages}
     messages = {each: upgrade_with(BY_TOPIC[each.topic], fields) for each, fields in last.items()}
@@ -248,7 +248,7 @@ def test_retained_message_is_not_bridged(
 def test_late_messages_of_a_returning_vehicle_are_held_back(
     run_bridge: RunBridge, zenoh_session: Session, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """After a router restart a vehicle may be gone for a moment; messages recovered afterwards are held back."""
+    """Messages recovered after a vehicle was briefly gone, as in a router restart, are held back."""
     timings.lateness = 0.2
     address = Address("1", VLP)
     subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(10))
@@ -346,7 +346,7 @@ def test_topic_of_another_node_is_not_published_twice(
     timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The bridge publishes a topic that PX4 publishes itself only as a translation to another layout."""
+    """If PX4 already publishes a topic to ROS 2, the bridge publishes it only in another layout, until PX4 stops."""
     timings.take_over = 0.1
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
@@ -364,7 +364,9 @@ def test_topic_of_another_node_is_not_published_twice(
     back.undeclare()
 
 
-def test_topics_follow_their_vehicles(run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session) -> None:
+def test_ros2_topic_is_listed_only_while_its_publisher_exists(
+    run_bridge: RunBridge, bus: nedbus.Bus, zenoh_session: Session
+) -> None:
     """ROS 2 lists a topic only while the vehicle's publisher exists."""
 
     def topics() -> set[str]:
@@ -398,7 +400,7 @@ def test_bridge_loop_is_ignored(
 def test_command_bridges_one_instance_for_humble(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session
 ) -> None:
-    """`nedbus ros2` bridges a single instance, in another domain, with the keys of Humble, and reports a conflict."""
+    """`nedbus ros2` bridges one instance to another domain with the keys of Humble, and reports a topic conflict."""
     publishers = [bus.publisher("estimator_local_position", vehicle="a-b", instance=number) for number in (0, 1)]
     bus.publisher("estimator_local_position", vehicle="a_b", instance=0)
     key = f"3/a_b/fmu/out/estimator_local_position_0/{dds_type(ROS2_TYPE)}/TypeHashNotSupported"
@@ -445,7 +447,7 @@ def test_access_control_that_hides_ros2_raises(timings: Timings, tmp_path: Path)
 def test_invalid_option_is_a_one_line_error(
     run_nedbus: Start, endpoint: str, arguments: list[str], exit_code: int, text: str
 ) -> None:
-    """An invalid option exits with 2, a router that does not answer with 1; both print one line."""
+    """The exit code is 2 for an invalid option, and 1 if no router answers; both print one line."""
     bridge = run_nedbus("ros2", "-c", endpoint, *arguments)
     assert bridge.wait() == exit_code
     assert text in bridge.err

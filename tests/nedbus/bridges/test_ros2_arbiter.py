@@ -28,7 +28,7 @@ def actions(
 
 
 def test_topic_namespace_is_derived_from_vehicle() -> None:
-    """Vehicle 1 has no namespace; others have the configured one, else one made from the vehicle's name."""
+    """Vehicle 1 has no namespace; other vehicles have the configured one, or else one derived from their name."""
     arbiter = make({"named": "/fleet/a/", "bare": ""})
     estimator = Address("wing-2", "estimator_local_position", 1)
     assert arbiter.topic_of(estimator) == "wing_2/fmu/out/estimator_local_position_1"
@@ -38,13 +38,13 @@ def test_topic_namespace_is_derived_from_vehicle() -> None:
 
 @pytest.mark.parametrize("namespace", ["7up", "a b", "a//b", "a-b", "/1/"])
 def test_namespace_invalid_in_ros_2_is_rejected(namespace: str) -> None:
-    """ROS 2 names begin with a letter and consist of letters, digits and underscores."""
+    """A namespace raises AddressError unless its names begin with a letter and have only letters, digits and "_"."""
     with pytest.raises(AddressError, match="namespace"):
         make({"1": namespace})
 
 
 def test_address_is_published_once_and_withdrawn_when_gone() -> None:
-    """Only changes return decisions: an address is published once, and withdrawn once it is gone."""
+    """`update` returns only changes: an address is published once, and withdrawn when it is gone."""
     arbiter = make()
     assert ONE not in arbiter.published
     assert arbiter.update([ONE], {}, now=0.0) == [Decision("publish", ONE, TOPIC)]
@@ -57,7 +57,7 @@ def test_address_is_published_once_and_withdrawn_when_gone() -> None:
 
 @pytest.mark.parametrize("published", [False, True])
 def test_topic_of_another_node_is_not_published(published: bool) -> None:
-    """A topic that another node publishes, such as PX4 itself, is not published, and reported once."""
+    """A topic that another node, such as PX4, already publishes is not published, and this is reported once."""
     arbiter = make()
     arbiter.update([ONE] if published else [], {}, now=0.0)
     assert (ONE in arbiter.published) is published
@@ -67,7 +67,7 @@ def test_topic_of_another_node_is_not_published(published: bool) -> None:
 
 
 def test_topic_is_taken_over_after_a_delay() -> None:
-    """The delay starts when the other node was last seen, so a node that restarts keeps its topic."""
+    """A topic is taken over some time after the other node was last seen, so a node that restarts keeps its topic."""
     arbiter = make()
     for now in (0.0, 4.0):
         arbiter.update([ONE], {ONE: "px4"}, now=now)
@@ -77,7 +77,7 @@ def test_topic_is_taken_over_after_a_delay() -> None:
 
 
 def test_returning_vehicle_is_published_without_delay() -> None:
-    """An address that left the bus is forgotten, so its return is published at once."""
+    """An address that leaves the bus is forgotten, so it is published at once when it returns."""
     arbiter = make()
     arbiter.update([ONE], {ONE: "px4"}, now=0.0)
     arbiter.update([], {}, now=1.0)

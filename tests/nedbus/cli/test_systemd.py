@@ -163,7 +163,7 @@ def test_reload_sends_reloading_then_ready(start: Start, systemd: Systemd, tmp_p
 
 @pytest.mark.usefixtures("frequent_status")
 def test_watchdog_is_not_sent_without_ticks(systemd: Systemd) -> None:
-    """While the main thread hangs, no WATCHDOG is sent, but the status text is."""
+    """While the main thread hangs, no WATCHDOG is sent, but the status text is still sent."""
     with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
         stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # sent after ten times the limit
@@ -214,7 +214,7 @@ def test_watchdog_is_not_sent_while_a_source_is_stuck(
 
 
 def test_watchdog_is_sent_while_replay_waits_for_readers(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
-    """WATCHDOG is sent while a replay at speed=max waits for slow readers: it is not stuck."""
+    """WATCHDOG is sent while a replay at speed=max waits for slow readers, because it is not stuck."""
     entered, opened = block(monkeypatch, "publish")
     with (
         notified(systemd, "sim:?speed=max&duration=3600", watchdog="20000") as (daemon, notifier),
@@ -275,7 +275,7 @@ def test_notifier_is_inactive_without_notify_socket(address: dict[str, str]) -> 
 
 
 def test_notify_returns_false_if_queue_is_full(systemd: Systemd) -> None:
-    """A notification that systemd cannot accept at the moment returns False instead of blocking."""
+    """`notify` returns False, and does not block, if systemd's queue is full or its socket does not exist."""
     accepted = sum(1 for _ in iter(lambda: notify(systemd.address, READY=1), False))  # until the queue is full
     for _ in range(accepted):
         systemd.receive()

@@ -11,7 +11,7 @@ from tests.waits import DEADLINE, changing_timings
 
 @pytest.fixture(scope="module")
 def long_lookup_timeout() -> Iterator[None]:
-    """Let definition lookups last until the test's deadline: a message whose lookup times out is invalid."""
+    """Raise the timeout of definition lookups to the tests' deadline: a message whose lookup times out is invalid."""
     with changing_timings() as timings:
         timings.definition_timeout = DEADLINE
         yield

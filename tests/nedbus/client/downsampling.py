@@ -21,7 +21,7 @@ MS = 1_000_000  # ns
 
 
 class Link:
-    """A TCP proxy to a router, which forwards only while `flows` is set; `carried` counts the forwarded bytes."""
+    """A TCP proxy to a router that forwards only while `flows` is set; `carried` counts the forwarded bytes."""
 
     def __init__(self, endpoint: str) -> None:
         self.carried = 0
@@ -49,7 +49,7 @@ class Link:
             each.close()
 
     def _accept(self) -> None:
-        with suppress(OSError):  # closed
+        with suppress(OSError):  # the socket is closed
             while True:
                 near, _ = self._listener.accept()
                 if self.broken:
@@ -61,7 +61,7 @@ class Link:
                     threading.Thread(target=self._forward, args=(source, target), daemon=True).start()
 
     def _forward(self, source: socket.socket, target: socket.socket) -> None:
-        with suppress(OSError):  # closed
+        with suppress(OSError):  # the socket is closed
             while data := source.recv(4096):
                 self.flows.wait()
                 self.carried += len(data)
@@ -95,7 +95,7 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 def has_downsampling_reader(publisher: nedbus.Publisher) -> bool:
     """Return True if a reader has requested downsampled streams of the publisher's vehicle."""
-    return publisher._downsampler.vehicle_listener.is_matched()  # otherwise visible only after a publish
+    return publisher._downsampler.vehicle_listener.is_matched()  # a publisher checks it only in `publish`
 
 
 def wait_for_downsampling_reader(publisher: nedbus.Publisher) -> None:

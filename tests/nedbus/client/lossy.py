@@ -1,4 +1,4 @@
-"""Subscriptions that lose messages, and their retransmission requests; loopback itself is lossless."""
+"""Subscriptions that drop chosen messages, because loopback loses none, and record retransmission requests."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Lossy:
 
 
 class CountedRequest:
-    """A retransmission request, which counts as open until its last reply."""
+    """A retransmission request that counts as open until its last reply."""
 
     def __init__(self, answers: RetransmitRequest, lossy: Lossy) -> None:
         self._answers = answers

@@ -1,4 +1,4 @@
-"""Messages with consecutive timestamps, and waiting until a publisher has a subscriber."""
+"""Publish and receive messages with consecutive timestamps, and wait until a publisher has a subscriber."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ SCHEMA = "nedbus/@schema/peer/VehicleLocalPosition"
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode) -> None:
-    """A published message arrives with its type, bit for bit, with its address and times."""
+    """A published message arrives as its type, bit for bit, with its address and the times of sending and reception."""
     publisher = bus.publisher("estimator_local_position", vehicle=7, instance=1)
     sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
     subscription = client.subscribe("*", mode=mode)
@@ -60,7 +60,7 @@ def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, mode: Mo
 def test_sample_published_before_the_subscription_is_retained(
     client: nedbus.Bus, bus: nedbus.Bus, mode: Mode, max_rate: float | None
 ) -> None:
-    """A sample published before the subscription or read by `latest` is retained, even once pickled; others are not."""
+    """`retained` is True for a sample published before the subscription or read by `latest`, even after pickling."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     subscription = client.subscribe(mode=mode, max_rate=max_rate)
@@ -92,7 +92,7 @@ def test_latency_does_not_include_the_time_until_reading(
 
 
 def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
-    """A publisher is declared at the router before its first message; otherwise one new reader in 300 misses it."""
+    """The router knows a publisher before its first message; otherwise one new reader in 300 would miss the message."""
     with nedbus.connect(endpoint) as other:
         for vehicle in range(100):
             publish(bus.publisher(VLP, vehicle=vehicle), 1)
@@ -136,7 +136,7 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
 
 
 def test_vehicles_appear_and_disappear(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Vehicles appear when their liveliness tokens are declared, and disappear when closed.
+    """Vehicles appear when their liveliness tokens are declared, and disappear when their publishers close.
 
     The bus never queries all tokens, because such a query would load all clients of the router.
     """
@@ -175,10 +175,10 @@ def test_vehicles_are_listed_again_after_an_overflow(
     wait_for(partial(has_vehicles, bus, len(tokens)), what="all new vehicles")
 
 
-def test_vehicles_beyond_the_limit_are_logged(
+def test_truncated_list_of_vehicles_is_incomplete_and_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, timings: Timings, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A list truncated at the limit is incomplete, which is logged once; it is complete once all vehicles fit."""
+    """A list of vehicles truncated at the limit is incomplete and logged once; it is complete once all vehicles fit."""
     monkeypatch.setattr(liveliness, "MAX_REPLIES", 2)
     timings.tokens_retry = 0.0
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
@@ -191,10 +191,10 @@ def test_vehicles_beyond_the_limit_are_logged(
     assert caplog.text.count("liveliness tokens") == 1
 
 
-def test_vehicles_of_a_slow_router_are_incomplete(
+def test_list_of_vehicles_is_incomplete_on_timeout(
     endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """On timeout the vehicles received so far are returned as incomplete, logged once; a later call completes them."""
+    """On timeout, `vehicles` returns an incomplete list and logs this once; a later call returns the complete list."""
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with closing(Link(endpoint)) as link, nedbus.connect(link.endpoint) as other:
         link.flows.clear()
@@ -208,7 +208,7 @@ def test_vehicles_of_a_slow_router_are_incomplete(
         assert len(other.vehicles()) == len(publishers)
 
 
-def test_vehicles_without_a_router_are_incomplete() -> None:
+def test_list_of_vehicles_is_incomplete_without_a_router() -> None:
     """Without a router, the list of vehicles is incomplete."""
     where = free_endpoint()
     router = open_router(listen=(where,))
@@ -230,12 +230,12 @@ def test_replies_beyond_channel_capacity_do_not_block(endpoint: str) -> None:
 
 
 def count_replies(zenoh_session: Session, key: str) -> int:
-    """Return the number of replies to a plain get."""
+    """Return the number of replies to a plain Zenoh get."""
     return sum(reply.ok is not None for reply in zenoh_session.get(key))
 
 
 def test_two_processes_of_one_vehicle_both_reply(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
-    """All publishers reply to a plain get, even if two processes publish the same vehicle."""
+    """All publishers reply to a plain Zenoh get, even if two processes publish the same vehicle."""
     with nedbus.connect(endpoint) as other:
         for each, topic in ((bus, VLP), (other, "external_ins_local_position")):
             publish(each.publisher(topic, vehicle="1"), 1)
@@ -282,7 +282,7 @@ def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_sessio
 
 
 def reply_with_statuses(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
-    """Reply to each query for services with all these payloads, by service id."""
+    """Return a handler that replies to each query for services with all payloads in `answers`, keyed by service id."""
     return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
 
 
@@ -514,7 +514,7 @@ def test_threads_reading_one_subscription_share_its_messages(bus: nedbus.Bus, mo
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))])
 def test_sample_can_be_copied_pickled_and_hashed(bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]) -> None:
-    """Samples can be queued for another process and kept in sets; the time of sending stays exact."""
+    """A copied or pickled sample equals the original, has the same hash, and keeps its exact time of sending."""
     bus.publisher(VLP, vehicle="1", source="test").publish(message(1, x=math.nan))
     sample = bus.subscribe().receive(DEADLINE)
     again = copied(sample)

@@ -145,7 +145,7 @@ def test_receive_timeout_includes_opening() -> None:
 
 
 def test_cancelled_receives_open_one_subscriber(endpoint: str, bus: nedbus.Bus) -> None:
-    """Receives cancelled while the subscription opens leave one subscriber, without duplicates."""
+    """If `receive` is cancelled while the subscription opens, a later one opens no second subscriber."""
     publisher = bus.publisher(VLP, vehicle="1")
 
     async def scenario() -> None:
@@ -221,7 +221,7 @@ def test_failed_session_raises_in_asyncio(endpoint: str) -> None:
 
 
 def test_failed_pump_raises_in_iteration(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An unexpected error of the pump thread raises ReceiveError with its text in the reader."""
+    """An unexpected error in the pump thread raises ReceiveError, with the text of the error, in the reading thread."""
 
     def fail(_: Receiver) -> None:
         raise RuntimeError("on purpose")

@@ -181,7 +181,7 @@ def test_close_waits_for_threads_inside_zenoh(bus: nedbus.Bus, monkeypatch: pyte
 
 
 def test_ten_subscriptions_need_at_most_twelve_threads(endpoint: str) -> None:
-    """Ten subscriptions read with a timeout need one thread each, plus the I/O thread and the closer thread."""
+    """Ten subscriptions that are read with a timeout need a thread each, plus the I/O thread and the closer thread."""
     before = set(threading.enumerate())
     with nedbus.connect(endpoint) as bus:
         subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(10)]

@@ -41,7 +41,7 @@ def health_at_px4_times(*clock: float) -> Health:
 
 
 def test_rate_and_jitter_cover_the_last_second() -> None:
-    """Rate and jitter cover the last full second: 50 Hz in steps of 15 and 25 ms."""
+    """Rate and jitter are computed over the last second: here 50 Hz, with intervals of 15 and 25 ms."""
     times = [0.0]
     for index in range(200):
         times.append(times[-1] + (0.1 if index < 10 else 0.015 if index % 2 else 0.025))
@@ -105,12 +105,14 @@ def test_on_change_stream_is_stale_only_below_its_minimum_rate(topic: str, silen
 
 
 def test_gaps_disorder_and_reboots_are_derived_from_px4_time() -> None:
-    """A step of PX4 time above three usual intervals is a gap; a step back is a message out of order or a reboot."""
+    """If PX4's time advances by more than three usual intervals, this is a gap.
+
+    A step back is a message out of order if it is shorter than a second, otherwise a reboot.
+    """
     clock = [index * 0.1 for index in range(20)]
     clock += [clock[-1] + 1.0 + index * 0.1 for index in range(5)]
     clock += [clock[-1] + 0.2, clock[-1] + 2.0]
     assert health_at_px4_times(*clock).gaps == 2
-    # Less than a second back is out of order; more is a reboot.
     health = health_at_px4_times(10.0, 10.1, 10.05, 10.2, 0.5, 0.6)
     assert (health.out_of_order, health.reboots) == (1, 1)
 
@@ -128,7 +130,7 @@ def test_gaps_disorder_and_reboots_are_derived_from_px4_time() -> None:
 def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, reboots: int) -> None:
     """Increments of a reset counter are counted, including its wrap at 255, from the first message on.
 
-    A reboot clears the counters, which is not a reset; later resets are counted.
+    A reboot clears the counters, which does not count as a reset; later resets are counted.
     """
     stream = StreamHealth(VLP)
     for seconds, counter in counters:
@@ -140,7 +142,7 @@ def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, rebo
 
 
 def test_flag_shares_are_fractions_of_messages() -> None:
-    """`flags` has the share of messages with a flag set in the last second, and `flags_ever` since the start."""
+    """`flags` and `flags_ever` are the shares of messages with a flag set, in the last second and since the start."""
     stream = StreamHealth(VLP)
     for index in range(400):
         late = index >= 200
@@ -159,7 +161,7 @@ def test_flag_share_ignores_messages_without_the_flag() -> None:
     assert stream.snapshot(1).flags == {"xy_valid": 0.5, "v_xy_valid": 0.0, "v_z_valid": 0.0}
 
 
-def test_latency_covers_the_last_second_and_lost_is_a_total() -> None:
+def test_latency_covers_the_last_second_and_losses_are_totals() -> None:
     """Latency is the median and maximum of the last second; losses are the total since the start."""
     stream = StreamHealth(VLP)
     for index, latency in enumerate((0.1, 0.2, 0.9)):
@@ -180,7 +182,7 @@ def test_usual_rate_reveals_a_slow_stream() -> None:
     assert 50 < health.usual_rate < 120
 
 
-def test_slow_stream_becomes_stale_later() -> None:
+def test_stale_timeout_is_longer_for_slow_streams() -> None:
     """A stream is stale after 3 s without a message, or after two usual intervals if that is longer."""
     assert stream_at(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
     assert stream_at(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
@@ -219,7 +221,7 @@ def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: 
 
 
 def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples that arrive while a reader starts, and that it reads at once, do not raise the rate."""
+    """Samples that queue up while a reader starts, and that it then reads together, do not raise the rate."""
     monitor, now, start, address = Monitor(), SECOND, time.time_ns(), Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
     monkeypatch.setattr("nedbus.clock.utc_ns", lambda: start + now)
@@ -230,8 +232,8 @@ def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
     assert monitor.snapshot()[address].rate == pytest.approx(100.0)
 
 
-def test_monitor_is_bounded() -> None:
-    """In a flood of keys, the 4096 most recently updated streams are kept, including one that stays active."""
+def test_number_of_monitored_streams_is_bounded() -> None:
+    """In a flood of keys, the monitor keeps the 4,096 most recently updated streams, including an active one."""
     monitor, real = Monitor(), sample("real")
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
     for each in flood:

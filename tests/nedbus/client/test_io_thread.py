@@ -27,7 +27,7 @@ class Calls:
         return self.pause
 
 
-def test_pauses_end_at_common_ticks() -> None:
+def test_jobs_with_long_pauses_are_called_at_common_ticks() -> None:
     """Jobs that pause for a tick or longer are called together at common ticks, even if their pauses differ."""
     calls = [Calls(TICK * (1 + number / 50)) for number in range(50)]
     jobs = [Job(call) for call in calls]

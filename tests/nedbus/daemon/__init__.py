@@ -1,1 +1,1 @@
-"""The service, its settings, and its monitoring."""
+"""The service: its sources, output, reload and log streams."""

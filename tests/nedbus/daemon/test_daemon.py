@@ -62,7 +62,7 @@ def has_state(bus: nedbus.Bus, state: str, number: int = 0) -> Callable[[], bool
 
 
 def expected_rows(path: Path) -> dict[str, list[list[str]]]:
-    """Return the messages of a log by address, read by the source (which test_ulog.py compares with pyulog)."""
+    """Return the local positions of a log by address, as read by `ulog:` (compared with pyulog in test_ulog.py)."""
     found: dict[str, list[list[str]]] = {}
     for each in open_replay(f"ulog:{path}?topics=VehicleLocalPosition").messages:
         found.setdefault(str(each.address), []).append(row_of(upgrade(each.fields)))
@@ -70,7 +70,7 @@ def expected_rows(path: Path) -> dict[str, list[list[str]]]:
 
 
 def row_of(message: VehicleLocalPosition) -> list[str]:
-    """Return the values of a message as text, in which NaN equals NaN."""
+    """Return the values of a message as text, so that NaN equals NaN."""
     return [repr(value) for value in message.__dict__.values()]
 
 
@@ -175,7 +175,7 @@ def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: st
 
 
 def test_ended_replay_loops_or_retains_its_last_message(tmp_path: Path, serve: Serve) -> None:
-    """With loop=1 a replay repeats; otherwise the service still replies with the last message after its end."""
+    """With loop=1 a replay starts again; without it, the service keeps replying with the last message of the replay."""
     path = write_log(tmp_path / "a.ulg", range(0, 100_000, 10_000))
     _, bus = serve("-s", f"ulog:{path}?loop=1&wait=1", "-s", f"ulog:{path}?vehicle=2&speed=max")
     wait_for(has_state(bus, "done", 1), what="the end of the replay")
@@ -285,7 +285,7 @@ def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -
 
 
 def test_client_service_logs_the_origin_of_connect(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """A service that is a client because of NEDBUS_CONNECT or a file logs that, and how to run a router instead."""
+    """A service that is a client because of NEDBUS_CONNECT or a file logs this, and how to run a router instead."""
     hint = "use --listen to run a router instead"
     file, here = tmp_path / "some.toml", free_endpoint()
     file.write_text(f'connect = "{endpoint}"')
@@ -332,7 +332,7 @@ def test_uplink_state_of_a_router_is_logged(caplog: pytest.LogCaptureFixture) ->
 
 
 def test_uplink_state_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    """A client logs once that its link is lost, and that it is up again, with endpoints and duration."""
+    """A client logs once that its link is lost and once that it is up again, with endpoints and outage duration."""
     here, other, now = free_endpoint(), free_endpoint(), 0.0
     caplog.set_level("INFO", "nedbus")
     router = open_router(listen=(here,))
@@ -409,7 +409,7 @@ def test_port_in_use_is_an_error_with_remedy(run_nedbus: Start, endpoint: str) -
     ],
 )
 def test_invalid_option_is_a_usage_error(arguments: str, text: str) -> None:
-    """With an invalid option the service exits with 2 and one line with the remedy, without a traceback."""
+    """With an invalid option, the service prints one line with the remedy and exits with 2, without a traceback."""
     os.mkfifo("pipe")  # opening it would block forever
     service = run_command("serve", *arguments.split())
     assert service.exit_code == 2

@@ -101,7 +101,7 @@ def wait_for_event(process: Process, vehicle: str, kind: str, change: str) -> No
 
 
 def freeze(process: Process, subscription: nedbus.Subscription[Any], messages: int) -> None:
-    """Stop a process while a vehicle sends this number of messages."""
+    """Suspend a process while a vehicle sends this number of messages."""
     process.signal(signal.SIGSTOP)
     try:
         for _ in range(messages):

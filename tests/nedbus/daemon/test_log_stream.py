@@ -1,6 +1,6 @@
 """The ULog stream of PX4 in a service: messages, status, metrics and the saved log, and a refused stream.
 
-The simulated PX4 replays a recording of a real one (SITL, main of 2026-05-14).
+The simulated PX4 replays a stream recorded from PX4 in SITL (main of 2026-05-14).
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ def test_log_stream_arrives_completely_in_another_process(start: Start, tmp_path
 
 
 @pytest.mark.process
-def test_refused_log_stream_is_explained(run_nedbus: Start) -> None:
-    """If another client has the stream, `info`, doctor and the log report it, and MAVLink positions are published."""
+def test_refused_log_stream_is_reported(run_nedbus: Start) -> None:
+    """If another client has the stream, `info`, `doctor` and the log report it; positions come from MAVLink instead."""
     endpoint, port = free_endpoint(), free_port()
     service = run_nedbus("serve", "--listen", endpoint, "--source", f"mavlink:udpin:127.0.0.1:{port}?log=1")
     with (

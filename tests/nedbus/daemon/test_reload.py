@@ -90,7 +90,7 @@ def test_invalid_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> N
 
 
 def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_path: Path) -> None:
-    """A removed source releases its addresses before a new source claims them, even a replay at full speed.
+    """A removed source, even a replay at full speed, releases its addresses before a new source claims them.
 
     A source without a vehicle is restarted if the default vehicle changes.
     """
@@ -108,7 +108,7 @@ def test_reload_can_move_an_address_to_another_source(run_nedbus: Start, tmp_pat
 
 
 def test_reload_keeps_sources_given_by_flags(run_nedbus: Start) -> None:
-    """Flags override the file, so SIGHUP changes nothing, and the result is logged."""
+    """Sources given by flags override the file, so a reload changes nothing and logs this result."""
     service = run_nedbus("serve", "--listen", free_endpoint(), "-s", "sim:", "-s", "sim:?vehicle=2")
     wait_for(lambda: service.err.count("seed 0") == 2, what="the vehicles")
     assert "0 started, 0 stopped, 2 unchanged" in reload(service, 1)

@@ -172,7 +172,7 @@ def run(source: object, clock: FakeClock | None = None, *, retry: bool = True) -
 
 
 def test_replay_publishes_each_message_at_its_due_time() -> None:
-    """At speed 2 messages are published in half the time; then the source is done, and `on_end` is called once."""
+    """At speed=2, messages are published in half the time. Then the source is done, and `on_end` is called once."""
     harness = Harness(FakeReplay([at(0.0), at(1.0), at(3.0)], speed=2.0), FakeClock())
     assert harness.status.state == "starting"
     harness.worker.run()
@@ -183,7 +183,7 @@ def test_replay_publishes_each_message_at_its_due_time() -> None:
 
 
 def test_replay_at_full_speed_is_lossless_and_unpaced() -> None:
-    """At speed=max publishers wait for readers, not for the clock."""
+    """At speed=max, publishers wait for readers, not for the clock."""
     clock = FakeClock()
     harness = run(FakeReplay([at(0.0), at(100.0)], speed=None), clock)
     assert (harness.times, clock.waits) == ([0.0, 0.0], [])
@@ -191,7 +191,7 @@ def test_replay_at_full_speed_is_lossless_and_unpaced() -> None:
 
 
 def test_late_replay_shifts_its_schedule() -> None:
-    """After a suspend of the host, a replay does not send faster to catch up."""
+    """After its host was suspended, a replay does not send faster to catch up."""
     clock = FakeClock()
 
     def stall() -> Iterator[SourceMessage]:
@@ -202,7 +202,7 @@ def test_late_replay_shifts_its_schedule() -> None:
     assert run(FakeReplay([at(0.0)], run=stall), clock).times == [0.0, 10.0, 11.0]
 
 
-def test_replay_waits_for_its_first_subscriber_only() -> None:
+def test_replay_waits_only_for_its_first_subscriber() -> None:
     """With wait=1 a replay publishes nothing before the first subscriber; later runs of a loop do not wait again."""
     harness = Harness(FakeReplay([at(0.0), at(0.5)], wait=True, loop=True), FakeClock(stop_at=2.0))
     harness.registry.readers_at = 1.0
@@ -256,7 +256,7 @@ def test_source_retries_or_fails_after_any_exception(failure: BaseException, rea
 
 
 def test_exception_in_error_handling_fails_the_source() -> None:
-    """An exception during error handling sets the state to failed, with the reason."""
+    """An exception during error handling sets the state to "failed", with the reason."""
 
     def panic() -> None:
         raise PanicException("poisoned")
@@ -330,7 +330,7 @@ def test_live_stream_is_published_until_stale() -> None:
 
 
 def test_live_source_is_waiting_unless_a_vehicle_is_fresh() -> None:
-    """The state is waiting before the first message and while all streams are stale, else running."""
+    """The state is "waiting" before the first message and while all streams are stale, otherwise "running"."""
     clock = FakeClock(stop_at=100.0)
     states: list[tuple[str, tuple[str, ...]]] = []
 

@@ -67,7 +67,7 @@ def find(findings: list[Finding], check: str, state: State, text: str) -> Findin
 
 
 def diagnose_until(endpoint: str, *texts: str) -> list[Finding]:
-    """Run the doctor, doubling the duration until it reports all of these: a busy machine delays messages."""
+    """Run the doctor, doubling the duration until it reports all texts, because a busy machine delays messages."""
     findings, listen = list[Finding](), 0.5
     while not all(any(re.search(text, f"{each.subject}: {each.seen}") for each in findings) for text in texts):
         assert listen < DEADLINE, findings
@@ -111,7 +111,7 @@ def source(**fields: object) -> dict[str, object]:
 
 
 def test_unreachable_endpoint_is_wrong_unless_another_router_answers(endpoint: str) -> None:
-    """A refused connection and an unresolved host name are wrong, and only a warning if another router answers."""
+    """An endpoint that refuses or does not resolve is "wrong", or only a "warning" if another router answers."""
     refused = free_endpoint()
     findings = diagnose(refused, "tcp/no-such-host.invalid:7447", "tcp/a..b:7447")
     assert "nedbus serve" in find(findings, "endpoint", "wrong", f"{refused}: connection refused").advice
@@ -136,8 +136,8 @@ def test_unexpected_error_in_check_is_a_finding(
     assert "Traceback" in caplog.text
 
 
-def test_server_that_is_not_a_router_is_wrong(timings: Timings) -> None:
-    """An HTTP server and a server that never answers are reported to speak neither Zenoh nor TLS."""
+def test_server_that_is_not_a_router_is_reported(timings: Timings) -> None:
+    """An HTTP server and a server that never answers are reported as speaking neither Zenoh nor TLS."""
     timings.doctor_open = timings.handshake = 0.2
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
@@ -154,7 +154,7 @@ def test_server_that_is_not_a_router_is_wrong(timings: Timings) -> None:
 
 
 def test_healthy_network_has_no_faults(bus: nedbus.Bus, endpoint: str, zenoh_session: Session) -> None:
-    """With a publishing vehicle nothing is wrong, and each check has an ok finding."""
+    """With a publishing vehicle, no finding is "wrong", and each check has a finding "ok"."""
     with publishing(bus), service_status(zenoh_session, sources=[source(addresses=[f"1/{VLP}"])]):
         findings = diagnose(endpoint, vehicle="1", listen=1.0)
     assert has_no_faults(findings), findings
@@ -172,7 +172,7 @@ def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str
     find(diagnose(endpoint, vehicle="7"), "vehicle", "wrong", "7: not found under nedbus/")
 
 
-def test_two_publishers_of_one_address_are_wrong(bus: nedbus.Bus, endpoint: str) -> None:
+def test_two_publishers_of_one_address_are_reported(bus: nedbus.Bus, endpoint: str) -> None:
     """Two publishers of one address share a token, but the source info of messages or heartbeats tells them apart."""
     with nedbus.connect(endpoint) as other:
         with publishing(bus), publishing(other):
@@ -182,7 +182,7 @@ def test_two_publishers_of_one_address_are_wrong(bus: nedbus.Bus, endpoint: str)
         find(diagnose_until(endpoint, "2 publishers"), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
 
 
-def test_undecodable_payload_is_wrong(zenoh_session: Session, endpoint: str) -> None:
+def test_undecodable_payload_is_reported(zenoh_session: Session, endpoint: str) -> None:
     """A payload that cannot be decoded is reported with the decoder's reason, such as an unknown layout."""
 
     def publish() -> None:
@@ -204,18 +204,18 @@ def test_undecodable_payload_is_wrong(zenoh_session: Session, endpoint: str) -> 
     ],
     ids=["service", "one of two services", "this host"],
 )
-def test_clock_offset_is_wrong(
+def test_clock_offset_is_reported(
     zenoh_session: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str
 ) -> None:
-    """If one of three clocks disagrees, it is wrong, even if it is this host's; of two clocks either may be wrong."""
+    """Of three clocks, the one that disagrees is wrong, even if it is this host's. Of two, either may be wrong."""
     with ExitStack() as services:
         for name, offset in clocks.items():
             services.enter_context(service_status(zenoh_session, name, offset=offset))
         assert advice in find(diagnose(endpoint), "clock", "wrong", text).advice
 
 
-def test_clock_offset_of_publisher_is_wrong(zenoh_session: Session, endpoint: str) -> None:
-    """Message timestamps reveal the offset of a publisher's clock without a service."""
+def test_clock_offset_of_publisher_is_reported(zenoh_session: Session, endpoint: str) -> None:
+    """Message timestamps reveal the offset of a publisher's clock, even without a service."""
     payload = encode(message(1))
 
     def publish() -> None:
@@ -228,7 +228,7 @@ def test_clock_offset_of_publisher_is_wrong(zenoh_session: Session, endpoint: st
 
 
 def test_service_status_produces_findings(zenoh_session: Session, endpoint: str) -> None:
-    """Failed, waiting and stale sources, rejections and other versions are reported, the worst first if many."""
+    """Failed, waiting and stale sources, rejections and other versions are reported; of many, the worst come first."""
     sources = [
         source(state="failed", error="the disk is gone"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
@@ -258,7 +258,9 @@ def service_report(session: Session, name: str, **vehicles: Mapping[str, object]
 
 
 def test_vehicle_states_in_service_reports_are_findings(zenoh_session: Session, endpoint: str) -> None:
-    """A bad vehicle is wrong, a watch vehicle a warning; healthy vehicles, and those silent for an hour, are omitted.
+    """A vehicle in state "bad" is "wrong", and one in state "watch" is a "warning".
+
+    Vehicles that are healthy, or have been silent for an hour, are omitted.
 
     If two services report a vehicle, only the report of the service that receives its messages counts.
     """
@@ -309,7 +311,7 @@ def test_invalid_event_report_is_ignored(zenoh_session: Session, endpoint: str, 
     assert not [each for each in findings if "evil" in each.seen or "check failed" in each.seen]
 
 
-def test_bad_vehicle_in_report_of_real_service_is_wrong(run_nedbus: Start, tmp_path: Path) -> None:
+def test_doctor_reports_bad_vehicle_from_event_report(run_nedbus: Start, tmp_path: Path) -> None:
     """The doctor reports a bad vehicle from the event report of a service that replays a log in another process."""
     endpoint = free_endpoint()
     log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
@@ -348,7 +350,7 @@ def test_other_prefixes_and_ros2_topics_are_warnings(zenoh_session: Session, end
     token.undeclare()
 
 
-def test_failing_source_of_real_service_is_wrong(run_nedbus: Start) -> None:
+def test_doctor_reports_failing_source_of_real_service(run_nedbus: Start) -> None:
     """A failing source of a service in another process is reported as text and as JSON, with exit code 1."""
     endpoint = free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", "-s", "ulog:nowhere.ulg")
@@ -399,7 +401,7 @@ Run = Callable[..., str]
 
 @pytest.fixture
 def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
-    """Run routers with the shipped configuration; certificate and text may be replaced."""
+    """Yield a function that runs a router with the shipped configuration, its certificate or other text replaced."""
     with ExitStack() as routers:
 
         def run(certificate: str = "router", **replaced: str) -> str:
@@ -439,7 +441,7 @@ def test_valid_certificates_are_described(run_router: Run, pki: Path) -> None:
         ),
     ],
 )
-def test_invalid_certificate_is_wrong(
+def test_invalid_certificate_is_reported_with_reason(
     run_router: Run, pki: Path, timings: Timings, case: tuple[str, str | None, str], expected: dict[str, str]
 ) -> None:
     """A finding states the reason, which Zenoh omits, and the router's certificate even if no session opens."""
@@ -512,8 +514,8 @@ def test_read_and_write_permissions_are_reported(
         assert has_no_faults(findings) == (state != "wrong"), findings
 
 
-def test_without_cryptography_certificates_are_verified_but_not_read(run_router: Run, pki: Path, start: Start) -> None:
-    """Without the package, names and dates are unknown and the advice names the extra; trust is still verified."""
+def test_certificates_are_verified_but_not_read_without_cryptography(run_router: Run, pki: Path, start: Start) -> None:
+    """Without `cryptography`, names and dates are unknown and the advice names the extra; trust is still verified."""
     endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
     settings = {name: str(path) for name, path in tls_settings(pki, "reader").items()}
     program = f"""
@@ -541,7 +543,7 @@ for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}),
 
 @pytest.mark.filterwarnings("ignore:Parsed a serial number")
 def test_damaged_certificate_raises_value_error_or_decodes(pki: Path) -> None:
-    """A certificate truncated or changed at any byte raises ValueError or decodes, and nothing else."""
+    """A certificate that is truncated or changed at any byte decodes or raises ValueError, but no other exception."""
     pem = (pki / "router.crt").read_text()
     assert Certificate.read(pki / "router.crt").hosts == ("127.0.0.1", "localhost")
     der = ssl.PEM_cert_to_DER_cert(pem)

@@ -80,7 +80,7 @@ def exporting(bus: nedbus.Bus) -> Iterator[HttpClient]:
 
 
 def test_service_serves_metrics_health_and_status(serve: Serve, pages: HttpClient) -> None:
-    """/metrics has series by vehicle, topic and source; /status is JSON; /readyz and /healthz are one line."""
+    """/metrics has series by vehicle, topic and source; /status returns JSON; /readyz and /healthz return one line."""
     serve("sim:?vehicle=7")
     of_stream = {"vehicle": "7", "topic": VLP, "source": "sim:?vehicle=7"}
     wait_for(lambda: pages.values("nedbus_stream_rate_hertz", **of_stream), what="a rate")
@@ -145,7 +145,7 @@ def test_healthy_vehicle_is_ok_on_vehicles_page(serve: Serve, pages: HttpClient,
     assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
 
 
-def test_bad_vehicle_returns_503_on_vehicles_page_only(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
+def test_bad_vehicle_returns_503_only_on_vehicles_page(serve: Serve, pages: HttpClient, tmp_path: Path) -> None:
     """For a bad vehicle /vehicles returns 503 and a metric is exported; /healthz and /readyz still return 200."""
     times = range(100_000, 300_000_000, 100_000)
     logs = {
@@ -203,7 +203,7 @@ def test_text_from_peers_is_one_line_on_vehicles_page() -> None:
 
 @pytest.mark.parametrize("every", [1, 3])
 def test_flapping_flag_stays_a_condition(every: int) -> None:
-    """While a flag flaps its condition stays active, so that a scrape between two changes does not miss it."""
+    """While a flag flaps, its condition stays active, so that a scrape between two changes does not miss it."""
     event_log, address = EventLog(), Address("7", VLP)
     for number in range(100):
         is_valid = number // every % 2 == 0
@@ -266,7 +266,7 @@ def test_failed_or_silent_source_is_not_ready(serve: Serve, pages: HttpClient, t
 
 
 def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_nedbus: Start, pages: HttpClient) -> None:
-    """/readyz returns 503 before the router starts, 200 while it runs, and 503 after it has ended."""
+    """/readyz returns 503 before the router starts, 200 while it runs, and 503 after it has stopped."""
     where, exported = free_endpoint(), HttpClient(free_port())
     serve("sim:", connect=where)
     assert pages.request("/readyz") == (503, f"the service is starting: {where}\n")
@@ -325,7 +325,7 @@ def test_public_http_address_logs_a_warning(caplog: pytest.LogCaptureFixture) ->
 
 
 def streams(count: int, topic: str = VLP) -> list[MeasuredStream]:
-    """Return streams of three messages each, of two sources in turn."""
+    """Return streams of three messages each, alternating between two sources."""
     health = StreamHealth(topic)
     for each in range(3):
         health.add(message(each), received=each, lost=each)
@@ -335,7 +335,7 @@ def streams(count: int, topic: str = VLP) -> list[MeasuredStream]:
 
 
 def test_streams_beyond_limit_are_summed_by_source() -> None:
-    """Streams beyond 1,000 are exported only as sums of their counts by source."""
+    """For streams beyond 1,000, only the sums of their counts per source are exported."""
     count = MAX_STREAMS + 201
     families = {each.name: each for each in stream_metrics(streams(count), messages="nedbus_messages_received")}
     assert families["nedbus_streams"].samples[0].value == count

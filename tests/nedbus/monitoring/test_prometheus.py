@@ -50,8 +50,8 @@ main()
 def traffic(bus: nedbus.Bus, zenoh_session: Session, udp_port: int) -> Iterator[threading.Event]:
     """Publish at 50 Hz; yield an event that makes everything fail while it is set.
 
-    Then vehicle "gone" is silent, "lost" skips every other sequence number, "doubtful" is invalid, dead reckoning and
-    in failsafe, "many" sends bursts, and junk is sent to a key and to a MAVLink port.
+    While it is set, vehicle "gone" is silent, "lost" skips every other sequence number, "doubtful" reports an invalid
+    position, dead reckoning and failsafe, "many" sends bursts, and junk is sent to a key and to a MAVLink port.
     """
     bad = threading.Event()
     gone, doubtful, many = (bus.publisher(VLP, vehicle=name) for name in ("gone", "doubtful", "many"))
@@ -222,7 +222,7 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
 @pytest.mark.parametrize(
     ("name", "series", "times"),
     [
-        (  # 15 s of dead reckoning, as in each lap of the simulation, do not fire; 31 s do
+        (  # 15 s of dead reckoning, as in each lap of the simulation, is too short; 31 s is not
             "NedbusDeadReckoning",
             'nedbus_vehicle_condition{condition="dead_reckoning"} _x10 1x14 stale _x5 1x60',
             {"25s": False, "1m0s": False, "1m10s": True},
@@ -258,7 +258,7 @@ def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], 
 def test_rules_fire_only_after_their_duration(
     start: Start, tmp_path: Path, name: str, series: str, times: dict[str, bool]
 ) -> None:
-    """With unchanged times the rules fire neither too early nor without a fault."""
+    """With their packaged times, the rules fire neither too early nor without a fault."""
     inputs = []
     for each in series.split("; "):
         metric, _, values = each.rpartition("} ") if "}" in each else each.partition(" ")

@@ -74,7 +74,7 @@ def endpoint_of(file: Path) -> str:
 
 @pytest.fixture(params=ROUTER_KINDS)
 def run_router(request: pytest.FixtureRequest) -> Iterator[RunRouter]:
-    """Run a router with a file, embedded or a real zenohd, and return a function that stops it."""
+    """Yield a function that runs a router, embedded or a real zenohd, with a file, and returns a function to stop it."""
     with ExitStack() as stack:
 
         def run(file: Path) -> Callable[[], None]:
@@ -90,7 +90,7 @@ def run_router(request: pytest.FixtureRequest) -> Iterator[RunRouter]:
 
 @pytest.fixture
 def join(file: Path, pki: Path) -> Iterator[Join]:
-    """Connect with the certificate of this name, to the router of the file or to other endpoints."""
+    """Yield a function that connects with the certificate of a given name, by default to the router of the file."""
     with ExitStack() as stack:
 
         def join_as(name: str, *endpoints: str, tls: nedbus.Tls | None = None) -> nedbus.Bus:
@@ -101,7 +101,7 @@ def join(file: Path, pki: Path) -> Iterator[Join]:
 
 
 def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others: list[str]) -> None:
-    """Assert that a reader receives messages published as this vehicle, and none published before as others."""
+    """Assert that a reader receives what the bus publishes as this vehicle, but nothing it published as others before."""
     publishers = {each: bus.publisher(VLP, vehicle=each) for each in [*others, vehicle]}
     with reader.subscribe("*", mode="every") as subscription:
 
@@ -119,7 +119,7 @@ def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others
         publisher.close()
 
 
-def test_bundle_publishes_its_vehicle_only(
+def test_bundle_publishes_only_its_vehicle(
     run_router: RunRouter, run_nedbus: Start, tmp_path: Path, *, file: Path, pki: Path, join: Join
 ) -> None:
     """A service with the nedbus.toml of an enrolled bundle publishes its vehicle and no other."""
@@ -291,8 +291,11 @@ def pki_command(code: int, command: str, *arguments: str) -> tuple[list[str], st
     return result.out.splitlines(), result.err
 
 
-def test_renew_replaces_expiring_certificates_only(tmp_path: Path) -> None:
-    """By default certificates that expire within 30 days are renewed, with their hosts; `list` shows use and state."""
+def test_renew_replaces_only_expiring_certificates(tmp_path: Path) -> None:
+    """By default, `renew` replaces certificates that expire within 30 days, and keeps their hosts.
+
+    `list` shows the use and the state of each certificate.
+    """
     folder = tmp_path / "fleet"
     make_authority(folder)
     make_authority(folder / "foreign")
@@ -353,7 +356,7 @@ def test_expired_authority_is_ignored_if_a_valid_one_is_in_the_file(pki: Path, t
 
 
 def handshake_error(ca: Path, server: nedbus.Tls, client: nedbus.Tls, *, strict: bool) -> str:
-    """Return the verification error of a handshake with mutual TLS, "" if it succeeds."""
+    """Return the verification error of a handshake with mutual TLS, or "" if it succeeds."""
     sides = []
     pipes = ssl.MemoryBIO(), ssl.MemoryBIO()
     for own, is_server in ((server, True), (client, False)):
@@ -419,7 +422,7 @@ def test_shipped_rules_equal_generated_rules(tmp_path: Path) -> None:
 
 
 def test_rules_command_sets_adds_and_removes_vehicles(file: Path, pki: Path, tmp_path: Path) -> None:
-    """--from replaces all vehicles, --add and --remove change some. The file keeps its mode, and errors write nothing."""
+    """--from replaces all vehicles; --add and --remove change some. The file keeps its mode, and errors write nothing."""
     file.chmod(0o640)
     names = tmp_path / "names"
     names.write_text("10\n2   # comment\n\nwing\n")

@@ -1,4 +1,4 @@
-"""Access control of config/router-secure.json5, verified by received messages: Zenoh drops denied messages silently."""
+"""Access control of config/router-secure.json5, tested by reception, because Zenoh drops denied messages silently."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def secure(request: pytest.FixtureRequest, configured: tuple[Path, str]) -> Iter
 
 @pytest.fixture
 def join(secure: str, pki: Path) -> Iterator[Join]:
-    """Connect a bus with the certificate of this name."""
+    """Yield a function that connects a bus with the certificate of a given name."""
     with ExitStack() as opened:
         yield lambda name: opened.enter_context(nedbus.connect(secure, tls=client_tls(pki, name), timeout=DEADLINE))
 
 
 @pytest.fixture
 def open_as(secure: str, pki: Path) -> Iterator[Open]:
-    """Open a plain session with the certificate of this name."""
+    """Yield a function that opens a plain Zenoh session with the certificate of a given name."""
     with ExitStack() as opened:
         yield lambda name: opened.enter_context(open_client([secure], tls=client_tls(pki, name), timeout=DEADLINE))
 
@@ -109,7 +109,7 @@ def test_lossless_publisher_waits_for_a_slow_reader(join: Join) -> None:
         publisher.close()  # a later close would wait for the reader to reconnect
 
 
-def test_message_without_msg_file_is_decoded(join: Join) -> None:
+def test_message_that_is_not_built_in_is_decoded(join: Join) -> None:
     """Readers may query vehicles for definitions that are not built in, although no rule names the topic."""
     vehicle, reader = join("vehicle-1"), join("reader")
     definition = define(
@@ -219,7 +219,7 @@ def test_commands_accept_certificates_as_flags_or_variables(secure: str, pki: Pa
 def test_px4_without_tls_is_bridged_to_the_secure_router(
     join: Join, open_as: Open, secure: str, pki: Path, run_nedbus: Start
 ) -> None:
-    """A local service with a certificate publishes a PX4 without TLS, and keeps PX4's own keys local."""
+    """A local service publishes the messages of a PX4 without TLS to the secure router; PX4's own keys stay local."""
     local = free_endpoint()
     service = run_nedbus(
         *("serve", "--vehicle", "1", "-s", "px4-zenoh:", "--listen", local),
@@ -320,7 +320,7 @@ def test_refused_clients_are_logged(
 
 
 def test_stdout_is_complete_at_exit_while_refusals_are_logged(start: Start) -> None:
-    """Lines printed just before exit pass through the pipe of Zenoh's log, complete and in order."""
+    """Lines printed just before exit are complete and in order, although a pipe filters Zenoh's log out of stdout."""
     code = """
 from nedbus.transport import log_refusals
 log_refusals()
@@ -430,7 +430,7 @@ def check(permission: WritePermission) -> Mapping[str, bool]:
     ],
     ids=lambda value: " ".join(map(str, value)),
 )
-def test_three_consecutive_denials_are_a_refusal(
+def test_vehicle_is_refused_after_three_consecutive_denials(
     endpoint: str,
     zenoh_session: Session,
     pki: Path,
@@ -439,7 +439,7 @@ def test_three_consecutive_denials_are_a_refusal(
     history: list[str],
     outcome: Outcome,
 ) -> None:
-    """A vehicle is refused after three consecutive denials, until the router accepts a probe."""
+    """A vehicle counts as refused after three consecutive denials, until the router accepts a probe."""
     verdicts = iter(history)
     monkeypatch.setattr(f"{PERMISSION}probe_writes", lambda *_, **__: {"1": next(verdicts)})
     permission = permission_of(zenoh_session, endpoint, pki, "1")
@@ -457,10 +457,10 @@ def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timing
         wait_for(lambda: check(permission) == {"1": False, "2": True}, what="the denied vehicle")
 
 
-def test_unreachable_or_open_router_is_not_a_refusal(
+def test_unreachable_or_open_router_is_not_reported_as_refusing(
     configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch, timings: Timings
 ) -> None:
-    """A router with older rules, without access control, stopped or frozen is never reported as a refusal."""
+    """A router does not count as refusing if it has older rules or no access control, or if it is stopped or frozen."""
     timings.probe_open, timings.probe = 0.1, 0.5
     monkeypatch.setattr(f"{PERMISSION}_CONFIRMED", 1)
     file, endpoint = configured

@@ -61,14 +61,14 @@ def in_thread(target: Callable[..., object], *arguments: object, stop: Callable[
 
 @pytest.fixture
 def limited(tmp_path: Path) -> Iterator[str]:
-    """Run a router limited to ten sessions, whose file has another limit in `metadata`."""
+    """Run a router that is limited to ten sessions, although `metadata` in its file has another limit."""
     where = free_endpoint()
     with open_router(config_file=write_config(tmp_path, where, metadata={"max_sessions": 7, "name": "base"})):
         yield where
 
 
 def router_finding(endpoint: str, seen: str) -> Finding:
-    """Return the doctor's finding about the only router; wait for it, because closed sessions count for a moment."""
+    """Wait until the doctor's finding on the router is `seen`; return it. Closed sessions are still counted briefly."""
     found: list[Finding] = []
 
     def is_found() -> bool:
@@ -159,7 +159,7 @@ def test_invalid_session_limit_is_unknown(limit: object) -> None:
         assert parse_state(f"@/{ZID}/router", answer) == RouterState(ZID, 2, None)
 
 
-def test_large_and_many_state_replies_are_bounded(
+def test_number_and_size_of_state_replies_are_limited(
     endpoint: str, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A peer that pretends to be many routers, or one with a huge session list, cannot exhaust memory."""
@@ -192,7 +192,7 @@ def test_doctor_warns_from_80_percent_of_the_session_limit(limited: str) -> None
         assert "docs/hosts.md" in finding.advice
 
 
-def test_unknown_session_limit_does_not_warn(tmp_path: Path) -> None:
+def test_doctor_does_not_warn_about_unknown_session_limit(tmp_path: Path) -> None:
     """The doctor does not warn if `metadata` has no limit, or if the admin space is disabled."""
     where = free_endpoint()
     for metadata in (["a", "list"], "mine"):
@@ -251,7 +251,9 @@ def test_exporter_metrics_have_sessions_and_limits_of_routers(
         wait_for(lambda: not shows(f"sessions{label}"), what="no router")
 
 
-def test_exporter_retries_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings) -> None:
+def test_exporter_retries_while_the_router_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
     """If a router has no free session for queries, the exporter retries until one is available."""
     timings.routers_interval = 0.05
     timings.routers_session = 0.1
@@ -286,7 +288,7 @@ def test_exporter_stops_during_an_unanswered_query(limited: str) -> None:
         assert time.monotonic() - begin < Timings().routers_timeout / 2
 
 
-def test_connect_error_at_a_full_router_names_the_limit(tmp_path: Path) -> None:
+def test_connect_error_names_the_session_limit_of_a_full_router(tmp_path: Path) -> None:
     """ConnectError and the doctor name the session limit; a client can connect once another session closes."""
     endpoint = free_endpoint()
     unicast = {"unicast": {"max_sessions": 1}}

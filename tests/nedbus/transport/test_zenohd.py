@@ -121,7 +121,7 @@ def test_storage_retains_the_last_message_of_a_vehicle(
 def test_live_reply_takes_precedence_over_the_storage(
     start: Start, tmp_path: Path, zenohd: str, zenoh_session: Session
 ) -> None:
-    """After a restart with an earlier clock, live replies take precedence, and `get` marks stored ones."""
+    """A live reply takes precedence, even after a restart with an earlier clock; `get` marks stored messages."""
     start_storage(start, tmp_path, zenohd)
     ahead = zenoh.Timestamp(zenoh_session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
 
@@ -166,7 +166,7 @@ def test_storage_waits_for_its_router_and_reconnects(start: Start, tmp_path: Pat
 
 
 def test_http_is_read_only(start: Start, secure: str, pki: Path, tmp_path: Path) -> None:
-    """With config/rest-reader.json5 GET returns messages, and PUT and DELETE affect no other client of the router."""
+    """With config/rest-reader.json5, GET returns messages, and PUT and DELETE affect no other client of the router."""
     address = free_endpoint().removeprefix("tcp/")
     changes = {"tls/127.0.0.1:7447": secure, HTTP: address}
     start_zenohd(start, "-c", str(write_config(pki, tmp_path / "rest-reader.json5", secure, **changes)))
@@ -192,7 +192,7 @@ def test_http_is_read_only(start: Start, secure: str, pki: Path, tmp_path: Path)
 
 
 def test_ros_2_bridge_requires_a_separate_router(run_nedbus: Start, secure: str, zenohd: str, pki: Path) -> None:
-    """`nedbus ros2` exits with an error at the secure router, which has no rules for ROS 2, and works with --to."""
+    """`nedbus ros2` fails with the secure router, which has no rules for ROS 2, unless --to names another router."""
     flags = tls_options(pki, "reader")
     with join(secure, pki, "vehicle-1") as vehicle:
         vehicle.publisher(VLP, vehicle="1")

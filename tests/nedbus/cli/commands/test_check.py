@@ -31,7 +31,7 @@ def passes(*arguments: object) -> bool:
 
 
 def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
-    """Each setting and list item is checked even if others are wrong, but only a source's first mistake is reported."""
+    """Each setting and list item is checked even if others are wrong. Of each source, the first mistake is reported."""
     file, closed = tmp_path / "nedbus.toml", free_endpoint()
     file.write_text(
         'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\n'
@@ -64,7 +64,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
 
 
 def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
-    """Options and variables are still checked, but settings that the file may contain are not reported missing."""
+    """If the file is unreadable, options and variables are still checked, but no setting is reported as missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
     for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
@@ -76,7 +76,7 @@ def test_unreadable_file_does_not_hide_other_mistakes(tmp_path: Path) -> None:
 
 
 def test_two_sources_with_the_same_address_are_reported(tmp_path: Path) -> None:
-    """No replay, and no live source with a named vehicle, may publish an address of another source."""
+    """If a replay, or a live source with a named vehicle, publishes an address of another source, this is reported."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
     file.write_text(
@@ -146,7 +146,7 @@ def test_invalid_endpoint_in_router_file_is_reported_with_position(
     assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [True, True], mistakes
 
 
-def test_router_files_are_parsed_as_zenohd_does(tmp_path: Path, endpoint: str) -> None:
+def test_router_files_are_parsed_as_by_zenohd(tmp_path: Path, endpoint: str) -> None:
     """Syntax errors, unknown keys and missing files are reported; the shipped files and a valid setup pass."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
     broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')

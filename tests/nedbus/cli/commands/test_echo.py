@@ -106,7 +106,7 @@ def test_echo_prints_one_line_per_message(simulation: str, arguments: list[str])
 
 
 def test_echo_json_can_be_parsed_by_the_model(simulation: str) -> None:
-    """Each line is JSON that the model validates, "Infinity" included; the topic "*" selects all topics."""
+    """With --json, each line is an object that the model validates, even with "Infinity"; "*" selects all topics."""
     rows = [json.loads(line) for line in echo(simulation, "--json", "-n", "50", "*").out.splitlines()]
     has = {each.address.topic: each.fields.keys() for each in open_replay("sim:?duration=15&speed=max").messages}
     assert len(rows) == 50
@@ -161,7 +161,7 @@ def test_echo_prints_counts_at_exit(run_nedbus: Start, endpoint: str, bus: nedbu
 
 
 def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Timings) -> None:
-    """`echo` marks a last message beyond the age limit as old, and `hz` does not count it."""
+    """`echo` marks a retained message beyond the age limit as old, and `hz` does not count it."""
     timings.old = 0.01
     bus.publisher(VLP, vehicle="1").publish(message(1))
     wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
@@ -174,7 +174,7 @@ def test_old_last_message_is_marked(endpoint: str, bus: nedbus.Bus, timings: Tim
 def test_blocked_echo_does_not_delay_a_replay(
     run_nedbus: Start, endpoint: str, pause_echo: Callable[..., AbstractContextManager[Paused]]
 ) -> None:
-    """A replay at speed=max ends while `echo` is blocked, because `echo` subscribes in mode "latest".
+    """A replay at speed=max ends even if `echo` is blocked, because `echo` subscribes in mode "latest".
 
     With --every the replay waits until the output of `echo` is read.
     """

@@ -196,7 +196,7 @@ def test_why_at_accepts_seconds_without_utc(log: Path) -> None:
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} does not exist")
 @pytest.mark.usefixtures("read_once")
 def test_why_at_accepts_utc_and_seconds() -> None:
-    """--at prints the same for a UTC time and for the equivalent time since boot."""
+    """`why --at` prints the same for a UTC time and for the same time in seconds since boot or since the start."""
     by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
     assert "GPS fix lost: 3D to none, satellites 10 to 0 from 23:08:59.8 to 23:09:19.6 UTC (19.8 s)." in by_utc
     for moment in ("27.557", "+27.325"):
@@ -298,7 +298,7 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
 def test_why_live_uses_service_history(
     run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path
 ) -> None:
-    """`why` uses a service's history, for all vehicles or one; no service keeps the history of a script's vehicle."""
+    """`why` uses the history of services, for all vehicles or for one. A vehicle published by a script has none."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
     result = run_command("why", "-c", endpoint)
@@ -380,7 +380,7 @@ def test_history_contains_px4_texts(run_nedbus: Start, bus: nedbus.Bus, endpoint
 def test_events_live_are_printed_as_they_happen(
     run_nedbus: Start, bus: nedbus.Bus, zenoh_session: Session, endpoint: str
 ) -> None:
-    """Events of a script's vehicle are shown as they happen; stderr names conditions that were active before."""
+    """Events of a script's vehicle are printed as they happen; stderr names conditions that are active at the start."""
     fields: dict[str, object] = VALID | {"z_valid": False}
     with bus.publisher(VLP, vehicle="7") as publisher:
 

@@ -32,7 +32,7 @@ Health = Callable[..., CommandResult]
 
 @pytest.fixture
 def health(endpoint: str) -> Health:
-    """Run `nedbus health` with options."""
+    """Return a function that runs `nedbus health` with options."""
     return lambda *options: run_command("health", "-c", endpoint, *options)
 
 
@@ -55,7 +55,7 @@ def wait_for_state(daemon: Daemon, state: str) -> None:
 
 
 def test_service_without_vehicles_is_not_healthy(endpoint: str, health: Health) -> None:
-    """A service is not healthy if its sources work but have not received any vehicle."""
+    """A service is not healthy if its sources work but have not received messages from any vehicle."""
     source = f"mavlink:udpin:127.0.0.1:{free_port()}"
     with serving(endpoint, source) as daemon:
         wait_for_state(daemon, "waiting")
@@ -117,7 +117,7 @@ def test_json_report_has_reason_and_ages(endpoint: str, bus: nedbus.Bus, health:
 
 
 def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, health: Health) -> None:
-    """--expect requires vehicles by id and --vehicles by number, on any host, even if scripts publish them."""
+    """--expect names the required vehicles, --vehicles their number; they may be on any host or come from scripts."""
     with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
         wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
         result = health("--expect", "1,7, 8", "--vehicles", "3")

@@ -90,7 +90,7 @@ def test_list_filters_by_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If replies are missing, the list shows the others with a warning and exits with 1."""
+    """If replies are missing, `list` shows the others with a warning and exits with 1."""
     monkeypatch.setattr(liveliness, "MAX_REPLIES", 1)
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
@@ -143,7 +143,7 @@ def test_hz_measures_rate_latency_and_loss(run_nedbus: Start, simulation: str) -
 
 @pytest.mark.process
 def test_get_shows_the_last_message(simulation: str) -> None:
-    """`get` prints all fields of the last message, by default of vehicle_local_position, or exits with 1."""
+    """`get` prints the last message, by default vehicle_local_position; if nothing is published, it exits with 1."""
 
     def get(*arguments: str) -> str:
         got = run_command("get", "-c", simulation, *arguments)
@@ -208,7 +208,7 @@ def test_duration_without_data_exits_with_1(endpoint: str, command: str, key_exp
 
 @pytest.mark.parametrize("command", ["list", "echo", "hz", "get", "info"])
 def test_missing_router_is_a_one_line_error(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a router a command exits with 1 and one line: endpoint, time waited, remedy."""
+    """Without a router, a command exits with 1 and prints one line with the endpoint, the time waited and a remedy."""
 
     def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
         return nedbus.Bus(settings, timeout=timeout / 10)

@@ -12,8 +12,8 @@ from tests.peers.processes import Start
 from tests.waits import wait_for
 
 
-def test_suggested_commands_work_as_pasted() -> None:
-    """Suggested commands use an endpoint without TLS; if there is none, a hint asks for a certificate."""
+def test_suggested_commands_use_an_endpoint_without_tls() -> None:
+    """Suggested commands use an endpoint without TLS; if there is none, a hint says that readers need a certificate."""
     assert " list  published" in suggested_commands([DEFAULT_ENDPOINT])
     assert " hz -c tcp/b:1 " in suggested_commands(["tls/a:1", "tcp/b:1"])
     for endpoint in ("tls/a:1", "quic/a:1"):
@@ -27,7 +27,7 @@ def wait_for_message(endpoint: str) -> None:
 
 
 def test_suggested_commands_for_wildcard_address_use_loopback(run_nedbus: Start) -> None:
-    """For a service that listens on 0.0.0.0 the suggested commands name 127.0.0.1, and work."""
+    """For a service that listens on 0.0.0.0, the suggested commands name 127.0.0.1, and work."""
     port = free_port()
     service = run_nedbus("serve", "--listen", f"tcp/0.0.0.0:{port}", "-s", "sim:")
     wait_for(lambda: " all fields" in service.err, what="the hint")

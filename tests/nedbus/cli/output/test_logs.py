@@ -45,7 +45,7 @@ def record(text: str = "%s is stale", *args: object, event: str | None = "stale"
 
 
 def log_calls(tree: ast.AST) -> Iterator[ast.Call]:
-    """Yield the log calls above DEBUG."""
+    """Yield the log calls above level DEBUG."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             logger, level = node.func.value, node.func.attr
@@ -135,7 +135,7 @@ def test_json_traceback_is_one_string() -> None:
 
 
 def test_journal_lines_have_syslog_priorities() -> None:
-    """Each line, including those of a traceback, has a syslog priority: 3 for errors to 7 for debug."""
+    """Each line, including those of a traceback, has a syslog priority, from 3 for errors to 7 for debug."""
     formatter = JournalFormatter(TextFormatter("%(message)s"))
     assert formatter.format(record("%s\nforged", "x")) == "<4>x\\nforged"
     for level, number in ((logging.DEBUG, 7), (logging.INFO, 6), (logging.ERROR, 3), (logging.CRITICAL, 3)):
@@ -179,7 +179,7 @@ def test_error_of_a_command_is_a_json_object(run_nedbus: Start, level: str) -> N
 
 
 def test_log_level_selects_lines(endpoint: str) -> None:
-    """--log-level warning hides lines of normal operation, --debug overrides it, and other values are refused."""
+    """--log-level warning hides lines of normal operation; --debug overrides it; an unknown level is a usage error."""
     quiet = run_command("--log-level", "warning", "serve", "-c", endpoint, "-s", REPLAY, "--until-done")
     assert (quiet.exit_code, quiet.err) == (0, "")
     loud = run_command("--log-level", "error", "--debug", "get", "-c", "tcp/127.0.0.1:1")
@@ -227,7 +227,7 @@ class Limited:
         return len(self.lines) - before
 
 
-def test_flood_is_rate_limited() -> None:
+def test_flood_of_log_lines_is_rate_limited() -> None:
     """A burst passes, then a few lines a minute, each preceded by the number of suppressed lines."""
     limited = Limited()
     assert limited.flood(1000) == BURST
@@ -247,7 +247,7 @@ def test_flood_is_rate_limited() -> None:
     assert sum(counts) + len(limited.lines) - len(counts) == 6000
 
 
-def test_each_kind_of_line_has_its_own_limit() -> None:
+def test_each_kind_of_log_line_has_its_own_rate_limit() -> None:
     """A flood does not suppress lines with other events or texts, and lifecycle events are never limited."""
     limited = Limited()
     limited.flood(1000)
@@ -273,7 +273,7 @@ def test_suppressed_lines_are_reported_after_a_flood() -> None:
     assert limited.lines[-1].startswith("suppressed 5 more lines")
 
 
-def test_lines_of_other_packages_are_limited() -> None:
+def test_log_lines_of_other_packages_are_rate_limited() -> None:
     """Lines without an event are limited per text; beyond the maximum number of texts, all others share one limit."""
     limited = Limited()
     assert limited.flood(1000, event=None) == BURST

@@ -232,7 +232,7 @@ def test_info_lists_gone_streams(on_terminal: OnTerminal, endpoint: str, zenoh_s
 def test_hz_redraws_in_place(
     on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus, number: signal.Signals, exit_code: int
 ) -> None:
-    """On a terminal each table replaces the previous one, is no higher than the terminal, and stays at the end.
+    """On a terminal each table replaces the previous one, is no taller than the terminal, and stays at the end.
 
     Ctrl-C and SIGTERM, which `timeout` sends, stop the redrawing and show the cursor again.
     """
@@ -297,7 +297,7 @@ def states(lines: str) -> list[str]:
 
 
 def test_streams_of_killed_service_are_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """`hz` reports a stream whose service was killed as "gone", once."""
+    """After a service was killed, `hz` reports its stream once as "gone"."""
     service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="data")
     with bus.publisher(VLP, vehicle="other") as other:
@@ -416,7 +416,7 @@ MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz"
 @pytest.mark.process
 @pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports between nedbus.cli and the signal; 10,000: all
 def test_interrupt_during_imports_prints_no_traceback(endpoint: str, command: str, imports: int) -> None:
-    """Ctrl-C at any time after the start of `main` ends without a traceback, with 130 in a shell."""
+    """Ctrl-C at any time after `main` has started ends a command without a traceback; a shell sees exit code 130."""
     environment = without_coverage() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
     arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
@@ -472,7 +472,7 @@ app(["serve", "-s", "sim:", "-l", sys.argv[1]])
 """
 
 
-def test_interrupt_during_a_slow_start_loses_nothing(start: Start) -> None:
+def test_interrupt_during_a_slow_start_exits_with_130(start: Start) -> None:
     """Ctrl-C while a router opens slowly exits with 130, even if that takes longer than the timeout for closing."""
     service = start("-c", SLOW, free_endpoint(), coverage=False)
     wait_for(lambda: "opening" in service.out, what="the service to open its router")

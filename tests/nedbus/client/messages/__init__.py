@@ -1,1 +1,1 @@
-"""Messages with definitions from nedbus and from their publishers, through a real router."""
+"""Messages through a real router, with definitions that are built in or queried from their publishers."""

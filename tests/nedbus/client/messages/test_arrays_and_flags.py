@@ -63,14 +63,14 @@ def publisher_of(bus: nedbus.Bus, address: Address, **options: Any) -> nedbus.Pu
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to all topics. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
+    """Subscribe to all topics. Request this fixture before `bus`: otherwise it closes first, and `bus` waits 5 s."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
 
 @BOTH
 def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, address: Address) -> None:
-    """Subscriptions and `latest` return an instance of the model, bit for bit and with its missing fields."""
+    """`receive` and `latest` return the message as an instance of its model, bit for bit, and list missing fields."""
     publisher, sent = publisher_of(bus, address, source="ins"), make(address, 5)
     publisher.publish(make(address, 4))
     subscription = client.subscribe(address.topic, mode="every")
@@ -89,7 +89,7 @@ def test_message_arrives_unchanged(client: nedbus.Bus, bus: nedbus.Bus, address:
 
 @BOTH
 def test_publishing_an_invalid_message_raises(bus: nedbus.Bus, address: Address) -> None:
-    """An invalid field raises an error that names it, a message of another type TypeError; neither is published."""
+    """An invalid field raises an error that names it, and another message type raises TypeError. Nothing is sent."""
     publisher = publisher_of(bus, address)
     wrong = {"q": (1.0, 0.0, 0.0)} if address == ATTITUDE else {"cs_in_air": 1}
     with pytest.raises(nedbus.InvalidMessageError, match=next(iter(wrong))):
@@ -122,7 +122,7 @@ def test_rows_and_batches_are_complete(
 
 
 def test_batch_has_one_message_type(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
-    """Messages of mixed types are read in batches of one type each, with all addresses of that type."""
+    """Messages of several types are read in batches; each batch has one type, and may have several addresses."""
     addresses = [ATTITUDE, FLAGS, Address("7", VLP), Address("8", "vehicle_attitude")]
     publishers = {address: publisher_of(bus, address) for address in addresses}
     for publisher in publishers.values():
@@ -174,7 +174,10 @@ def test_lost_messages_are_recovered(endpoint: str, bus: nedbus.Bus, address: Ad
 
 
 def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
-    """Commands print arrays as numbers with nine digits, as CSV columns, and as JSON lists with NaN as a string."""
+    """Arrays are printed with nine significant digits, in CSV as a column per element, in JSON as lists.
+
+    JSON has no NaN, so it is printed as a string.
+    """
     with publisher_of(bus, ATTITUDE) as publisher:
         publisher.publish(make(ATTITUDE, 2))
         wait_for(lambda: bus.latest(ATTITUDE.topic), what="the message")
@@ -194,7 +197,7 @@ def test_commands_print_arrays(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bus: nedbus.Bus) -> None:
-    """`nedbus schema` queries publishers for a topic that is not built in; other names are usage errors."""
+    """`nedbus schema` queries the definition of a topic that is not built in; unpublished topics are usage errors."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )
@@ -211,7 +214,7 @@ def test_schema_of_unknown_topic_is_queried_from_its_publisher(endpoint: str, bu
 
 
 def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
-    """A message and its ranges are defined by a .msg text, and readers query the definition.
+    """A message defined by a .msg text is published, its ranges are checked, and readers query the definition.
 
     An unknown topic without a definition raises AddressError.
     """
@@ -229,7 +232,7 @@ def test_custom_message_is_published(client: nedbus.Bus, endpoint: str) -> None:
 
 @pytest.mark.parametrize("topic", [None, "vehicle_attitude_groundtruth"])
 def test_class_selects_its_topic(client: nedbus.Bus, bus: nedbus.Bus, topic: str | None) -> None:
-    """A class selects its first topic, or another one of its topics by name, for `subscribe` and `latest`."""
+    """For `subscribe` and `latest`, a class selects its first topic, unless `topic` names another of its topics."""
     chosen, options = topic or ATTITUDE.topic, dict[str, Any](topic=topic) if topic else {}
     for number, each in enumerate(["vehicle_attitude", "vehicle_attitude_groundtruth", "estimator_attitude"]):
         instance = 0 if each == "estimator_attitude" else None
@@ -273,7 +276,7 @@ with nedbus.connect(sys.argv[1]) as bus, bus.publisher("wheel_speeds", vehicle=1
 
 @pytest.mark.process
 def test_custom_class_is_received(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """A custom message class is received as that class, and with the same fields by readers without the class."""
+    """A message of a custom class is received as that class; readers without the class receive the same fields."""
     process = start("-c", CUSTOM_CLASS, endpoint)
     wait_for(lambda: process.out.count("\n") == 2 or process.err, what="the script")
     assert process.out == 2 * "WheelSpeeds(timestamp=1, speed=(2.0, 3.0))\n", process.err

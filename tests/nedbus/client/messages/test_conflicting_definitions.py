@@ -1,4 +1,4 @@
-"""Conflicting definitions of a message by several firmware builds: readers use the definition of the sender."""
+"""A message that several firmware builds define differently: readers use the definition of the sender."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def router() -> Iterator[str]:
 
 
 class Reader:
-    """A reader of all vehicles in mode `every`; `form`: whether it reads models, rows or batches."""
+    """A reader of all vehicles in mode `every`, as models, rows or batches (`form`)."""
 
     def __init__(self, endpoint: str, form: str) -> None:
         self.form = form
@@ -151,7 +151,7 @@ STEPS: Final = st.lists(
 
 @pytest.mark.router
 def test_restart_with_other_firmware_changes_fields(router: str) -> None:
-    """After a vehicle restarts with another firmware, a new reader gets the fields of the new firmware."""
+    """After a vehicle restarts with another firmware build, a new reader gets the fields of the new build."""
     before = [(Network.publish, "C"), (Network.restart_reader, "rows")]
     run(router, [*before, (Network.restart, "C"), *before])
 
@@ -198,7 +198,7 @@ def test_unread_samples_keep_their_definition(client: nedbus.Bus, bus: nedbus.Bu
 
 
 def test_encoding_has_the_hash_of_the_definition(bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """The encoding has the hash of a definition that nedbus does not include; readers query it by that hash."""
+    """The encoding of a message that is not built in contains the hash by which readers query its definition."""
     for firmware in "AB":
         publisher_of(bus, firmware).publish(fields_of(firmware, 1))
     short = {firmware: short_hash(NAME, definition_of(firmware).types) for firmware in "AB"}
@@ -236,7 +236,7 @@ def test_definition_with_wrong_hash_is_ignored(client: nedbus.Bus, zenoh_session
 
 
 def test_unresponsive_publisher_does_not_delay_readers(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A message is read once one publisher has sent its definition, even if another one does not reply."""
+    """A message is read as soon as one publisher replies with its definition, even if another does not reply."""
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))
     with (
@@ -263,7 +263,7 @@ def test_payload_that_contradicts_its_encoding_is_invalid(bus: nedbus.Bus, zenoh
 
 @pytest.mark.parametrize("distinct", [True, False])
 def test_recording_has_a_schema_per_firmware(bus: nedbus.Bus, tmp_path: Path, distinct: bool) -> None:
-    """Each firmware is recorded with its own schema and read back with its fields, even if builds share an address."""
+    """Each firmware build is recorded with its schema and read back with its fields, even if two share an address."""
     path, stop = tmp_path / "flight.mcap", threading.Event()
     recorder = Recorder(bus.subscribe(TOPIC, mode="every"), path)
     thread = threading.Thread(target=recorder.run, args=(stop,))

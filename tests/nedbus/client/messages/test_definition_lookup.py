@@ -69,7 +69,7 @@ def test_message_with_queried_definition_is_read_completely(
 def test_hostile_definition_does_not_affect_other_streams(
     client: nedbus.Bus, bus: nedbus.Bus, zenoh_session: Session, answer: bytes | dict[str, Any]
 ) -> None:
-    """If a peer replies with an invalid definition, only its own message is invalid."""
+    """If a peer replies with an invalid definition, only messages with this definition are invalid."""
     identity, fields = "0" * 32, [] if isinstance(answer, bytes) else answer["fields"]
     with suppress(ValueError):  # use the right hash, if there is one, so that the reply is rejected for another reason
         identity = short_hash("Evil", {each["name"]: field_type(each["type"]) for each in fields})
@@ -123,7 +123,7 @@ def test_looked_up_definition_is_freed_with_the_bus(endpoint: str, bus: nedbus.B
 def test_encoding_without_name_and_hash_is_invalid(
     client: nedbus.Bus, zenoh_session: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A message whose encoding has no name and hash cannot be looked up: it is invalid, and the log states why."""
+    """A message whose encoding has no message name and hash is invalid, and the log states the reason."""
     with client.subscribe("wheel_encoders") as subscription:
         wait_for_matching(zenoh_session, "nedbus/7/wheel_encoders")
         zenoh_session.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")

@@ -51,7 +51,7 @@ DROPPED: Final = {  # fields of older layouts that PX4 removed; the model does n
     "vehicle_gps_position": {"selected"},
 }
 FLIGHTS: Final = [next(LOGS.parent.glob(f"*/{name}.ulg"), LOGS / f"{name}.ulg") for name in STREAMS]
-UTC: Final = {  # source of UTC, and the date of the boot
+UTC: Final = {  # source of UTC, and the time of the boot
     "gps_loss": ("boot_time_utc_us", "2026-11-21T20:31:26"),
     "fmuv6c_1.17_selector_whipsaw": ("boot_time_utc_us", "2026-04-08T16:21:05"),
     "twelve_messages": ("timesync_status", "2026-11-22T23:08:32"),
@@ -71,7 +71,7 @@ each_flight = pytest.mark.parametrize("flight", FLIGHTS, ids=lambda path: path.s
 
 
 def raw_streams(flight: Path) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
-    """Return the streams read by pyulog, by nedbus stream name."""
+    """Return the streams of a log as pyulog reads them, with nedbus stream names as keys."""
     log = ULog(str(flight))
     found: dict[str, Mapping[str, npt.NDArray[Any]]] = {}
     for data in log.data_list:
@@ -115,7 +115,7 @@ TEXTS = "log_message"
 def test_arrays_of_a_log_equal_pyulog(flight: Path) -> None:
     """`nedbus.read` returns all topics of a log bit for bit, except the messages known to be invalid."""
     raw, arrays = raw_streams(flight), nedbus.read(flight, ["*"])
-    arrays.pop(TEXTS)  # derived from texts and events
+    arrays.pop(TEXTS)  # nedbus derives this topic from texts and events; pyulog does not have it
     assert arrays.keys() == raw.keys()
     left_out = {topic: count for (log, topic, _), count in REJECTED.items() if log == flight.stem}
     compared = 0
@@ -193,7 +193,7 @@ def test_converted_log_equals_the_original(flight: Path, tmp_path: Path) -> None
 
 @each_flight
 def test_utc_is_derived_from_a_log(flight: Path) -> None:
-    """UTC comes from GNSS, a companion computer's clock or the log's information messages; otherwise it is None."""
+    """UTC comes from GNSS, a companion computer's clock, the log's information messages or Unix timestamps."""
     found = nedbus.utc_of(flight)
     source_and_time = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")
     assert source_and_time == UTC.get(flight.stem)
@@ -227,7 +227,7 @@ def test_aligned_table_has_all_topics(flight: Path) -> None:
 
 
 def test_plot_of_topic_without_track_fails(tmp_path: Path) -> None:
-    """Only positions have a track; for other topics `nedbus plot` fails with a reason."""
+    """`nedbus plot` of a topic other than a position is a usage error that names the topic."""
     plot = run_command("plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png"))
     assert plot.exit_code == 2
     assert "vehicle_attitude has no track" in plot.err

@@ -32,7 +32,7 @@ class Stuck(Exception):  # noqa: N818 - not an error, but an expected outcome
 
 @dataclass(eq=False)
 class Reader:
-    """A reader of `rate` messages per second, whose lease expires 5 s after its suspension."""
+    """A reader that reads `rate` messages per second; its lease expires 5 s after it is suspended."""
 
     name: str
     rate: float = math.inf
@@ -106,7 +106,7 @@ class FakeSession:
         self.scheduled.sort(key=itemgetter(0))
 
     def cut(self, reader: Reader, at: float, *, until: float) -> None:
-        """Break the link of a reader."""
+        """Break the link of a reader for the time from `at` to `until` [s]."""
         self.schedule(at, lambda: setattr(reader, "alive", False))
         self.schedule(until, lambda: setattr(reader, "alive", True))
 
@@ -122,7 +122,7 @@ class FakeSession:
         self.schedule(until, lambda: setattr(reader, "stopped", None))
 
     def advance(self, seconds: float) -> None:
-        """Advance the clock."""
+        """Advance the clock and the readers, and reply to queries; raise Stuck after ten minutes."""
         self.now += seconds
         if self.now > END:
             raise Stuck
@@ -139,7 +139,7 @@ class FakeSession:
         return bool(self.routers) and reader.is_linked(self.now)
 
     def longest_pause(self, since: float = 0.0) -> float:
-        """Return the longest time without a sent message."""
+        """Return the longest time between two sent messages [s]."""
         times = [since, *(each for each in self.sent if each >= since)]
         return max(later - earlier for earlier, later in pairwise(times))
 

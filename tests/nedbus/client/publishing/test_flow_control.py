@@ -59,7 +59,8 @@ def test_fast_reader_does_not_delay_the_publisher(session: FakeSession, control:
 def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control: FlowControl) -> None:
     """A stuck reader gets 2,000 messages at once, then 10 per second until the history cache is full, then none.
 
-    A connected reader is never given up: requests are repeated after 0.5, 1, 2, 4 and 8 s, then every 10 s.
+    The publisher waits for a connected reader forever: it repeats its request after 0.5, 1, 2, 4 and 8 s, then
+    every 10 s.
     """
     session.readers.append(Reader("stuck", rate=0.0))
     with pytest.raises(Stuck):
@@ -72,7 +73,10 @@ def test_stuck_reader_gets_a_window_and_a_trickle(session: FakeSession, control:
 
 
 def test_window_is_shared_by_active_publishers() -> None:
-    """Active publishers share the window and unused shares; a second without messages makes a publisher inactive."""
+    """Active publishers share the window; what one of them does not use is available to the others.
+
+    A publisher is inactive after a second without messages.
+    """
     shared = SharedWindow()
     assert shared.share("a", 0, now=0.0) == WINDOW
     assert shared.share("a", 1900, now=0.1) == WINDOW
@@ -110,7 +114,7 @@ def test_reader_that_resumes_gets_all_messages(session: FakeSession, control: Fl
 
 @pytest.mark.parametrize("rate", [100.0, 500.0, 5_000.0])
 def test_slow_reader_sets_the_pace_and_never_starves(session: FakeSession, control: FlowControl, rate: float) -> None:
-    """The publisher leads by a window and a trickle at most, and a slow reader always has messages to read."""
+    """The publisher is ahead of a slow reader by at most a window and a trickle; the reader never has to wait."""
     reader = Reader("slow", rate=rate)
     session.readers += [reader, Reader("fast")]
     session.publish(control, 10_000)
@@ -120,7 +124,9 @@ def test_slow_reader_sets_the_pace_and_never_starves(session: FakeSession, contr
     assert session.longest_pause() < 0.2
 
 
-def test_slow_reader_leaves_others_ten_messages_per_second(session: FakeSession, control: FlowControl) -> None:
+def test_fast_reader_gets_ten_messages_per_second_despite_a_slow_one(
+    session: FakeSession, control: FlowControl
+) -> None:
     """With a reader of one message per second, other readers get ten per second while the history cache has room."""
     session.readers += [Reader("slow", rate=1.0), Reader("fast")]
     session.publish(control, WINDOW + 1000)
@@ -160,9 +166,9 @@ def measure_lead(session: FakeSession, control: FlowControl, reader: Reader, at:
 def test_reader_that_returns_in_time_misses_nothing(  # noqa: PLR0917 - a table
     session: FakeSession, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
 ) -> None:
-    """A reader whose link was reset, whose router restarted, or that was suspended gets all messages.
+    """A reader gets all messages, even if its link was reset, its router restarted, or its process was suspended.
 
-    Until then other readers get ten messages per second.
+    Until it returns, other readers get ten messages per second.
     """
     reader = Reader("back", rate=rate)
     session.readers += [reader, Reader("fast")]
@@ -181,12 +187,13 @@ def test_reader_that_returns_in_time_misses_nothing(  # noqa: PLR0917 - a table
         (FakeSession.stop, 0.0, TIMINGS.lease + 90.0),
     ],
 )
-def test_lost_reader_is_given_up(
+def test_publisher_stops_waiting_for_a_lost_reader(
     session: FakeSession, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
 ) -> None:
-    """A disconnected reader is given up after 5 s with a router, a suspended reader 90 s after its lease expires.
+    """The publisher stops waiting for a disconnected reader after 5 s with a router.
 
-    Until then other readers get ten messages per second.
+    It stops waiting for a suspended reader 90 s after the reader's lease expires. Until then, other readers get ten
+    messages per second.
     """
     reader = Reader("gone", rate=5_000.0)
     session.readers += [reader, Reader("fast")]
@@ -198,10 +205,10 @@ def test_lost_reader_is_given_up(
 
 @pytest.mark.parametrize("away", [0.5, 4.0, 7.0, 60.0])
 @pytest.mark.parametrize("answered", [True, False])
-def test_wait_for_readers_is_extended_without_a_router(
+def test_publisher_waits_for_readers_while_the_router_is_away(
     session: FakeSession, control: FlowControl, away: float, answered: bool
 ) -> None:
-    """A reader that returns 3 s after the router misses nothing, whether it ever replied or not."""
+    """The publisher waits for its readers until the router is back: a reader that returns 3 s later misses nothing."""
     reader = Reader("back")
     session.readers.append(reader)
     session.publish(control, 1000 if answered else 249)
@@ -218,7 +225,7 @@ def test_wait_for_readers_is_extended_without_a_router(
 def test_publisher_waits_for_a_suspended_reader(
     session: FakeSession, control: FlowControl, rate: float, published: float, second: int
 ) -> None:
-    """The publisher waits for a suspended reader, however its lease overlaps with requests and late replies."""
+    """The publisher waits for a suspended reader, whenever its lease expires between requests and late replies."""
     reader = Reader("stopped", rate=rate)
     session.readers += [reader, Reader("fast")]
     session.stop(reader, second, until=math.inf)
@@ -232,7 +239,7 @@ def test_publisher_waits_for_a_suspended_reader(
 def test_reader_suspended_while_replying_is_recognized(
     session: FakeSession, control: FlowControl, others: list[str], back: float
 ) -> None:
-    """A reader suspended while replying is recognized on return, so the publisher waits for no unknown reader."""
+    """A reader suspended while replying is recognized when it returns; the publisher waits for no other reader."""
     reader = Reader("back", stops_in_answer=True)
     session.readers += [reader, *map(Reader, others)]
     session.schedule(TIMINGS.lease + back, lambda: setattr(reader, "stopped", None))
@@ -240,8 +247,10 @@ def test_reader_suspended_while_replying_is_recognized(
     assert session.now < TIMINGS.lease + back + 20_000 / 10_000.0
 
 
-def test_reader_that_closes_during_a_long_request_is_given_up(session: FakeSession, control: FlowControl) -> None:
-    """A reader that closes while a stuck one delays the request is given up 5 s after the stuck reader resumes."""
+def test_reader_that_closes_while_another_is_stuck_does_not_delay_the_publisher(
+    session: FakeSession, control: FlowControl
+) -> None:
+    """If a reader closes while another is stuck, the publisher stops waiting for it 5 s after the other resumes."""
     stuck, ended = Reader("stuck", rate=0.0), Reader("ended")
     session.readers += [stuck, ended]
     session.schedule(10.0, lambda: setattr(ended, "closed", True))
@@ -259,7 +268,7 @@ def test_closed_session_ends_the_wait(session: FakeSession, control: FlowControl
     assert session.now < 50.0
 
 
-def test_flush_waits_for_reception_only(session: FakeSession, control: FlowControl) -> None:
+def test_flush_waits_only_for_reception(session: FakeSession, control: FlowControl) -> None:
     """A flush waits until readers have received all messages, not until they have read them."""
     session.readers.append(Reader("slow", rate=0.0))
     assert control.wait_for_reception(100, timeout=5.0)
@@ -302,7 +311,7 @@ def test_flush_waits_for_a_lost_reader(session: FakeSession, control: FlowContro
     assert session.now == pytest.approx(6.0, abs=0.5)
 
 
-def test_acknowledged_number_wraps(session: FakeSession, control: FlowControl) -> None:
-    """Message numbers wrap after 2^32, both at the reader and at the publisher."""
+def test_message_number_in_acknowledgement_request_wraps(session: FakeSession, control: FlowControl) -> None:
+    """The message number in an acknowledgement request wraps at 2^32, as the reader's numbers do."""
     assert control.wait_for_reception(2**32 + 1, timeout=1.0)
     assert session.requests[-1]["number"] == "0"

@@ -90,7 +90,7 @@ def test_waiting_publishers_do_not_delay_queries(endpoint: str) -> None:
 def test_cancelled_publish_many_can_be_continued(
     endpoint: str, stuck: nedbus.Subscription[nedbus.VehicleLocalPosition]
 ) -> None:
-    """After a cancelled call, `published` has the number sent; publishing the rest loses and repeats nothing."""
+    """After a cancelled call, `published` is the number of sent messages; sending the rest loses and repeats none."""
 
     async def scenario() -> None:
         async with nedbus.connect_async(endpoint) as bus:
@@ -108,7 +108,7 @@ def test_cancelled_publish_many_can_be_continued(
 
 
 def test_cancelled_close_closes_without_waiting(endpoint: str, zenoh_session: Session, bus: nedbus.Bus) -> None:
-    """A reader that acknowledges nothing delays a close until it is cancelled; then everything is closed."""
+    """A close that waits for acknowledgements can be cancelled; it then closes everything without waiting."""
     queries: list[zenoh.Query] = []
 
     async def scenario() -> None:
@@ -151,7 +151,7 @@ def test_exception_in_block_closes_publisher_without_waiting(client: nedbus.Bus,
 
 @pytest.mark.parametrize("whole_bus", [False, True])
 def test_close_returns_after_its_timeout(client: nedbus.Bus, zenoh_session: Session, whole_bus: bool) -> None:
-    """A reader that acknowledges nothing delays a close by its timeout at most, and not at all with timeout 0."""
+    """Without acknowledgements, a close returns after its timeout; with timeout 0, it does not request any."""
     queries: list[zenoh.Query] = []
     with answer_queries(zenoh_session, f"nedbus/*/{VLP}/@ack", queries.append):
         for vehicle, timeout in (("1", 0.0), ("2", 0.05)):
@@ -191,7 +191,7 @@ def test_ctrl_c_ends_waiting_publishers(start: Start, endpoint: str, bus: nedbus
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to positions. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
+    """Subscribe to positions. Request this fixture before `bus`: otherwise it closes first, and `bus` waits 5 s."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
 

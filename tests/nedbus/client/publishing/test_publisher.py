@@ -30,7 +30,7 @@ def test_every_publish_method_raises_for_invalid_messages(client: nedbus.Bus, me
 
 
 def test_publish_many_with_invalid_arguments_sends_nothing(bus: nedbus.Bus) -> None:
-    """Another dtype raises TypeError, an empty array sends nothing, and a closed publisher raises ClosedError."""
+    """`publish_many` raises TypeError for another dtype and ClosedError after closing; an empty array sends nothing."""
     publisher = bus.publisher(VLP, vehicle="1")
     with pytest.raises(TypeError, match="astype"):
         publisher.publish_many(np.zeros(3, [("x", "f4")]))

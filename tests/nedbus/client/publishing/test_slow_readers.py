@@ -50,7 +50,7 @@ with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mo
 
 
 def subscribe(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to positions. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
+    """Subscribe to positions. Request this fixture before `bus`: otherwise it closes first, and `bus` waits 5 s."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
@@ -95,7 +95,7 @@ def test_stuck_reader_slows_down_a_replay_without_losses(
 def test_suspended_reader_gets_all_messages(
     start: Start, endpoint: str, bus: nedbus.Bus, timings: Timings, *, when: str, lease: int
 ) -> None:
-    """A reader suspended (SIGSTOP) until its lease expires (5 s by default, here also 1 s) loses nothing."""
+    """A reader suspended (SIGSTOP) until its lease expires loses nothing, with a lease of 1 s or the default of 5 s."""
     assert timings.lease == 5
     begin = time.monotonic()
     timings.lease = lease
@@ -121,7 +121,9 @@ def test_suspended_reader_gets_all_messages(
 
 
 @pytest.mark.parametrize("lossless", [False, True])
-def test_publishers_started_during_an_outage_are_recovered(endpoint: str, bus: nedbus.Bus, lossless: bool) -> None:
+def test_messages_of_publishers_started_during_an_outage_are_recovered(
+    endpoint: str, bus: nedbus.Bus, lossless: bool
+) -> None:
     """A reader that was offline when publishers started gets their whole history cache in order once it reconnects."""
     near = free_endpoint()
     router = open_router(listen=(near,), connect=(endpoint,))
@@ -166,7 +168,7 @@ def test_publishers_started_during_an_outage_are_recovered(endpoint: str, bus: n
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_killed_reader_is_given_up(
+def test_replay_continues_after_a_reader_is_killed(
     start: Start,
     endpoint: str,
     reader: nedbus.Subscription[Any],
@@ -175,7 +177,7 @@ def test_killed_reader_is_given_up(
     *,
     number: signal.Signals,
 ) -> None:
-    """A replay continues without a reader that is killed or interrupted, and other readers miss nothing."""
+    """A replay continues after one of its readers is killed or interrupted; other readers miss nothing."""
     timings.return_wait = 0.5
     dying = start("-c", READER, endpoint, str(COUNT), "slow", coverage=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")

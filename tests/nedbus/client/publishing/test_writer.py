@@ -59,7 +59,7 @@ class Stream:
             self.heartbeats.resume(cast("Writer", self.writer))
 
     def wait(self, seconds: float) -> list[float]:
-        """Advance the clock; return the times of heartbeats since then."""
+        """Advance the clock by `seconds`; return when heartbeats were sent meanwhile, as seconds since the call."""
         begin, before = self.now, len(self.sent)
         while self.due <= begin + seconds:
             self.now = max(self.now, self.due)
@@ -80,7 +80,10 @@ def stream(monkeypatch: pytest.MonkeyPatch) -> Stream:
 
 @pytest.mark.parametrize("rate", [5, 7, 50, 400])
 def test_busy_stream_sends_no_heartbeats(stream: Stream, rate: int) -> None:
-    """A stream of 5 Hz or more sends no heartbeats, because its next message reveals losses; nor does a new one."""
+    """A stream of 5 Hz or more sends no heartbeats, because its next message reveals losses.
+
+    A stream without messages sends none either.
+    """
     assert stream.wait(10.0) == []
     for _ in range(20 * rate):
         stream.publish()
@@ -110,7 +113,7 @@ def test_heartbeats_of_a_silent_stream_back_off(stream: Stream) -> None:
 
 
 def test_message_during_a_heartbeat_restarts_the_schedule(stream: Stream) -> None:
-    """A message put while a heartbeat is being sent gets its own first heartbeat in time."""
+    """A message published while a heartbeat is being sent is followed by its own first heartbeat in time."""
     stream.publish()
 
     def publish_during_heartbeat() -> None:

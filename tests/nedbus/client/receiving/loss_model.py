@@ -25,7 +25,7 @@ UNLIMITED: Final = 100_000
 class InitialState(NamedTuple):
     """The initial state of a simulation.
 
-    `caches`: size of each publisher's history cache. `capacity`: of the queue. Both in messages.
+    `caches`: size of each publisher's history cache [messages]. `capacity`: size of the queue [messages].
     """
 
     mode: Mode = "every"
@@ -44,9 +44,9 @@ class Request(NamedTuple):
 class ReceivePath(Protocol):
     """The receive path of one subscription, without I/O. Mode `latest` has no heartbeats and no requests.
 
-    `link`: the link broke, or has been up for so long that an unknown publisher is new.
-    `answer`: with `final`, a request that these samples do not complete is given up.
-    `read`: the timestamps of one or more messages, and the reported losses.
+    `link`: report that the link broke, or that it has been up for so long that an unknown publisher must be new.
+    `answer`: pass the samples of a reply; with `final`, requested messages that are not among them are lost.
+    `read`: return the timestamps of one or more messages, and the losses that they report.
     """
 
     def __init__(self, setting: InitialState) -> None: ...

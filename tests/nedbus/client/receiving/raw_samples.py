@@ -34,7 +34,7 @@ INVALID = Payload(bytes(len(VALID)))  # of the right size: detected only when it
 
 
 class Raw(SimpleNamespace):
-    """A fake sample; unlike its base, it supports weak references."""
+    """A fake sample that supports weak references, unlike SimpleNamespace."""
 
 
 def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
@@ -78,7 +78,7 @@ def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> Pe
 
 
 def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
-    """Put samples into a queue, and give up all gaps, because no publisher replies."""
+    """Put samples into a queue, and count all gaps as lost, because no publisher replies."""
     pending_queue.put(samples, overflowed=overflowed)
     pending_queue.give_up()
 

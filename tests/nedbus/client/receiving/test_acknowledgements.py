@@ -50,7 +50,7 @@ def reader() -> AcknowledgingReader:
 
 
 def test_read_is_acknowledged_after_all_earlier_samples_are_read(reader: AcknowledgingReader) -> None:
-    """A request with `read` is acknowledged once all samples queued when its message arrived have been read."""
+    """A request with `read` is acknowledged once its message and all samples queued before it have been read."""
     reader.put(raw(0))
     reader.request(1, read=True)
     assert reader.read(1) == []  # message 1 is still in transit
@@ -61,7 +61,7 @@ def test_read_is_acknowledged_after_all_earlier_samples_are_read(reader: Acknowl
 
 
 def test_unknown_publisher_is_acknowledged_once_the_ring_is_empty(reader: AcknowledgingReader) -> None:
-    """An unknown publisher's request is acknowledged once the ring is empty: before, its messages may be in the ring.
+    """An unknown publisher's request waits until the ring is empty, because the ring may hold its messages.
 
     A request with `read` also waits until all samples queued at that time have been read.
     """
@@ -81,7 +81,7 @@ def test_requests_of_publishers_are_independent(reader: AcknowledgingReader) -> 
 
 
 def test_number_of_open_requests_is_bounded(reader: AcknowledgingReader) -> None:
-    """Beyond the limit the oldest requests are discarded; publishers repeat them."""
+    """Beyond the limit, the oldest acknowledgement requests are discarded; publishers repeat them."""
     reader.put(raw(0))
     for number in range(1, MAX_ACK_REQUESTS + 3):
         reader.request(number)
@@ -110,7 +110,7 @@ def test_read_is_acknowledged_when_the_script_reads(reader: AcknowledgingReader,
     assert reader.acknowledged == ["1", "3"]
 
 
-def test_unknown_publisher_is_acknowledged_after_receiving(reader: AcknowledgingReader) -> None:
+def test_request_of_unknown_publisher_waits_while_the_ring_is_drained(reader: AcknowledgingReader) -> None:
     """An unknown publisher's request waits while another thread drains the ring, which may hold its messages."""
     assert reader.request(7, name="while receiving") == []
     assert reader.put(raw(0, publisher="b")) == ["while receiving"]
@@ -130,8 +130,8 @@ def test_unknown_publisher_is_not_acknowledged_after_a_link_change(reader: Ackno
     assert reader.put(raw(1, publisher="b")) == ["1", "7"]
 
 
-def test_acknowledgement_waits_for_a_gap(reader: AcknowledgingReader) -> None:
-    """A sample held back behind a gap is acknowledged only once the gap is filled or given up."""
+def test_acknowledgement_waits_until_gap_is_closed(reader: AcknowledgingReader) -> None:
+    """A sample held back behind a gap is acknowledged only once the gap is filled or counted as lost."""
     reader.put(raw(0), raw(2))
     assert reader.request(2) == []
     reader.queue.give_up()
@@ -146,7 +146,7 @@ def test_dropped_message_is_acknowledged(reader: AcknowledgingReader, monkeypatc
     assert reader.put(*map(raw, range(2, 20))) == ["1"]
 
 
-def test_end_of_the_queue_acknowledges_all_requests(reader: AcknowledgingReader) -> None:
+def test_closed_queue_acknowledges_all_requests(reader: AcknowledgingReader) -> None:
     """A closed queue acknowledges all open and later requests, so that no publisher waits for its reader."""
     reader.put(raw(0))
     reader.request(0, read=True, name="read")

@@ -159,7 +159,7 @@ def test_two_reading_threads_receive_a_message_each(bus: nedbus.Bus) -> None:
 def test_invalid_samples_do_not_end_an_iteration(
     client: nedbus.Bus, zenoh_session: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Invalid payloads and keys, deletes and wildcard puts are counted and logged once per key; valid ones arrive."""
+    """Invalid payloads and keys, deletes and wildcard puts are counted, logged once per key, and skipped."""
     subscription = client.subscribe("*", mode="every")
     assert receive_timestamps(subscription, 1) == [1]
     good = encode(message(2, x=1.0))
@@ -276,10 +276,10 @@ def test_peer_that_never_replies_does_not_delay_other_streams(
     assert len(queries) <= 1
 
 
-def test_unexpected_error_in_the_pump_is_counted(
+def test_sample_is_counted_and_requested_again_after_an_unexpected_error(
     bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An exception in the pump is logged, its sample counted and requested again, and the reader continues."""
+    """An unexpected error while a sample is queued is logged; the sample is counted as invalid and requested again."""
     subscription = bus.subscribe(mode="every")
     assert receive_timestamps(subscription, 1) == [1]
     with monkeypatch.context() as patched:

@@ -80,7 +80,7 @@ def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
     lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
 
 
-def test_requests_during_a_lookup_are_queried_next() -> None:
+def test_definition_requested_during_a_lookup_is_looked_up_next() -> None:
     """A definition requested during another lookup is looked up next, and readers wait for both.
 
     A definition in the first reply is not looked up again, even if more of its messages have arrived.
@@ -103,7 +103,7 @@ def test_requests_during_a_lookup_are_queried_next() -> None:
 
 
 def test_wait_for_unanswered_lookups_is_bounded() -> None:
-    """A peer that invents definitions makes readers wait for 3 s in total, then for a tenth of the time.
+    """Lookups of definitions that no peer knows make readers wait for 3 s in total, then for 10 % of the time.
 
     Definitions from other peers are still looked up, and memory for failed lookups is bounded.
     """

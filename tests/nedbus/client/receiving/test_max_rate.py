@@ -120,7 +120,7 @@ def steady(rate: float, seconds: float) -> list[float]:
 
 
 def test_steady_stream_passes_evenly() -> None:
-    """A gate of 5 Hz passes every 20th message of 100 Hz, with jitter and without drift over ten minutes."""
+    """A 5 Hz gate passes every 20th message of a 100 Hz stream with jitter, without drift over ten minutes."""
     times = [number / 100 + 0.002 * math.sin(number) for number in range(60_000)]
     taken = passed(5, times)
     assert len(taken) == 3_000
@@ -137,21 +137,21 @@ def test_mean_rate_is_the_requested_rate(rate: float, source: float) -> None:
 
 @pytest.mark.parametrize("rate", [2, 5, 10])
 def test_slower_stream_passes_completely(rate: float) -> None:
-    """A stream slower than the rate passes completely."""
+    """A stream that is not faster than the rate passes completely."""
     times = steady(2, 100.0)
     assert passed(rate, times) == times
 
 
 @given(st.lists(st.floats(-0.09, 0.09), min_size=50, max_size=50))
 def test_jitter_omits_at_most_one_message(jitter: list[float]) -> None:
-    """A stream at exactly the rate, with a jitter of half a period, loses at most one message."""
+    """Of a stream at exactly the rate, with a jitter of almost half a period, at most one message is omitted."""
     times = [number / 5 + late for number, late in enumerate(jitter)]
     assert len(passed(5, times)) >= len(times) - 1
 
 
 @given(st.floats(0.1, 200.0), st.lists(st.floats(0.0, 3.0), min_size=1, max_size=200))
 def test_rate_gate_never_exceeds_its_limit(rate: float, steps: list[float]) -> None:
-    """In T seconds at most rate x (T + 2.5 ms) + 2 messages pass, at any arrival times."""
+    """In any T seconds at most rate x (T + 2.5 ms) + 2 messages pass, whatever their arrival times."""
     taken = passed(rate, list(accumulate(steps, initial=1000.0)))
     for first, last in combinations_with_replacement(range(len(taken)), 2):
         assert last - first + 1 <= rate * (taken[last] - taken[first] + 0.0025) * (1 + 1e-6) + 2

@@ -119,7 +119,7 @@ def downsampled_streams(zenoh_session: Session) -> list[str]:
     return [str(reply.ok.key_expr) for reply in zenoh_session.liveliness().get("nedbus/**/@rate/*") if reply.ok]
 
 
-def test_downsampled_streams_are_declared_for_readers_only(
+def test_downsampled_streams_are_declared_only_while_they_have_readers(
     bus: nedbus.Bus, zenoh_session: Session, clock: Clock
 ) -> None:
     """Downsampled streams are declared once they have readers, and undeclared a minute after the last one closed."""
@@ -181,7 +181,7 @@ def test_last_messages_of_a_storage_are_ignored(bus: nedbus.Bus, zenoh_session: 
 def publish_across_outage(
     publisher: nedbus.Publisher, subscription: nedbus.Subscription[Any], clock: Clock, link: Link, seconds: int
 ) -> list[nedbus.Sample[Any]]:
-    """Publish 1 s of 100 Hz, then `seconds` during an outage; return all samples up to the first one after it."""
+    """Publish at 100 Hz for 1 s, then for `seconds` in an outage; return the samples up to the first one after it."""
     take_last(publisher, subscription)
     taken = []
     for first in range(1, 101, 20):
@@ -208,7 +208,7 @@ def publish_across_outage(
 
 
 @pytest.mark.parametrize(("mode", "seconds"), [("every", 10), ("every", 40), ("latest", 10)])
-def test_losses_during_an_outage_are_recovered_for_20_s(
+def test_losses_in_an_outage_of_up_to_20_s_are_recovered(
     endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, seconds: int
 ) -> None:
     """In mode "every", losses of a downsampled stream in an outage of up to 20 s are recovered.
@@ -238,7 +238,7 @@ def test_losses_during_an_outage_are_recovered_for_20_s(
 
 
 def test_lossless_publisher_does_not_wait_for_downsampling_reader(endpoint: str, bus: nedbus.Bus) -> None:
-    """A replay at full speed neither waits for a downsampling reader nor exceeds its rate."""
+    """A lossless publisher neither waits for a reader of a downsampled stream nor exceeds the rate of that stream."""
     publisher = bus.publisher(VLP, vehicle="7", lossless=True)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=1) as subscription:
         wait_for_downsampling_reader(publisher)
@@ -257,8 +257,8 @@ def test_lossless_publisher_does_not_wait_for_downsampling_reader(endpoint: str,
 
 
 @pytest.mark.parametrize(("mode", "slow_end"), [("latest", "reader"), ("every", "vehicle")])
-def test_slow_link_carries_the_requested_rate_only(endpoint: str, clock: Clock, mode: Mode, slow_end: str) -> None:
-    """At 5 Hz, a 100 Hz stream needs less than 5 kB/s on each link, the reader's and the vehicle's."""
+def test_slow_link_carries_only_the_requested_rate(endpoint: str, clock: Clock, mode: Mode, slow_end: str) -> None:
+    """With `max_rate=5`, a 100 Hz stream needs less than 5 kB/s on the reader's link and on the vehicle's link."""
     with closing(Link(endpoint)) as link:
         near, far = (link.endpoint, endpoint) if slow_end == "reader" else (endpoint, link.endpoint)
         with nedbus.connect(far) as vehicle, nedbus.connect(near) as reader:
@@ -285,7 +285,7 @@ def test_stream_that_is_not_downsampled_is_logged_once(
     timings: Timings,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """A stream that is not downsampled is not received, which is logged once; no stream is received at full rate."""
+    """A stream that its publisher does not downsample is not received, not even at full rate; this is logged once."""
     put, disabled = Downsampler.put, []
     monkeypatch.setattr(Downsampler, "put", lambda self, *args: None if self in disabled else put(self, *args))
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
@@ -305,7 +305,7 @@ def test_stream_that_is_not_downsampled_is_logged_once(
 
 
 def test_echo_prints_downsampled_messages(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:
-    """`nedbus echo --max-rate 5` prints every 20th message of 100 Hz."""
+    """`nedbus echo --max-rate 5` prints every 20th message of a 100 Hz stream."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     echo = run_nedbus("echo", "-c", endpoint, "--max-rate", "5", "--every", "--csv", "--field", "timestamp", "-n", "51")
@@ -320,7 +320,7 @@ def test_echo_prints_downsampled_messages(run_nedbus: Start, endpoint: str, bus:
 
 
 def test_key_of_a_downsampled_stream_ends_with_its_rate() -> None:
-    """The key of a downsampled stream is the stream's key, a chunk that no wildcard matches, and the rate."""
+    """The key of a downsampled stream consists of the stream's key, a chunk that no wildcard matches, and the rate."""
     address = Address("7", "estimator_local_position", 1)
     assert address.rate_key(5) == "nedbus/7/estimator_local_position/1/@rate/5"
     assert Address.from_key(address.rate_key(5).partition(RATE)[0]) == address

@@ -45,7 +45,7 @@ STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_first_reply_of_a_publisher_is_retained(mode: Mode) -> None:
-    """The first sample of a publisher is retained if it is a reply to the query for the last message."""
+    """The first sample of a publisher is marked as retained if it is a reply to the query for the last message."""
     pending_queue, block, drop = make_queue(mode), zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
     arriving = [(4, "a", block), (5, "a", block), (6, "a", drop), (1, "b", drop), (2, "b", block)]
     seen = []
@@ -98,7 +98,7 @@ def test_mode_latest_keeps_the_newest_of_each_key(caplog: pytest.LogCaptureFixtu
 
 
 def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogCaptureFixture) -> None:
-    """Valid samples among invalid ones arrive, and a flood of invalid ones on a key logs one line.
+    """Invalid samples are counted, and logged once per key; valid samples between them arrive.
 
     A payload of unusual size is decoded before it can replace a valid sample.
     """
@@ -114,7 +114,7 @@ def test_invalid_samples_are_counted_and_logged_once_per_key(caplog: pytest.LogC
     assert len(caplog.messages) == 2
 
 
-def test_memory_for_invented_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_tracked_keys_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reader keeps the state of at most 10,000 keys, here 10; messages on additional keys still arrive."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_KEYS", 10)
     pending_queue = make_queue("every")
@@ -144,7 +144,7 @@ def vehicles_in_memory() -> list[str]:
 def test_least_recently_active_key_is_evicted(
     mode: Mode, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Beyond the limit, the least recently active key is evicted and counted; losses of other keys are counted."""
+    """Beyond the limit, the least recently active key is evicted and counted; losses of other keys still count."""
     monkeypatch.setattr(module, "MAX_KEYS", 3)
     now = [0.0]
     pending_queue = make_queue(mode, clock=lambda: now[0])
@@ -182,7 +182,7 @@ def test_key_with_an_open_gap_is_evicted_last(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """2,000 vehicles appear and disappear, eight at a time; memory has only the vehicles of the last ten minutes.
+    """While 2,000 vehicles come and go, eight at a time, only the state of those of the last ten minutes is kept.
 
     A vehicle whose messages or heartbeats still arrive is not evicted.
     """
@@ -215,7 +215,7 @@ def test_losses_during_a_long_outage_are_counted() -> None:
     assert pending_queue.counts.lost == 89
 
 
-def test_wait_ends_with_sample_wake_end_or_timeout() -> None:
+def test_queue_wait_returns_on_sample_wake_end_or_timeout() -> None:
     """A wait ends when a sample arrives, `wake` is called, the queue ends, or the timeout expires."""
     pending_queue = make_queue("every")
     assert not pending_queue.wait(0.0)
@@ -272,7 +272,7 @@ def test_losses_before_dropped_samples_are_reported_later(small_queue: PendingQu
     assert small_queue.counts == Counts(received=10, lost=4, dropped=5)
 
 
-def test_losses_before_a_dropped_sample_survive_invalid_ones(small_queue: PendingQueue) -> None:
+def test_losses_are_reported_by_the_next_valid_sample(small_queue: PendingQueue) -> None:
     """Losses before dropped and invalid samples are reported by the next valid sample of the key."""
     put(small_queue, [raw(0), raw(3)])
     put(small_queue, [raw(number, payload=INVALID) for number in range(4, 13)])
@@ -310,7 +310,7 @@ class Encoding(str):
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
-def test_stream_keeps_no_receive_buffer(mode: Mode) -> None:
+def test_key_state_keeps_no_receive_buffer(mode: Mode) -> None:
     """The state of a key stores a copy of the encoding, because a Zenoh encoding keeps its receive buffer alive."""
     pending_queue, encoding = make_queue(mode), Encoding(SOURCE)
     reference = weakref.ref(encoding)
@@ -417,7 +417,7 @@ def test_batch_in_mode_latest_reports_losses_before_superseded_samples() -> None
 
 
 def test_loss_is_reported_by_the_batch_after_the_gap() -> None:
-    """Messages that exceed a full batch, and the losses before them, are left to the next batch."""
+    """Messages that do not fit into a full batch are left for the next one, which reports the losses before them."""
     pending_queue = make_queue("every")
     put(pending_queue, [raw(number) for number in range(5000) if number not in {4500, 4501}])
     first, second = take_batch(pending_queue), take_batch(pending_queue)
@@ -426,7 +426,7 @@ def test_loss_is_reported_by_the_batch_after_the_gap() -> None:
 
 
 def test_samples_and_batches_report_each_loss_once() -> None:
-    """Samples and batches of one subscription report each loss once."""
+    """If a subscription is read alternately as samples and as batches, each loss is reported once."""
     pending_queue = make_queue("every")
     put(pending_queue, [raw(0), raw(5)])
     assert sum(sample.lost for sample in drain(pending_queue)) == 4

@@ -49,7 +49,10 @@ def fail(*_: object) -> None:
 
 @pytest.mark.parametrize("unanswered", [0, 3])
 def test_lost_samples_are_requested_by_exact_key(lossy: Lossy, unanswered: int) -> None:
-    """A request has an exact key, because routers match wildcards with all caches, and is repeated until answered."""
+    """Lost samples are requested by their exact key, because routers match wildcards with all caches.
+
+    A request is repeated until it is answered.
+    """
     lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
     lossy.publish(*range(7))
     assert lossy.receive(7) == list(range(7))
@@ -58,7 +61,7 @@ def test_lost_samples_are_requested_by_exact_key(lossy: Lossy, unanswered: int) 
 
 
 def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages no longer in the publisher's cache are lost, after a second request."""
+    """Messages that the publisher no longer caches count as lost after a second request."""
 
     def request_available(
         session: Session, key: str, name: str, numbers: range, *, timeout: float
@@ -74,7 +77,7 @@ def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pyte
 
 
 def test_publisher_without_a_cache_gets_one_request(lossy: Lossy, zenoh_session: Session, timings: Timings) -> None:
-    """A third-party publisher with sequence numbers but no cache gets one request per gap after a timeout."""
+    """After a timeout, a third-party publisher with sequence numbers but no cache gets only one request per gap."""
     timings.retransmit_timeout = 0.2
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
@@ -205,7 +208,7 @@ def test_malformed_heartbeats_are_ignored(lossy: Lossy, zenoh_session: Session, 
 
 
 def test_unanswered_requests_do_not_delay_others(lossy: Lossy, zenoh_session: Session) -> None:
-    """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
+    """Requests to publishers that exist only in forged heartbeats do not delay requests to real publishers."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"
     with answer_queries(zenoh_session, f"{evil}/**", taken.append):
@@ -252,8 +255,8 @@ def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytes
     assert lossy.subscription.counts == Counts(received=59, lost=1)
 
 
-def test_slow_reader_requests_after_reading(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slow reader requests lost messages only after reading: recovered messages would displace unread ones."""
+def test_slow_reader_requests_lost_messages_only_after_reading(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow reader requests lost messages only after reading, so that recovered ones do not displace unread ones."""
     monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
@@ -285,7 +288,7 @@ def test_unexpected_error_loses_only_the_recovered_message(
 
 @pytest.mark.parametrize("rest", [0, 1])
 def test_newest_messages_are_recovered_after_a_router_restart(rest: int) -> None:
-    """After a router restart a reader recovers the newest messages, whether another one follows or not."""
+    """After a router restart, a reader recovers the newest messages, whether or not another message follows."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     received: list[int] = []

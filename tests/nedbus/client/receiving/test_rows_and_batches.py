@@ -25,7 +25,7 @@ COUNT = 900  # fewer than half a window, because one thread publishes and reads
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to all topics. Request this fixture before `bus`: `bus` waits 5 s for a reader that closes first."""
+    """Subscribe to all topics. Request this fixture before `bus`: otherwise it closes first, and `bus` waits 5 s."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
@@ -142,7 +142,7 @@ def test_async_subscription_yields_rows_and_batches(endpoint: str, bus: nedbus.B
     assert asyncio.run(read()) == (list(range(1, 101)), 200)
 
 
-def test_receive_batch_raises_no_data_error_on_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+def test_receive_batch_returns_a_batch_or_raises_on_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
     """`receive_batch` returns a batch with the provenance of each message, or raises NoDataError on timeout."""
     bus.publisher(VLP, vehicle="1", source="test").publish({"timestamp": 7, "x": 1.0})
     subscription = client.subscribe(VLP, mode="every")
