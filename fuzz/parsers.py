@@ -144,7 +144,7 @@ def parse_cdr(data: bytes) -> int:
 
 
 def parse_msgpack(data: bytes) -> int:
-    """Decode a payload of the message that the first byte selects as model, row and array; a valid one round-trips.
+    """Decode a payload, of the message selected by the first byte, as model, row and array; a valid one round-trips.
 
     Returns the number of valid messages.
     """

@@ -12,7 +12,7 @@ from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, pro
 
 @given(st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True), st.sets(st.sampled_from(list(FIELD_TYPES))))
 def test_provenance_round_trip(source: str | None, provided: set[str]) -> None:
-    """Any source and set of fields is encoded and parsed again."""
+    """Any source and set of fields is unchanged after encoding and parsing."""
     encoding = encoding_of(source, frozenset(provided))
     assert encoding.startswith(ENCODING)
     assert provenance_of(encoding) == Provenance(source, frozenset(FIELD_TYPES.keys() - provided))

@@ -78,7 +78,7 @@ def test_counter_wrap_counts_as_one_reset() -> None:
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """After two resets between two messages, the delta covers only the last one: the track is discontinued."""
+    """After two resets between two messages, the delta covers only the last one, so the track is discontinued."""
     _, second, third = track(
         at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
     )
@@ -95,7 +95,7 @@ def test_reset_without_delta_discontinues_the_track() -> None:
 
 
 def test_backward_timestamp_restarts_the_track() -> None:
-    """After a reboot the vehicle starts a new track."""
+    """A timestamp that steps back, as after a reboot, starts a new track."""
     _, second, third = track(
         at(100, x=5.0), at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)), at(1, x=0.5, xy_reset_counter=0)
     )

@@ -121,7 +121,7 @@ def test_reordered_message_is_not_a_reboot(flight: Flight) -> None:
 
 
 def test_silence_is_reported_until_next_position(flight: Flight) -> None:
-    """ "silent" dates from the last position, turns into "gone" without a publisher, and ends with the next one."""
+    """Silence dates from the last position, turns into "gone" without a publisher, and ends with the next position."""
     flight.fly(1)
     last = flight.now
     assert flight.wait(2.0).update() == []
