@@ -40,7 +40,7 @@ for _ in sys.stdin:
         event_log.add(address, fields, due)
     event_log.settle(due)
     print(1e6 * (time.process_time() - start) / len(messages), flush=True)
-"""  # for each line on stdin: us per message
+"""  # prints us per message for each line on stdin
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """A fleet at 100 Hz in one process: python -m benchmarks.fleet VEHICLES SECONDS ENDPOINT [noise].
 
 The process prints "ready", waits for a line, publishes, and prints its maximum delay in seconds.
-With `noise` no two messages are alike, so a recording compresses no better than that of a real flight.
+With `noise` no two messages are alike, so that a recording compresses no better than one of a real flight.
 """
 
 from __future__ import annotations

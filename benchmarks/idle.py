@@ -63,10 +63,10 @@ def main() -> None:
     arguments = parser.parse_args()
     for checkout in (HERE, Checkout(arguments.vs)) if arguments.vs else (HERE,):
         print(f"\n{checkout.folder}")
-        measure_at_rest(checkout, arguments.seconds)
+        measure_idle(checkout, arguments.seconds)
 
 
-def measure_at_rest(checkout: Checkout, seconds: float) -> None:
+def measure_idle(checkout: Checkout, seconds: float) -> None:
     """Measure services without readers, an idle subscription, and many buses."""
     with tempfile.TemporaryDirectory() as folder:
         ended = f"ulog:{write_log(Path(folder) / 'flight.ulg', range(0, 100_000, 10_000), x=1.0)}"
@@ -95,7 +95,7 @@ def measure_at_rest(checkout: Checkout, seconds: float) -> None:
 
 def measure(process: Process, seconds: float) -> str:
     """Measure for `seconds`: CPU in percent of a core, memory, threads, and wake-ups per second and thread."""
-    time.sleep(2.0)  # startup work ends
+    time.sleep(2.0)  # until the work at startup has ended
     (used,), before, start = processes.cpu_seconds(process), switches(process), time.monotonic()
     time.sleep(seconds)
     (used_after,), after, passed = processes.cpu_seconds(process), switches(process), time.monotonic() - start

@@ -69,7 +69,7 @@ class Service:
                 self.get()
         after, passed = self._cpu(), time.monotonic() - begin
         messages = self._published() - published
-        # Threads that answer requests do not exist at both times.
+        # Threads that answer a request end before the second reading, and are not counted.
         used = sum(after[thread] - before[thread] for thread in before.keys() & after.keys())
         return Interval(messages / passed, used / messages * 1e6)
 
@@ -98,7 +98,7 @@ def main() -> None:
         )
         rates, costs = [], []
         for pair in range(arguments.pairs):
-            order = (False, True) if pair % 2 else (True, False)  # drift affects both
+            order = (False, True) if pair % 2 else (True, False)  # alternating, so drift affects both
             intervals = {scraped: service.measure(arguments.seconds, scraped=scraped) for scraped in order}
             rates.append(1 - intervals[True].rate / intervals[False].rate)
             costs.append(intervals[True].cpu / intervals[False].cpu - 1)

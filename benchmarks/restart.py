@@ -35,7 +35,7 @@ with nedbus.connect(sys.argv[1]) as bus, bus.subscribe(mode="every") as subscrip
             seen.add(sample.address), times.append(time.monotonic())
             if len(seen) == streams:
                 print(json.dumps([times[0], times[-1], missing]), flush=True)
-"""  # for each line on stdin: the times of the first message and of the first one of the last stream, and the loss
+"""  # prints for each line on stdin: times of the first message and of the last stream's first message, and the loss
 
 
 def main() -> None:

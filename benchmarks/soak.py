@@ -83,7 +83,7 @@ while subscriber.handler.recv():
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--names", type=int, default=50_000)
+    parser.add_argument("--names", type=int, default=50_000, help="number of vehicles")
     parser.add_argument("--interval", type=float, default=0.0, help="interval between two vehicles [s]")
     parser.add_argument("--checkout", type=Path, default=ROOT, help="checkout to measure (default: this one)")
     arguments = parser.parse_args()
@@ -113,7 +113,7 @@ def main() -> None:
 
 def measure(processes: dict[str, Process], pages: dict[str, str], stage: int, timeout: float) -> None:
     """Run all stages, print the state after each, and the growth from the first to the last."""
-    print("   names  names/s  open ms  MB: " + " ".join(f"{name:>9}" for name in processes))
+    print("vehicles    per s  open ms  MB: " + " ".join(f"{name:>9}" for name in processes))
     stages = []
     for number in range(1, STAGES + 1):
         resume(processes["publisher"])
@@ -129,7 +129,7 @@ def measure(processes: dict[str, Process], pages: dict[str, str], stage: int, ti
     for name, first in zip(processes, stages[0], strict=True):
         kilobytes, beyond = 1024 * growth[name] / stage / (STAGES - 1), (growth[name] - growth["raw"]) / first
         verdict = "" if name in {"raw", "publisher"} else "met" if beyond <= 0.1 else "MISSED: 10 %"
-        print(f"{name:10} {kilobytes:8.2f} kB a name, {beyond:.0%} beyond raw  {verdict}")
+        print(f"{name:10} {kilobytes:8.2f} kB per vehicle, {beyond:.0%} more than raw  {verdict}")
 
 
 def scrape(address: str) -> str:

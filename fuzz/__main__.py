@@ -25,7 +25,7 @@ BUILD: Final = ROOT / "build" / "fuzz"
 _HANG: Final = 10  # s for one input
 _MEMORY: Final = 512  # MB of the process
 _MAX_LENGTH: Final = {"mcap": 20_000, "ulog": 10_000, "mavlink": 8_000}  # maximum input size [bytes]; others 4096
-_GRACE: Final = 600  # s; a harness that exceeds its time by more is killed: a busy machine starts it slowly
+_GRACE: Final = 600  # s; a harness is killed this long after its time; on a busy machine it starts slowly
 _LEAST_EDGES: Final = 100
 _SHOWN: Final = 25  # lines of output for a finding
 

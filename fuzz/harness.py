@@ -1,11 +1,11 @@
-"""Fuzz one parser with libFuzzer: `python -m fuzz.harness ulog FOLDER`; with a file for FOLDER, that input alone."""
+"""Fuzz one parser with libFuzzer: `python -m fuzz.harness ulog FOLDER`; if FOLDER is a file, run only that input."""
 
 import logging
 import sys
 
 import atheris
 
-atheris.enabled_hooks.add("str")  # inputs are guided to what `startswith` expects; the hook of re lacks arguments
+atheris.enabled_hooks.add("str")  # guides inputs to what `startswith` expects; the hook for `re` lacks arguments
 with atheris.instrument_imports(include=["nedbus", "nedbus_msgs", "mcap"]):
     from . import parsers
 

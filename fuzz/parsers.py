@@ -50,22 +50,22 @@ MAVLINK_KINDS: Final = (
 )  # fmt: skip
 """Ids of the messages that `frames` makes."""
 MAVLINK_IDS: Final = (SYSTEM, COMPONENT)
-"""System and component of the client of the log stream."""
-_MAX_PIECES: Final = 40  # of a log: feeding single bytes would take too long
+"""System and component id of the log stream's client."""
+_MAX_PIECES: Final = 40  # chunks of a log: feeding single bytes would take too long
 _RAW: Final = 255  # kind of an item: raw bytes without a frame
 _REMOTE: Final = 64  # bit of the kind: from another system
 _LOST: Final = 128  # bit of the kind: one message before this one was lost
 
 
 def parse_ulog(data: bytes) -> int:
-    """Feed a log in pieces, decode its messages and texts; the pieces must not change the records.
+    """Parse a log in chunks and decode its messages and texts; the chunk size must not affect the records.
 
-    The first two bytes are the mode of the parser and the size of the pieces. Returns the number of records.
+    The first two bytes are the mode of the parser and the chunk size. Returns the number of records.
     """
     verify, log = bool(data[:1] > b"\x7f"), data[2:]
     size = max(int.from_bytes(data[1:2], "big") ** 2, len(log) // _MAX_PIECES, 1)
     whole = _records(log, len(log) or 1, verify=verify)
-    assert _plain(_records(log, size, verify=verify)) == _plain(whole), "the records depend on the size of the pieces"
+    assert _plain(_records(log, size, verify=verify)) == _plain(whole), "the records depend on the chunk size"
     streams: dict[ulog.Subscription, ulog.LoggedStream] = {}
     texts = ulog.LogMessageBuilder()
     count = 0
@@ -144,7 +144,7 @@ def parse_cdr(data: bytes) -> int:
 
 
 def parse_msgpack(data: bytes) -> int:
-    """Decode a payload of the message that the first byte selects, in all forms; a valid one survives a round trip.
+    """Decode a payload, of the message selected by the first byte, as model, row and array; a valid one round-trips.
 
     Returns the number of valid messages.
     """
@@ -173,7 +173,7 @@ def parse_msgpack(data: bytes) -> int:
 def parse_mavlink(data: bytes) -> int:
     """Receive frames from a link as the source does, with its log stream. Returns the number of messages.
 
-    The input is that of `frames`; a `LogReceiver` reads it in its thread.
+    The input has the format of `frames`; a `LogReceiver` reads it in its thread.
     """
     options = MavlinkOptions(log=frozenset({"1", "take"}), topics=("*",))
     link: Any = _Link(frames(data))

@@ -103,7 +103,7 @@ def missing_lines(shown: Iterable[str], printed: str) -> list[str]:
 
 
 class Runner:
-    """Run snippets with the vehicles of this test instead of those of the user."""
+    """Run snippets with the vehicles of this test instead of the user's."""
 
     def __init__(self, start: Start, endpoint: str, folder: Path) -> None:
         self._start, self._endpoint, self._folder = start, endpoint, folder
@@ -195,7 +195,7 @@ def runner(start: Start, vehicles: str, snippet_folder: Path) -> Runner:
 
 @pytest.mark.parametrize("block", [each for each in (*SHELLS, *PYTHON) if each.is_run], ids=str)
 def test_snippet_runs(runner: Runner, block: Block) -> None:
-    """Every snippet without a reason not to run ends without an error."""
+    """Every snippet that is not marked `not run` or `run by` ends without an error."""
     runner.run(block)
 
 

@@ -70,7 +70,7 @@ def test_publish_example_moves_its_vehicle(start: Start, endpoint: str, bus: ned
 
 @pytest.mark.slow
 def test_alarm_example_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Path) -> None:
-    """examples/alarm.py waits for the router of the service at its start, and after the service was killed."""
+    """examples/alarm.py waits for the service's router at startup, and again after the service was killed."""
     endpoint = free_endpoint()
     states = ["vehicle 1: good", "vehicle 1: ALARM: nothing arrived for 1 s", "vehicle 1: good"]
 

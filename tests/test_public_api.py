@@ -70,7 +70,7 @@ def annotations_of(public: object) -> typing.Iterator[str]:
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_public_signatures_mention_public_names_only(name: str) -> None:
+def test_public_signatures_mention_only_public_names(name: str) -> None:
     """A script can import every class in a public signature from nedbus or its public modules."""
     for annotation in annotations_of(getattr(PUBLIC[name], name)):
         expression = annotation.removeprefix("<class '").removesuffix("'>")

@@ -22,7 +22,7 @@ def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEA
     """Wait until a condition holds; fail with `what` after the deadline."""
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, f"waited {seconds} s in vain for {what}"
+        assert time.monotonic() < end, f"timed out after {seconds} s waiting for {what}"
         time.sleep(0.01)
 
 

@@ -1,7 +1,7 @@
 """The message that all forms send, as plain Python values, from a real flight in tests/data/flights.json.
 
 The environment variable BENCH_FLIGHT selects the flight. The sender sets `timestamp`; `timestamp_sample` is 0, because
-it must not be later.
+it must not be later than `timestamp`.
 """
 
 import json

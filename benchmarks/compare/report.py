@@ -1,4 +1,4 @@
-"""Output of the results: performance.json, two tables for its page, and four rows for the README."""
+"""Output of the results: performance.json, two tables for its page, and a table for the README."""
 
 from __future__ import annotations
 
@@ -112,8 +112,9 @@ def as_markdown(results: Results, rounds: int) -> str:
         f"The message is one of a real flight, {FLIGHTS[DEFAULT_FLIGHT]['from']}: valid, with no origin and no terrain"
         " estimate.\n\n"
         f"{table(results)}\n\n"
-        "With the messages of other flights: messages/s · the reader's CPU at 1 kHz, of raw; and with ten vehicles at"
-        " 100 Hz in one process: publisher's CPU / reader's CPU / p50, of raw:\n\n"
+        "Messages of other flights: each cell has messages/s · the reader's CPU time at 1 kHz. The last column, ten"
+        " vehicles at 100 Hz in one process, has publisher's CPU time / reader's CPU time / p50 latency. CPU times and"
+        " latencies are relative to `raw` (1.00).\n\n"
         f"{flight_table(results)}"
     )
 

@@ -1,4 +1,4 @@
-"""A plain Zenoh client for the forms without nedbus."""
+"""A plain Zenoh client, for the compared forms that do not use nedbus."""
 
 import json
 from collections.abc import Callable, Mapping

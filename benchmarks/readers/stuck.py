@@ -8,7 +8,7 @@ Vehicle 1 is live at --rate Hz, and the healthy reader always subscribes to it; 
     both    the stuck reader subscribes to vehicle 1, the healthy one to both: the replay continues
     replay  the stuck reader subscribes to vehicle 2, the healthy one to both: the replay waits, vehicle 1 continues
 
-Targets: the healthy reader is without a message of vehicle 1, or of a replay without a stuck reader, for at most 0.2 s;
+Targets: the healthy reader waits at most 0.2 s for a message of vehicle 1, or of a replay that has no stuck reader;
 the stuck reader receives a replay completely and in order, and counts the loss of vehicle 1 exactly.
 """
 

@@ -27,7 +27,7 @@ def make_certificates(folder: Path, *names: str) -> None:
 
 
 def distribute(folder: Path) -> None:
-    """Copy the files of each container to its folder, with the documented shell loop; root makes uid 1000 the owner."""
+    """Copy the files of each container to its folder with the documented loop; if run as root, chown to uid 1000."""
     loop = re.search(r"^for name in .*?^done$", (ROOT / "docs" / "security.md").read_text(), re.DOTALL | re.MULTILINE)
     assert loop is not None
     subprocess.run(["bash", "-e", "-c", loop[0].replace("pki/", f"{folder}/")], check=True, timeout=DEADLINE)
@@ -37,7 +37,7 @@ def distribute(folder: Path) -> None:
 
 
 def join(stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeout: float = DEADLINE) -> nedbus.Bus:
-    """Connect from the host with the certificate `name`, or without any."""
+    """Connect from the host with the certificate `name`; None: without a certificate."""
     own, key = (None, None) if name is None else (pki / f"{name}.crt", pki / f"{name}.key")
     endpoint = f"tls/{stack.address}"
     return nedbus.connect(endpoint, tls=nedbus.Tls(pki / ca, own, key), timeout=timeout)

@@ -22,7 +22,7 @@ DEADLINE = 300.0  # timeout of one Docker command [s]
 
 
 def find_compose() -> list[str]:
-    """Return the command of compose: docker-compose of this environment, or the plugin of docker."""
+    """Return the compose command: docker-compose from this environment or the PATH, or the Docker plugin."""
     local = Path(sys.executable).with_name("docker-compose")
     if local.exists():
         return [str(local)]

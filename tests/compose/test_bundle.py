@@ -1,4 +1,4 @@
-"""Bundles of `nedbus pki enroll`, run with Docker against the secure stack, and `pki renew` and `pki rules`."""
+"""`nedbus pki enroll`, `renew` and `rules`: bundles that run in Docker against the secure stack."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def router_certificate(stack: Stack, pki: Path) -> str:
     return presented.strip()
 
 
-def test_bundles_work_with_the_secure_stack(
+def test_bundle_is_denied_until_access_rules_name_its_vehicle(
     make_stack: StartStack, run_nedbus: Start, secure: Stack, pki: Path, tmp_path: Path, *, record: Record
 ) -> None:
     """A bundle started as in its README.txt is denied until the router's access rules name its vehicle."""

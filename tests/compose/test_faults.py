@@ -36,7 +36,7 @@ def sent(sample: nedbus.Sample) -> int:
 
 
 def test_router_restart_is_recovered(make_stack: StartStack, record: Record) -> None:
-    """Both sides reconnect; mode `every` loses nothing, `latest` continues with the newest, and counts are exact."""
+    """Both sides reconnect; `every` loses nothing, `latest` continues with the newest message, and counts are exact."""
     stack = make_stack("router")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
@@ -110,7 +110,7 @@ def test_link_outage_is_recovered_or_counted(make_stack: StartStack, record: Rec
 
 
 def test_frozen_service_disappears_and_returns(make_stack: StartStack, record: Record) -> None:
-    """The data of a stopped service ages; its vehicle disappears when the lease ends, and returns when it continues."""
+    """The data of a stopped service ages; its vehicle disappears when the lease ends, and returns with the service."""
     stack = make_stack("frozen")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:

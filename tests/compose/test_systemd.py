@@ -176,7 +176,7 @@ def test_reload_starts_and_stops_sources(machine: Machine) -> None:
 
 
 def test_invalid_configuration_is_not_retried(machine: Machine) -> None:
-    """With a mistake in the settings `systemctl start` fails with the reason in the journal, and is not retried."""
+    """With invalid settings `systemctl start` fails with the reason in the journal, and is not retried."""
     configure(machine, "sorce = []\n")
     assert machine.call("systemctl start nedbus").returncode != 0
     assert machine.property("ActiveState") == "failed"
@@ -195,7 +195,7 @@ def test_port_in_use_is_retried(machine: Machine) -> None:
 
 
 def test_template_runs_several_services(machine: Machine) -> None:
-    """Instances of the template unit run several services, each with its settings file."""
+    """Instances of the template unit run several services, each with its own settings file."""
     configure(machine, SIMULATION + 'vehicle = "wing"\nlisten = ["tcp/127.0.0.1:7448"]\n', "wing")
     configure(machine, SIMULATION + 'vehicle = "tail"\nconnect = ["tcp/127.0.0.1:7448"]\n', "tail")
     machine.run("systemctl start nedbus@wing nedbus@tail")

@@ -81,7 +81,7 @@ MANY_EXAMPLES = settings(max_examples=10 * settings().max_examples)
 
 
 def make_valid(fields: dict[str, object]) -> dict[str, object]:
-    """Change fields of the right types to pass every rule."""
+    """Change correctly typed fields so that they pass every rule."""
     for name in NOT_NEGATIVE:
         value = fields[name]
         assert isinstance(value, float)
@@ -102,12 +102,12 @@ def make_valid(fields: dict[str, object]) -> dict[str, object]:
 
 
 def fields() -> st.SearchStrategy[dict[str, object]]:
-    """Return a strategy for the fields of any valid message."""
+    """Return a strategy for the fields of any valid VehicleLocalPosition."""
     return st.fixed_dictionaries({name: TYPES[kind] for name, kind in FIELD_TYPES.items()}).map(make_valid)
 
 
 def messages() -> st.SearchStrategy[VehicleLocalPosition]:
-    """Return a strategy for any valid message."""
+    """Return a strategy for any valid VehicleLocalPosition."""
     return fields().map(VehicleLocalPosition.model_validate)
 
 

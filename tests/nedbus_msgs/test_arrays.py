@@ -112,7 +112,7 @@ def test_decoded_array_is_a_writable_copy(size: int) -> None:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("step", [-1, 2])
 def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> None:
-    """Reversed and strided views are supported."""
+    """Reversed and strided views are encoded and validated like contiguous arrays."""
     payloads = [REAL[index % len(REAL)] for index in range(size * abs(step))]
     view = decode_array(b"".join(payloads))[0][::step]
     assert encode_array(view) == b"".join(payloads[::step])

@@ -38,7 +38,7 @@ EACH_PROPERTY = pytest.mark.parametrize(
 
 
 def test_doubt_flags_are_validity_and_dead_reckoning() -> None:
-    """Flags of global reference, terrain and heading are not included."""
+    """Doubts come from validity and dead reckoning, not from flags of global reference, terrain and heading."""
     assert DOUBT_FLAGS == ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning")
 
 
@@ -134,7 +134,7 @@ def test_global_and_home_position_properties_follow_their_flags() -> None:
      (6, False, True, False)],
 )  # fmt: skip
 def test_gnss_position_requires_a_fix(fix_type: int, flag: bool, has_position: bool, has_velocity: bool) -> None:
-    """Receivers without a fix send zeros or an old position, and may set vel_ned_valid."""
+    """The position requires a 3D fix, the velocity a fix and vel_ned_valid: without a fix, values are zero or old."""
     position = {"latitude_deg": 47.0, "longitude_deg": 8.0, "altitude_msl_m": 400.0}
     velocity = {"vel_n_m_s": 1.0, "vel_e_m_s": 2.0, "vel_d_m_s": 3.0}
     fields: dict[str, Any] = {**position, **velocity, "vel_ned_valid": flag}

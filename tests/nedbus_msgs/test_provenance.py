@@ -12,7 +12,7 @@ from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, pro
 
 @given(st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True), st.sets(st.sampled_from(list(FIELD_TYPES))))
 def test_provenance_round_trip(source: str | None, provided: set[str]) -> None:
-    """Any source and set of fields is encoded and parsed again."""
+    """Any source and set of fields is unchanged after encoding and parsing."""
     encoding = encoding_of(source, frozenset(provided))
     assert encoding.startswith(ENCODING)
     assert provenance_of(encoding) == Provenance(source, frozenset(FIELD_TYPES.keys() - provided))
@@ -32,12 +32,12 @@ def test_encoding_without_missing_fields_has_no_mask() -> None:
     + [f"{ENCODING};missing={mask}" for mask in ("-1", "f" * 15)],
 )
 def test_invalid_parts_of_an_encoding_are_ignored(encoding: str) -> None:
-    """Unknown or invalid parts may come from other programs."""
+    """Unknown or invalid parts, which other programs may send, are ignored."""
     assert provenance_of(encoding) == Provenance()
 
 
 def test_mask_bits_beyond_the_last_field_are_ignored() -> None:
-    """The extra bits may belong to fields of a newer layout."""
+    """Mask bits beyond the last field, which a newer layout may have, are ignored."""
     assert provenance_of(f"{ENCODING};missing={'f' * 14};new=1").missing == FIELD_TYPES.keys()
 
 

@@ -78,7 +78,7 @@ def test_counter_wrap_counts_as_one_reset() -> None:
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """After two resets between two messages, the delta covers only the last one: the track is discontinued."""
+    """After two resets between two messages, the delta covers only the last one, so the track is discontinued."""
     _, second, third = track(
         at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
     )
@@ -95,7 +95,7 @@ def test_reset_without_delta_discontinues_the_track() -> None:
 
 
 def test_backward_timestamp_restarts_the_track() -> None:
-    """After a reboot the vehicle starts a new track."""
+    """A timestamp that steps back, as after a reboot, starts a new track."""
     _, second, third = track(
         at(100, x=5.0), at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)), at(1, x=0.5, xy_reset_counter=0)
     )
@@ -105,7 +105,7 @@ def test_backward_timestamp_restarts_the_track() -> None:
 
 
 def test_delta_without_a_jump_at_a_new_origin_is_ignored() -> None:
-    """When the origin's altitude is set, delta_z is -179.5 m but z moves by 2 mm, as in a real log."""
+    """A delta without a jump is ignored: as in a real log, delta_z is -179.5 m at a new origin, but z moves by 2 mm."""
     first, second = track(
         at(21.574, z=-0.2), at(21.674, z=-0.198, z_reset_counter=1, delta_z=-179.5362, z_global=True, ref_alt=179.5362)
     )
@@ -138,7 +138,7 @@ def test_moved_origin_is_compensated(counted: int) -> None:
 
 
 def test_unexplained_jump_at_a_new_origin_discontinues_the_track() -> None:
-    """A jump explained neither by the delta nor by the origins is kept."""
+    """A jump explained neither by the delta nor by the origins is kept, and discontinues the track."""
     _, second = track(at(1), at(2, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
     assert second.discontinued == {"xy"}
     assert second.x == 500.0

@@ -151,7 +151,7 @@ def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, 
     ],
 )
 def test_invalid_selection_raises(topic: str, vehicle: str, instance: int | None, what: str) -> None:
-    """A typo in a topic, or an impossible instance, must not result in a subscription without messages."""
+    """A misspelled topic or an impossible instance raises, because a subscription to it would receive nothing."""
     with pytest.raises(AddressError, match=what):
         Selection(topic, vehicle, instance)
 

@@ -73,8 +73,8 @@ def test_vectors_cover_each_message_and_type() -> None:
     assert {each["message"] for each in FILE["exact"]} == {*MESSAGES, "WireTypes"}
 
 
-def test_vectors_have_the_golden_bytes() -> None:
-    """The golden bytes of the first version are still vectors."""
+def test_golden_payloads_remain_among_the_vectors() -> None:
+    """The golden payloads of the first version are still among the test vectors."""
     payloads = {each["payload"] for each in FILE["exact"]}
     for name in ("golden.json", "golden_messages.json"):
         assert {each["payload"] for each in json.loads((DATA / name).read_text()).values()} <= payloads
@@ -85,7 +85,7 @@ def test_vectors_have_the_golden_bytes() -> None:
 @pytest.mark.timeout(420)  # packages may be downloaded and compiled
 @pytest.mark.parametrize("tool", COMMANDS)
 def test_program_in_another_language_conforms(tool: str, tmp_path: Path) -> None:
-    """The program decodes and encodes all vectors; skips without its tools, or where packages cannot be installed."""
+    """The program decodes and encodes all vectors; skipped without its tools, or if packages cannot be installed."""
     for path in HERE.glob("vectors.*"):
         shutil.copy(path, tmp_path)
     (tmp_path / "Cargo.toml").write_text(RUST)

@@ -144,7 +144,7 @@ Bytes from_hex(const std::string& hex) {
   return out;
 }
 
-// The values of a definition's fields; a float may be written as an integer.
+// Return whether two values are equal; vectors.json may contain a float without a fraction as an integer.
 bool same(const json& one, const json& other) {
   if (one.is_array()) return std::equal(one.begin(), one.end(), other.begin(), other.end(), same);
   if (one.is_number_float() && other.is_number()) {

@@ -34,7 +34,7 @@ function decodeValue(value, { base, length }) {
 }
 
 export function decodeMessage(message, payload) {
-  // Texts stay bytes, because they may not be UTF-8, and 64-bit integers become BigInt.
+  // Texts stay bytes, because they may be invalid UTF-8; 64-bit integers become BigInt.
   const array = decode(payload, { useBigInt64: true, rawStrings: true });
   const layout = Array.isArray(array) ? array.shift() : undefined;
   if (typeof layout !== "number" && typeof layout !== "bigint") throw new Error("array");

@@ -163,7 +163,7 @@ class Tab:
         return found
 
     def rows(self, name: str) -> list[dict[str, Any]]:
-        """Return the data of that data source as rows."""
+        """Return the data of `source` as rows."""
         columns = self.source(name)
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 

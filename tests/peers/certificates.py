@@ -17,7 +17,7 @@ CONFIG: Final = Path(__file__).parents[2] / "config"
 
 @pytest.fixture(scope="session")
 def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a read-only folder of keys and certificates, valid and invalid."""
+    """Make a folder of valid and invalid certificates with their keys, which tests must not change."""
     folder = tmp_path_factory.getbasetemp() / "pki"
     if folder.is_dir():  # made for another test module
         return folder
@@ -50,7 +50,7 @@ def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
 
 
 def tls_settings(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
-    """Return the TLS settings of a client with the certificate `name`, or without any."""
+    """Return the TLS settings of a client with the certificate `name`; None: without a certificate."""
     own = {} if name is None else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
     return {"tls_ca": pki / ca, **own}
 

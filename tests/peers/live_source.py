@@ -13,7 +13,7 @@ from tests.waits import DEADLINE
 
 
 class Listener:
-    """A listening live source: pending messages, all rejections, and the currently missing topics."""
+    """A listening live source: pending messages, all rejections, and the topics that are currently unavailable."""
 
     def __init__(self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None) -> None:
         source = parse_source(text).open_source(vehicle="1", routers=routers)
@@ -43,7 +43,7 @@ class Listener:
         """Process events until a condition holds."""
         end = time.monotonic() + DEADLINE
         while not condition():
-            assert time.monotonic() < end, f"waited {DEADLINE} s in vain for {what}"
+            assert time.monotonic() < end, f"timed out after {DEADLINE} s waiting for {what}"
             self.step()
 
     def receive(self, count: int = 1) -> list[SourceMessage]:

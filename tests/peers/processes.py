@@ -131,7 +131,7 @@ class Process:
 
 
 def without_coverage() -> dict[str, str]:
-    """Return the environment without coverage, for processes that SIGINT ends: it may interrupt coverage's lock."""
+    """Return the environment without coverage, for processes ended by SIGINT, which may interrupt coverage's lock."""
     return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
 
 

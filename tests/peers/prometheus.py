@@ -61,7 +61,7 @@ class Prometheus:
         return [each for each in firing if {"alertname": name, **labels}.items() <= each.items()]
 
     def annotations(self) -> list[str]:
-        """Return the annotations of all alerts, pending ones included."""
+        """Return the annotations of all alerts, including pending ones."""
         return [text for each in self._get("/api/v1/alerts")["alerts"] for text in each["annotations"].values()]
 
     def query(self, expression: str) -> list[tuple[dict[str, str], float]]:

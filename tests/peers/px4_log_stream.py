@@ -77,7 +77,7 @@ class Entry(NamedTuple):
 class Recording:
     """All messages of the vehicle except replies to the recorded client.
 
-    `start`, `header_end`: times of the recording. `tail`: the messages after STOP.
+    `start`, `header_end`: times in the recording [s]. `tail`: the messages after STOP.
     `clock`: time of the recording [s] and of the vehicle [ns], from answers to TIMESYNC.
     `definitions`: records of topics that appeared in flight, with the index of the entry that completes each.
     """
@@ -107,7 +107,7 @@ def unpack(frame: bytes) -> tuple[int, bytes]:
 
 
 def stream_message(frame: bytes) -> Message | None:
-    """Return the message of the stream in a frame, None for any other."""
+    """Return the stream message in a frame; None for other frames."""
     number, payload = unpack(frame)
     if number not in (_DATA, _ACKED):
         return None
@@ -197,8 +197,8 @@ class Px4LogStream:
     `speed`: factor of real time; None: as fast as the client reads, while `is_ready` returns True.
     `loss`, `burst`: fraction of datagrams to the client that are dropped, and the number dropped in a row.
     `reorder`: fraction of datagrams that arrive up to five datagrams late.
-    `round_trip`: minimum time from a message to its acknowledgement [s]; in real time that of the recordings.
-    `refusal`: MAV_RESULT of every START. `answers`: False: no logger, so no COMMAND_ACK at all.
+    `round_trip`: minimum time from a message to its acknowledgement [s]; default in real time: as recorded.
+    `refusal`: MAV_RESULT of every START. `answers`: whether a logger runs, and sends COMMAND_ACK.
     `unsent`: number of STARTs that are accepted without sending data.
     `owner`: ids of the client that initially owns the stream; `is_owner_on_link`: it is on this link.
     `events`: by time in the recording [s]. `on_send`: called with each frame.
@@ -484,7 +484,7 @@ class Px4LogStream:
         self._transmit(message.pack(self._mav), number)
 
     def _transmit(self, frame: bytes, number: int = 0) -> None:
-        """Send, drop or delay a frame; `number`: count of LOGGING_DATA, from 1, or 0."""
+        """Send, drop or delay a frame; `number`: index of a LOGGING_DATA message, from 1; 0 for other frames."""
         self._release()
         self._frames += 1
         if is_heartbeat(frame):

@@ -24,7 +24,7 @@ from nedbus_msgs import MESSAGES
 ROOT: Final = Path(__file__).parents[2]
 BASELINE: Final = ROOT / "packaging" / "public_api.pyi.txt"
 MODULES: Final = ("nedbus", "nedbus.errors", "nedbus.frames", "nedbus.health", "nedbus_msgs")
-_NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")  # scripts do not make these
+_NOT_MADE: Final = re.compile(r"[Gg]et one from|from `connect|returns one|yields them")  # not created by scripts
 _DECORATORS: Final = ("property", "staticmethod", "classmethod")
 
 
@@ -36,7 +36,7 @@ def main() -> int:
     old = BASELINE.read_text()
     breakages = list(find_breakages(old, describe_api()))
     version = old.split(maxsplit=3)[2].rstrip(",")
-    print("\n".join(breakages) or f"no breaking change of the API of {version}")
+    print("\n".join(breakages) or f"no breaking API change since {version}")
     is_allowed = compatible_range(version) != compatible_range(nedbus.__version__)
     return int(bool(breakages) and not is_allowed)
 
@@ -55,7 +55,7 @@ def describe_api() -> str:
     loader = griffe.GriffeLoader(search_paths=[str(ROOT / "service"), str(ROOT / "schemas")])
     loader.load("nedbus_msgs")
     loader.load("nedbus")
-    logging.getLogger("griffe").setLevel(logging.ERROR)  # it names the packages that were not loaded
+    logging.getLogger("griffe").setLevel(logging.ERROR)  # otherwise it warns of packages that are not loaded
     loader.resolve_aliases(implicit=True)
     lines, seen = [f"# nedbus {nedbus.__version__}, written by `make api-baseline`"], dict[str, str]()
     for module in MODULES:

@@ -43,7 +43,7 @@ def options(endpoint: str) -> dict[str, Any]:
 
 
 def compile_codec(end: ROS2Publisher | ROS2Subscriber) -> None:
-    """Make rosbags generate its code for the type now, not at the first message: it takes 40 ms."""
+    """Make rosbags generate its code for the type now, which takes 40 ms, instead of at the first message."""
     store = end.session_mgr.store
     message = store.types[end.msg_type](**VALUES)
     store.deserialize_cdr(store.serialize_cdr(message, end.msg_type), end.msg_type)

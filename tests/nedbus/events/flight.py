@@ -20,7 +20,7 @@ DISARMED, ARMED = 1, 2
 
 
 class Flight:
-    """A vehicle and its event log; messages arrive when they are sent, and times are seconds."""
+    """A vehicle and its event log; messages arrive without delay, and times are in seconds."""
 
     def __init__(self) -> None:
         self.event_log = EventLog()
@@ -65,7 +65,7 @@ class Flight:
         return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
 
     def update(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
-        """Update the event log with the state of the position stream, None if unknown; return the new events."""
+        """Update the event log with the state of the position stream (None if not observed); return the new events."""
         self.event_log.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
         return self.new_events()
 

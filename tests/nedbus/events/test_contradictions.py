@@ -60,7 +60,7 @@ def test_height_is_contradicted_when_all_references_disagree(flight: Flight) -> 
 
 
 def test_position_is_contradicted_beyond_its_limit(flight: Flight) -> None:
-    """The limit is the sum of 4 m, three times the receiver's accuracy, and the distance flown in 0.5 s."""
+    """A position is contradicted beyond 4 m plus three times the receiver's accuracy plus the distance of 0.5 s."""
     assert fly(flight, 10.0, north=6.9) == []
     assert fly(flight, 10.0, north=12.0, vx=12.0, x=12.0) == []
     assert fly(flight, 10.0, north=30.0, gps={"eph": 9.0}) == []
@@ -86,7 +86,7 @@ def test_position_is_contradicted_beyond_its_limit(flight: Flight) -> None:
          "ref_alt": float("nan")},
     ],
 )  # fmt: skip
-def test_height_is_not_contradicted(flight: Flight, how: dict[str, Any]) -> None:
+def test_height_is_not_contradicted_without_sufficient_evidence(flight: Flight, how: dict[str, Any]) -> None:
     """A height is not contradicted if a reference agrees, the estimate is invalid, or the limit is not exceeded."""
     fly(flight, 2.0)
     reported = fly(flight, 10.0, **{"up": 30.0, **how})
@@ -121,7 +121,7 @@ def test_ground_truth_contradicts_height_and_position(flight: Flight) -> None:
 
 
 def test_contradiction_while_disarmed_is_info() -> None:
-    """A contradiction while disarmed is info, because GNSS receivers are inaccurate indoors."""
+    """A contradiction while disarmed has severity "info", because GNSS receivers are inaccurate indoors."""
     flight = Flight()
     flight.status(DISARMED)
     reported = fly(flight, 10.0, north=50.0)
@@ -130,7 +130,7 @@ def test_contradiction_while_disarmed_is_info() -> None:
 
 
 def test_malformed_air_data_is_ignored(flight: Flight) -> None:
-    """Air data with missing fields or unexpected types is ignored: any publisher can define the message."""
+    """Air data with missing fields or unexpected types is ignored, because any publisher can define the message."""
     for odd in ({}, {"baro_alt_meter": "high"}, {"baro_alt_meter": None, "baro_device_id": (1, 2)}):
         for _ in range(20):
             assert flight.wait(0.5).send("vehicle_air_data", **odd) == []

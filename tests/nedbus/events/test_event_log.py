@@ -56,7 +56,7 @@ def test_conditions_in_first_message_are_not_events() -> None:
 
 @pytest.mark.parametrize("kind", ["xy", "z", "v_xy", "v_z"])
 def test_invalid_flag_begins_and_ends_condition(flight: Flight, kind: str) -> None:
-    """A cleared validity flag is a bad condition until a message sets the flag again."""
+    """A cleared validity flag is a condition of severity "bad" until a message sets the flag again."""
     begun = flight.wait(0.1).send(**dict[str, Any]({f"{kind}_valid": False}))
     assert brief(begun) == [(f"{kind}_invalid", "begin", "bad")]
     ended = flight.wait(2.5).send()
@@ -86,7 +86,7 @@ def test_reboot_is_reported_once(flight: Flight) -> None:
 
 
 def test_stream_resuming_long_after_reboot_is_not_another_reboot(flight: Flight) -> None:
-    """Streams that step back later belong to the same reboot, in any order, and state is kept."""
+    """Streams that step back later, in any order, belong to the same reboot, and the vehicle stays armed."""
     streams: list[Callable[[], list[Event]]] = [flight.send, flight.gps, lambda: flight.status(ARMED)]
     for first in range(3):
         flight.wait(1000.0)
@@ -103,7 +103,7 @@ def test_stream_resuming_long_after_reboot_is_not_another_reboot(flight: Flight)
 
 
 def test_delayed_message_from_before_reboot_is_not_a_reboot(flight: Flight) -> None:
-    """Streams are not ordered relative to each other: a delayed message from before a reboot is not a reboot."""
+    """A delayed message of another stream, from before a reboot, is not a reboot: streams have no common order."""
     flight.gps()
     flight.booted, before = flight.now, flight.booted
     assert brief(flight.wait(0.1).send()) == [("reboot", "once", "bad")]
@@ -121,7 +121,7 @@ def test_reordered_message_is_not_a_reboot(flight: Flight) -> None:
 
 
 def test_silence_is_reported_until_next_position(flight: Flight) -> None:
-    """Silence is dated from the last position, turns into gone without a publisher, and ends with the next position."""
+    """Silence dates from the last position, turns into "gone" without a publisher, and ends with the next position."""
     flight.fly(1)
     last = flight.now
     assert flight.wait(2.0).update() == []
@@ -131,7 +131,7 @@ def test_silence_is_reported_until_next_position(flight: Flight) -> None:
     assert flight.update("stale") == []
     assert brief(flight.wait(1.0).update("gone")) == [("gone", "begin", "bad")]
     assert flight.event_log.state("1", flight.now).since == last
-    assert flight.update("stale") == []  # gone stays gone
+    assert flight.update("stale") == []  # "gone" does not turn back into "silent"
     back = flight.wait(1.0).send()
     assert brief(back) == [("gone", "end", "info")]
     assert back[0].lasted == pytest.approx(6.0)
@@ -139,7 +139,7 @@ def test_silence_is_reported_until_next_position(flight: Flight) -> None:
 
 
 def test_vehicle_without_stream_states_is_silent_after_3_s(flight: Flight) -> None:
-    """Without stream states, a vehicle is silent after 3 s without a position, even if other topics arrive."""
+    """If stream states are not observed, a vehicle is silent after 3 s without a position, whatever else arrives."""
     assert flight.wait(2.9).update(None) == []
     flight.gps()
     assert brief(flight.wait(0.2).update(None)) == [("silent", "begin", "bad")]
@@ -160,7 +160,7 @@ def test_burst_of_losses_is_one_event(flight: Flight) -> None:
 
 
 def test_continuous_loss_is_reported_every_20_s(flight: Flight) -> None:
-    """Continuous losses are reported every 20 s, and the state stays watch."""
+    """Continuous losses are reported every 20 s, and the state stays "watch"."""
     reported = []
     for second in range(100):
         flight.wait(1.0).send(lost=1)
@@ -265,7 +265,7 @@ def test_overload_is_evidence_for_loss(flight: Flight) -> None:
 
 
 def test_battery_warning_is_a_condition(flight: Flight) -> None:
-    """A low battery is watch and a critical one bad; a warning is active until the field `warning` is 0."""
+    """A low battery has severity "watch", a critical one "bad"; a warning is active until `warning` is 0."""
     assert flight.wait(1.0).battery(0) == []
     assert brief(flight.wait(1.0).battery(1)) == [("battery", "begin", "watch")]
     critical = flight.wait(1.0).battery(2)
@@ -300,15 +300,15 @@ def test_gps_conditions_have_hysteresis(flight: Flight) -> None:
     assert brief(flight.gps(spoofing_state=1)) == [("spoofing", "end", "info")]
 
 
-def test_missing_first_fix_is_info(flight: Flight) -> None:
-    """A missing fix in the first message is info without an event; the first fix is an event."""
+def test_no_fix_in_the_first_message_is_info(flight: Flight) -> None:
+    """A missing fix in the first message has severity "info" and causes no event; the first fix is an event."""
     assert flight.gps(fix_type=0, satellites_used=0) == []
     assert flight.severity == "info"
     assert brief(flight.gps()) == [("gps_fix_lost", "end", "info"), ("few_satellites", "end", "info")]
 
 
 def test_flags_changed_in_one_message_are_one_event(flight: Flight) -> None:
-    """Equal flag changes in one message are one event that names them; each flag ends separately."""
+    """Flags of one kind that are set in one message are one event that names them; each flag ends separately."""
     names = ["reject_hor_pos", "reject_hor_vel", "fs_bad_hdg", "cs_baro_fault", "cs_gnss_pos", "cs_baro_hgt"]
 
     def send(**changed: Any) -> list[Event]:
@@ -333,7 +333,7 @@ def test_flags_changed_in_one_message_are_one_event(flight: Flight) -> None:
 
 
 def test_missing_fix_and_reference_are_conditions_only_once_armed() -> None:
-    """In an armed vehicle, a fix or global reference missing since the first message is a condition since then."""
+    """A fix or global reference that is still missing after arming is a condition since the first message."""
     flight, since = Flight(), 100.0
     assert flight.gps(fix_type=0, satellites_used=0) == flight.send(xy_global=False) == []
     assert flight.wait(1.0).status(DISARMED) == []
@@ -379,7 +379,7 @@ def test_flag_labels_are_words_not_field_names() -> None:
 
 
 def test_gcs_loss_is_info_while_disarmed(flight: Flight) -> None:
-    """A lost GCS connection is info while the vehicle is disarmed, and watch while it is armed."""
+    """A lost GCS connection has severity "info" while the vehicle is disarmed, and "watch" while it is armed."""
     flight.status(DISARMED, gcs_connection_lost=False)
     assert brief(flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)) == [("gcs_lost", "begin", "info")]
     assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [("armed", "once", "info")]
@@ -443,7 +443,7 @@ def test_second_receiver_and_battery_are_ignored(flight: Flight) -> None:
 
 
 def test_new_timestamp_alone_does_not_move_origin() -> None:
-    """An origin is set once, and moves by at least 1 cm; a new ref_timestamp alone is ignored."""
+    """The origin is set once; later changes of less than 1 cm, or of ref_timestamp alone, are not events."""
     flight = Flight()
     flight.send(xy_global=False, z_global=False)
     origin: dict[str, Any] = {
@@ -515,7 +515,10 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
 def test_reset_size_is_delta_or_observed_step(
     flight: Flight, seconds: float, fields: dict[str, Any], size: str
 ) -> None:
-    """The size is the delta if both samples agree with it, else their difference minus motion if close in time."""
+    """The size of a reset is its delta if the samples before and after it agree with the delta.
+
+    Otherwise it is their difference minus the motion, or unknown if they are too far apart in time.
+    """
     reset = next(each for each in flight.wait(seconds).send(**fields) if each.kind == "reset")
     assert reset.text == f"reset of {size}"
 
@@ -554,7 +557,7 @@ def test_flapping_combinations_of_flags_are_suppressed(flight: Flight) -> None:
 
 
 def test_flapping_of_one_kind_does_not_suppress_another(flight: Flight) -> None:
-    """Changes are counted separately for each kind."""
+    """Changes are counted separately for each kind, so flapping of one kind does not suppress another."""
     for index in range(20):
         flight.wait(0.1).send(xy_valid=index % 2 == 1)
     assert brief(flight.wait(0.1).send(z_valid=False)) == [("z_invalid", "begin", "bad")]
@@ -607,7 +610,7 @@ def test_evidence_is_not_nested(flight: Flight) -> None:
 
 
 def test_state_lists_the_worst_condition_first(flight: Flight) -> None:
-    """Bad conditions precede watch conditions, and a single watch event affects the state for a minute."""
+    """Conditions of severity "bad" precede "watch"; a single "watch" event affects the state for a minute."""
     flight.wait(0.1).send(xy_reset_counter=1, delta_xy=(5.0, 0.0), x=5.0)
     assert (flight.severity, flight.kinds) == ("watch", ["reset"])
     flight.gps()

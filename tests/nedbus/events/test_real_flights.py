@@ -34,7 +34,7 @@ NOT_IN_TABLE: Final = (
 )  # fmt: skip
 RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # PX4 1.15 name: current name
 
-pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there")]
+pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} does not exist")]
 
 
 def path_of(name: str) -> Path:
@@ -173,7 +173,7 @@ def test_healthy_flight_has_no_story() -> None:
 
 
 def test_flight_without_gnss_has_one_story() -> None:
-    """A flight without GNSS has one story of severity watch: no fix and no global reference since the first message."""
+    """A flight without GNSS has one "watch" story: no fix and no global reference since the first message."""
     (only,) = why("cuav_1.16_gps_interference")
     assert (only.begin, only.until, only.is_bad) == (None, None, False)
     assert only.what == "no GPS fix, 0 satellites; xy has no global reference; z has no global reference"
@@ -195,8 +195,8 @@ def test_never_valid_estimate_has_one_story(name: str, lacking: tuple[str, ...])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_only_fix_reference_or_position_is_missing_for_a_whole_flight(name: str) -> None:
-    """The only conditions that last a whole flight are a missing fix, global reference or valid position."""
+def test_conditions_that_last_a_whole_flight(name: str) -> None:
+    """Of watch and bad conditions, only no fix, no global reference and invalid estimates last a whole flight."""
     vehicle = cached_events(name).event_log.vehicles["1"]
     held = {each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"}
     not_global = {"xy has no global reference", "z has no global reference"}
@@ -264,8 +264,8 @@ def test_primary_ekf_changes_are_events() -> None:
 def test_only_one_log_has_a_contradicted_estimate(name: str) -> None:
     """Only one log has a contradicted estimate: height 27 m below GNSS and barometer, and position 6 to 9 m off.
 
-    In the other logs no valid estimate is off by enough for long enough: 92 m for half a second in twelve_messages,
-    3 m in gps_loss, and from the barometer alone 16 m in fast flight and 6 m at takeoff.
+    In the other logs no valid estimate exceeds the limit for long enough: it is off by 92 m for half a second in
+    twelve_messages, by 3 m in gps_loss, and from the barometer alone by 16 m in fast flight and 6 m at takeoff.
     """
     events = [each for each in events_in(name) if each.kind.endswith("_contradicted")]
     right = [
@@ -358,7 +358,7 @@ def test_verdict_names_contradicted_height() -> None:
 
 
 def test_vehicle_with_vision_is_usable_without_gps() -> None:
-    """The vehicle is usable with vision, but without fix and global reference throughout."""
+    """A vehicle with vision is usable, although it has no GPS fix or global reference for the whole flight."""
     found = verdict(path_of("cuav_1.16_gps_interference"))
     assert found.usable is True
     text = (
@@ -386,7 +386,7 @@ def test_state_and_verdict_name_the_same_cause(name: str) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(LOGS.parent.rglob("*.ulg")), ids=lambda path: path.stem)
-def test_verdict_has_three_lines(path: Path) -> None:
+def test_verdict_has_at_most_three_lines(path: Path) -> None:
     """A verdict has at most three lines; on a healthy flight it is just "no faults"."""
     text = verdict(path).text
     assert len(textwrap.wrap(f"1: {text}", 100, subsequent_indent="   ")) <= 3

@@ -78,7 +78,7 @@ def test_report_json_round_trip() -> None:
     assert [(each.text, each.initial) for each in vehicle.held] == [("z not valid", True)]
 
 
-def test_story_from_report_equals_that_of_service() -> None:
+def test_story_from_report_equals_story_of_service() -> None:
     """A story from a report equals the service's own story, even for conditions older than all events."""
     flight = flying(xy_valid=False)
     for within in (1e9, 0.0):
@@ -231,7 +231,7 @@ def test_vehicle_received_by_one_service_is_not_missing() -> None:
 
 
 def test_missing_vehicles_are_faults() -> None:
-    """Missing vehicles are faults, by name or by number; vehicles published by scripts count as present."""
+    """A missing vehicle is a fault, whether expected by name or by count; one published by a script is present."""
     one = report(flying())
     assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
@@ -270,7 +270,7 @@ def test_vehicle_without_position_fails_validity_check() -> None:
 
 
 def test_recent_events_are_faults() -> None:
-    """Events of severity bad or watch within the period are faults; info is not."""
+    """Events of severity "bad" or "watch" within the period are faults; "info" events are not."""
     flight = flying(xy_valid=False)
     flight.wait(1.0).send()
     lines = faults_of([report(flight)], Expectation(within=60.0))

@@ -88,7 +88,7 @@ def test_end_of_one_fault_does_not_end_another() -> None:
 
 
 def test_watch_condition_is_a_story_if_none_is_bad() -> None:
-    """A watch condition is a story if no condition is bad, or if `at` selects its time."""
+    """A "watch" condition is a story if no condition is "bad", or if `at` selects its time."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -106,7 +106,7 @@ def test_watch_condition_is_a_story_if_none_is_bad() -> None:
 
 
 def test_active_watch_condition_is_a_story_after_ended_fault() -> None:
-    """A watch condition that is active now is a story, even after a bad condition that has ended."""
+    """A "watch" condition that is active now is a story, even after a "bad" condition that has ended."""
     flight = Flight()
     lose_gps(flight)
     recover(flight)
@@ -172,7 +172,7 @@ def test_invalid_time_raises(text: str) -> None:
 
 
 def test_unavailable_clock_raises() -> None:
-    """A time on a clock that no message contains raises; a log without UTC uses seconds since boot."""
+    """Parsing a time raises if no message has its clock; a log without UTC uses seconds since boot."""
     times, event = Times(), event_at(40.0, boot=100.0)
     assert (times.clock(event), times.text(event), times.utc(event)) == ("boot", "100.000", None)
     assert times.find("99", event) == 39.0
@@ -196,8 +196,8 @@ def test_event_without_boot_time_is_relative_to_start() -> None:
     assert Times().find(Times().text(event), event) == 40.0
 
 
-def test_unix_time_since_boot_is_utc() -> None:
-    """A time since boot that is a Unix time, as in the simulator, is shown as UTC."""
+def test_timestamp_in_unix_time_is_shown_as_utc() -> None:
+    """A timestamp that is Unix time, as from a simulator, is shown as UTC."""
     event = event_at(1.0, boot=EVENING)
     assert (Times().clock(event), Times().text(event)) == ("vehicle", "23:59:50.0")
 

@@ -113,7 +113,7 @@ def test_reboot_ends_initial_condition(vehicle: SimpleVehicle) -> None:
 
 
 def test_info_condition_on_ground_becomes_watch_when_armed(vehicle: SimpleVehicle) -> None:
-    """A GCS connection lost while disarmed is watch once the vehicle is armed."""
+    """A GCS connection lost while disarmed has severity "watch" once the vehicle is armed."""
     status = {"arming_state": 1, "nav_state": 4, "failsafe": False}
     vehicle.send(0.0, "vehicle_status", **status, gcs_connection_lost=False)
     vehicle.send(1.0, "vehicle_status", **status, gcs_connection_lost=True)
@@ -132,8 +132,8 @@ def test_jamming_in_first_message_is_a_condition(vehicle: SimpleVehicle) -> None
     assert other.state(0.0) == "info"
 
 
-def test_condition_of_whole_recording_is_state_at_any_time(vehicle: SimpleVehicle) -> None:
-    """A vehicle that is never valid in a recording is bad at any time, as in live data."""
+def test_condition_active_throughout_a_recording_is_in_every_state(vehicle: SimpleVehicle) -> None:
+    """A vehicle whose position is never valid in a recording has state "bad" at any time in it, as in live data."""
     for second in range(5):
         vehicle.send(float(second), xy_valid=False)
     state = state_at(spans_of(list(vehicle.event_log.events), vehicle.event_log.vehicles["1"].initial), 3.0)
@@ -199,7 +199,7 @@ def test_logging_dropout_is_not_silence(vehicle: SimpleVehicle) -> None:
 
 
 def test_only_primary_ekf_has_conditions(vehicle: SimpleVehicle) -> None:
-    """Faults of an EKF that is not primary are not conditions; faults of a former primary EKF end."""
+    """Only faults of the primary EKF are conditions; they end when another EKF becomes primary."""
     for primary, faulty in ((1, 0), (0, 0), (1, 1)):
         for time in (0.0, 1.0):
             vehicle.send(time, "estimator_selector_status", primary_instance=primary)
@@ -222,7 +222,7 @@ def test_only_primary_ekf_has_conditions(vehicle: SimpleVehicle) -> None:
 
 
 def test_fault_of_other_ekf_is_info_with_its_instance(vehicle: SimpleVehicle) -> None:
-    """A fault of an EKF that is not primary is info and no evidence; it is a fault once that EKF becomes primary."""
+    """A fault of a non-primary EKF has severity "info" and is no evidence; once the EKF is primary, it is a fault."""
     for time, primary, rejects in ((0.0, 0, False), (1.0, 0, True), (2.0, 1, True), (3.0, 0, True)):
         vehicle.send(time, "estimator_status_flags", 1, reject_hor_pos=rejects)
         vehicle.send(time, "estimator_selector_status", primary_instance=primary)

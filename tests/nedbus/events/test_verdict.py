@@ -70,7 +70,7 @@ def test_verdict_reports_absence_of_faults() -> None:
 
 
 def test_verdict_without_validity_flags_is_unknown() -> None:
-    """With a position without validity flags, as from ArduPilot, `usable` is None."""
+    """For a position without validity flags, as from ArduPilot, `usable` is None."""
     flight = Flight()
     for _ in range(5):
         flight.wait(0.1).send(missing=("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
@@ -80,7 +80,7 @@ def test_verdict_without_validity_flags_is_unknown() -> None:
 
 
 def test_watch_condition_leaves_vehicle_usable() -> None:
-    """A vehicle with a condition of severity watch stays usable."""
+    """A vehicle with a condition of severity "watch" stays usable."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -220,7 +220,7 @@ def test_verdict_is_limited_to_vehicle_and_time() -> None:
 
 
 def test_verdict_on_never_valid_vehicle_quotes_px4() -> None:
-    """The most severe text during a fault since the first message is evidence, however late it appears."""
+    """If a fault is active since the first message, PX4's most severe text is evidence, however late it appears."""
     flight = Flight()
     flight.send(xy_valid=False)
     px4_text(flight, "Preflight Fail: GPS Vertical Pos Drift too high", 4)

@@ -70,7 +70,7 @@ def test_method_last_never_uses_future_messages() -> None:
 
 
 def test_method_nearest_may_use_future_messages() -> None:
-    """With method "nearest" a later message has a negative age; the earlier of two equally near ones is used."""
+    """With method "nearest" a later message has a negative age; of two equally near messages the earlier is used."""
     table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
     assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
     assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
@@ -130,7 +130,7 @@ def test_floats_are_not_interpolated_across_a_reset() -> None:
 
 
 def test_fields_select_the_columns() -> None:
-    """`stream.field` selects one column, `field` one of every stream; time columns remain; unknown fields raise."""
+    """`stream.field` selects one column, `field` one column per stream; time columns remain; unknown fields raise."""
     flight = {VLP: POSITIONS, "home_position": HOME}
     table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
     assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
@@ -173,7 +173,7 @@ def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
 
 
 def test_streams_on_different_clocks_raise() -> None:
-    """Streams with Unix time and time since boot raise; the error names both and the remedy."""
+    """Aligning a stream in Unix time with one in time since boot raises; the error names both and the remedy."""
     unix = array_of(VLP, {"timestamp": BOOT}, {"timestamp": BOOT + 1_000_000})
     with pytest.raises(
         ArgumentError, match=f"home_position begins at 1 s, {VLP} ends at 1700000001 s: expected topics on one"
@@ -285,7 +285,7 @@ def test_utc_comes_from_gnss_then_companion_clock() -> None:
 
 
 def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:
-    """The last samples of a live vehicle are enough to derive its UTC; without a date it is None."""
+    """The last samples of a live vehicle are enough to derive its UTC; without a GNSS time the result is None."""
     for vehicle, utc in (("7", 1_700_000_000_000_000), ("8", 0)):
         gps = bus.publisher("sensor_gps", vehicle=vehicle, instance=1)
         gps.publish({"timestamp": 5_000_000, "time_utc_usec": utc})

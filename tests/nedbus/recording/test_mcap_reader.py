@@ -1,4 +1,4 @@
-"""Files of other MCAP writers and `ros2 bag record`, and files in unsupported formats."""
+"""Files from `ros2 bag record` and other MCAP writers, and files in unsupported formats."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def add_in_middle(payload: bytes) -> bytes:
 
 @pytest.mark.parametrize("where", ["end", "middle"])
 def test_fields_unknown_to_px4_are_skipped_and_listed(tmp_path: Path, where: str) -> None:
-    """Additional fields in the file's definition are skipped, wherever they are; no message is lost."""
+    """Additional fields in the file's definition, wherever they are, are skipped and listed; no message is lost."""
     text, own = message_definition("1.16"), "float32 wind_north\nfloat32 wind_east\n"
     if where == "end":
         path = write_bag(
@@ -150,7 +150,7 @@ def test_all_variants_of_mcap_are_read_completely(
     """
     path = tmp_path / "a.mcap"
     has_padding = False
-    # The package skips bytes after known fields only outside of chunks, and finds a footer by its length.
+    # The mcap package skips bytes after known fields only outside of chunks, and finds a footer by its length.
     exact = {Opcode.MESSAGE, Opcode.FOOTER} | ({Opcode.SCHEMA, Opcode.CHANNEL} if form else set())
     finish: Callable[[RecordBuilder], None] = RecordBuilder.finish_record
 
@@ -267,7 +267,7 @@ def test_recording_without_readable_messages_raises(
 
 
 def test_bag_with_compressed_messages_is_read(tmp_path: Path) -> None:
-    """A bag of `ros2 bag record --compression-mode message`, which compresses each payload, is read."""
+    """A bag from `ros2 bag record --compression-mode message`, which compresses each payload, is read."""
     assert_complete(write_bag(tmp_path / "a.mcap", change=zstandard.compress))
 
 
@@ -307,7 +307,7 @@ def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
 
 
 def test_compressed_recording_is_read(tmp_path: Path) -> None:
-    """A file of `--compression-mode file`, compressed as a whole, is read up to the first damage or a size limit."""
+    """A file from `ros2 bag record --compression-mode file` is read up to the first damage or a size limit."""
     path = tmp_path / "a.mcap.zstd"
     data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
     path.write_bytes(data)
@@ -329,6 +329,6 @@ def test_compressed_recording_is_read(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_files_from_user_reports_are_read_completely(name: str) -> None:
-    """Files written by rosbags and mcap have ten messages each, x = 0 to 9."""
+    """Files written by the libraries rosbags and mcap have ten messages each, x = 0 to 9."""
     assert nedbus.read(CASES / name)["x"].tolist() == list(range(10))
     assert nedbus.read(CASES / name, VLP)["timestamp"].size == 10

@@ -49,7 +49,7 @@ def drawn(
 
 
 def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) -> Event:
-    """Return an event of the flight of `flight_of`."""
+    """Return an event of the flight that `flight_of` returns."""
     return Event("7", kind, change, severity, fields.pop("text", kind.replace("_", " ")), boot - 1.0, boot, **fields)
 
 

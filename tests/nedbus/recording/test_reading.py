@@ -1,4 +1,4 @@
-"""Logs and recordings as arrays, data frames and plots, and the scripts of the docs."""
+"""Logs and recordings as arrays, data frames and plots, and the scripts in the docs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.peers.command_line import run_command
 
 from .test_alignment import array_of, write
 
-# pandas, polars and matplotlib take a second to import, so only the tests that need them do.
+# pandas, polars and matplotlib take a second to import, so only the tests that need them import them.
 
 DOCS = Path(__file__).parents[3] / "docs"
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")  # of the streams in a plot, in order
@@ -90,7 +90,7 @@ def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
 
 
 def test_ambiguous_selection_names_the_missing_argument(tmp_path: Path) -> None:
-    """The error names the argument that is missing or wrong: vehicle, topic or instance."""
+    """The error for a selection names the argument that is missing or wrong: vehicle, topic or instance."""
     path = tmp_path / "a.mcap"
     addresses = [Address(str(vehicle), VLP) for vehicle in range(1, 14)]
     addresses += [Address("99", "estimator_local_position", instance) for instance in (0, 1)]
@@ -272,7 +272,7 @@ def test_missing_fields_are_listed(tmp_path: Path) -> None:
 
 
 def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
-    """With two sources of one vehicle, a field that one lacks is null only in its messages."""
+    """If one of a vehicle's two sources lacks a field, the field is null only in the messages of that source."""
     path = tmp_path / "a.mcap"
     array = to_array([message(1, eph=1.0), message(2, eph=2.0)])
     without = Provenance("mavlink", frozenset({"dead_reckoning", "delta_xy", "eph"}))
@@ -286,8 +286,8 @@ def test_fields_missing_in_some_messages_are_null_there(tmp_path: Path) -> None:
     assert in_polars["eph"].to_list() == [1.0, None]
 
 
-def test_names_and_scripts_in_the_docs_work(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names in docs/data.md and docs/recordings.md exist in `nedbus`, and the scripts of the latter run."""
+def test_names_in_the_docs_exist_and_scripts_run(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names in docs/data.md and docs/recordings.md exist in `nedbus`; the scripts in docs/recordings.md run."""
     data, recordings = ((DOCS / name).read_text() for name in ("data.md", "recordings.md"))
     names = set(re.findall(r"\bnedbus\.([A-Za-z]\w*)", re.sub(r"nedbus\.toml", "", data + recordings)))
     names |= set(re.findall(r"`(\w+_to_\w+)`", data))

@@ -42,7 +42,7 @@ ADDRESS = Address("7", VLP)
 
 
 def read_independently(path: Path) -> list[tuple[str, int, int, Any]]:
-    """Read with the mcap package and decode with rosbags by the definition in the file, without code of nedbus."""
+    """Read with the mcap package and decode with rosbags by the definition in the file, without nedbus code."""
     store = get_typestore(Stores.EMPTY)
     found = []
     with path.open("rb") as file:
@@ -78,7 +78,7 @@ def test_independent_reader_decodes_every_field(tmp_path: Path) -> None:
 def test_replay_of_a_recording_is_bit_exact(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
-    """A recording replays the same messages as those on the bus, with the same missing fields."""
+    """A replay publishes exactly the messages that were recorded from the bus, with the same missing fields."""
     messages = list(open_replay("sim:?duration=1&topics=VehicleLocalPosition").messages)
     path = tmp_path / "flight.mcap"
     publishers = {
@@ -205,7 +205,7 @@ def test_file_without_messages_raises(tmp_path: Path, content: bytes | None, rea
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_ros2_bag_is_replayed(tmp_path: Path, layout: str) -> None:
-    """A file of `ros2 bag record` in any layout of px4_msgs is replayed; other topics are ignored.
+    """A file from `ros2 bag record` in any layout of px4_msgs is replayed; other topics are ignored.
 
     A channel with an unsupported encoding is skipped with a warning.
     """
@@ -373,7 +373,7 @@ def test_recording_without_messages_warns_and_removes_the_file(
 ) -> None:
     """Without messages a notice is printed after 2 s; at the end the empty file is removed, with exit code 1.
 
-    The recorder starts after the notice, because its duration might end before it.
+    The recorder starts after the notice, because its duration might otherwise end before the notice.
     """
     path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
 

@@ -78,7 +78,7 @@ def test_commands_in_the_docs_run(swarm: list[str], monkeypatch: pytest.MonkeyPa
 
 
 def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
-    """The gap between two flights of a vehicle does not matter."""
+    """Two flights of a vehicle, years apart, are read together under different names."""
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
     second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
     event_log = read_file_events(first, second)
@@ -116,7 +116,7 @@ def test_several_files_are_read_and_aligned_in_utc(swarm: list[str]) -> None:
 
 
 def test_page_shows_several_files(swarm: list[str]) -> None:
-    """A playback has the vehicles of all files, aligned in UTC."""
+    """A playback of several files has all of their vehicles, aligned in UTC."""
     recording = Recording(*map(Path, swarm))
     wait_for(lambda: recording.is_read, what="the files")
     assert recording.name == "a 1.ulg, b.ulg, c.ulg"

@@ -79,7 +79,7 @@ def test_log_without_release_is_converted_without_warning(tmp_path: Path) -> Non
 
 
 def test_end_of_fake_position_fusion_is_the_cause() -> None:
-    """Fake position fusion ends at 154.1 s, no other fusion begins before 160.4 s: xy is invalid from 154.3 s."""
+    """Fake position fusion ends at 154.1 s and no other begins before 160.4 s, so xy is invalid from 154.3 s."""
     lines = run_command("events", str(CASES / "15b_ekf_aiding_lost.ulg")).out.splitlines()
     (invalid,) = (line for line in lines if "BAD    xy not valid" in line)
     assert invalid.startswith("   154.300")
@@ -104,7 +104,7 @@ def test_unreadable_file_raises_with_the_reason(name: str, reason: str) -> None:
     "name", ["Bom", "BomCrlf", "DefaultValue", "FormFeed", "Latin1", "LineSep", "Nel", "StringConst"]
 )
 def test_msg_file_variants_are_read(name: str) -> None:
-    """The .msg files that rosbags reads are read, and also files with a BOM, which rosbags rejects."""
+    """All .msg files that the library rosbags reads are accepted, as are files with a BOM, which it rejects."""
     source: Any = parse_source(f"px4-zenoh:?msg={CASES / '43_msg_files' / name}.msg").open_source(vehicle="1")
     ((definition,),) = (each.values() for each in source._supplied.values())
     assert [*definition.types][:3] == ["timestamp", "angle", "mode"]

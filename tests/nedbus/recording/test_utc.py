@@ -24,8 +24,8 @@ INPUTS: Final = DATA / "fmu_in_topics.mcap"
     ("path", "utc", "source"),
     [(UNIX, "2025-10-09 08:53:19.997000", "timestamp"), (BOOT, "2025-09-08 13:31:04", "boot_time_utc_us")],
 )
-def test_utc_of_align_and_events_agree(path: Path, utc: str, source: str) -> None:
-    """`utc_of`, `align` and events have the same UTC, for Unix timestamps and for a log with its boot time."""
+def test_utc_of_a_recording_is_the_same_everywhere(path: Path, utc: str, source: str) -> None:
+    """`utc_of`, `align` and events give the same UTC, from Unix timestamps or from the boot time in a log."""
     found = nedbus.utc_of(path)
     assert found is not None
     first = nedbus.read(path)["timestamp"][0]

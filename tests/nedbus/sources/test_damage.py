@@ -365,7 +365,7 @@ def test_commands_read_undamaged_part_and_exit_1(tmp_path: Path) -> None:
 
 
 def test_damaged_chunk_of_converted_flight_is_small(tmp_path: Path) -> None:
-    """`convert` writes small chunks, so one damaged chunk loses less than a fifth of 30 s."""
+    """`convert` writes small chunks, so one damaged chunk loses less than a fifth of a flight of 30 s."""
     path = tmp_path / "a.mcap"
     convert_replay("sim:?duration=30", path)
     with RecordingReader(path, vehicle="1") as reader:
@@ -412,7 +412,7 @@ INVALID = {
 
 @pytest.mark.parametrize("invalid", INVALID.values(), ids=INVALID)
 def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: pytest.LogCaptureFixture) -> None:
-    """The message is rejected with its position, and counted; the others are replayed, converted and read."""
+    """An undecodable message is rejected with its position, and counted; the others are replayed and read."""
     path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), invalid, payload(3)])
     run = open_replay(f"mcap:{path}")
     messages = list(run.messages)
@@ -426,7 +426,7 @@ def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: 
 
 
 def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
-    """The replay is not restarted: the following messages are published once, and the exit code is 0."""
+    """An undecodable message does not restart the replay: later messages are published once; the exit code is 0."""
     path = write_payloads(tmp_path / "a.mcap", [payload(1), BAD_BOOL, payload(2)])
     service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
     assert service.exit_code == 0, service.err

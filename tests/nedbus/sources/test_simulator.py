@@ -82,7 +82,7 @@ def test_same_seed_yields_identical_flight() -> None:
 
 @pytest.mark.parametrize("topic", ["vehicle_local_position", "estimator_local_position", "vehicle_attitude", "*"])
 def test_selected_topics_equal_those_of_whole_flight(topic: str) -> None:
-    """A selection of topics has exactly the messages that they have in the whole flight."""
+    """A flight of selected topics has exactly the messages of these topics in the whole flight."""
     whole, chosen = encoded("?duration=18"), encoded(f"?duration=18&topics={topic}")
     assert chosen == [each for each in whole if topic in ("*", each[1].split("/")[1])]
 
@@ -208,7 +208,7 @@ def test_attitude_is_consistent_with_estimate(
 def test_global_position_matches_local_position(
     streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
 ) -> None:
-    """The global position is the projected local position, and valid whenever that is valid."""
+    """The global position is the projected local position, and is valid whenever the local position is."""
     estimates = {message.timestamp: message for message in streams[VLP]}
     assert others["vehicle_global_position"][0].timestamp == 12_000_000  # the origin is known
     for message in others["vehicle_global_position"]:
@@ -248,7 +248,7 @@ def test_status_and_gps_are_consistent_with_outage(
 
 
 def test_battery_home_and_land_detection_are_consistent(others: dict[str, list[Any]]) -> None:
-    """The battery discharges, home is sent at the start and with the origin, and the vehicle takes off once."""
+    """The battery discharges, home_position is sent at the start and with the origin; the vehicle takes off once."""
     batteries = others["battery_status/0"]
     assert all(after.remaining < before.remaining for before, after in itertools.pairwise(batteries))
     assert all(0.8 < each.remaining <= 1 and 14 < each.voltage_v < 17 for each in batteries)

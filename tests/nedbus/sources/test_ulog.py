@@ -1,4 +1,4 @@
-"""Replay of flight logs: all topics and instances, old layouts, damage of every kind."""
+"""Replay of flight logs: all topics and instances, old layouts, every kind of damage."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_bool_other_than_0_or_1_is_rejected(tmp_path: Path) -> None:
 
 
 def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> None:
-    """A topic without instances has one stream per vehicle; there is a warning."""
+    """A topic without instances has one stream per vehicle: a second instance is skipped, with a warning."""
     writer = UlogWriter()
     writer.define([VLP])
     writer.add(VLP, message(1, x=1.0))
@@ -262,7 +262,7 @@ def test_field_of_another_type_is_converted(tmp_path: Path) -> None:
 
 
 def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
-    """The field is left out of its message, and logged once with a value; the rest of the message is read."""
+    """A field whose value does not fit is left out of its message, and logged once; the rest is read."""
     path = write_old_log(tmp_path / "a.ulg", [6, -1, 256, 7], temperature=0.1)
     run = open_log(path, "?topics=*")
     batteries = [each.fields for each in run.messages if each.address.topic == "battery_status"]
@@ -278,7 +278,7 @@ def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
 
 
 def test_old_log_without_release_is_not_reported_as_damaged(tmp_path: Path) -> None:
-    """The log is converted with exit code 0, and its mode change is reported as an event."""
+    """A log without a release is converted with exit code 0, and its mode change is reported as an event."""
     path = write_old_log(tmp_path / "a.ulg", [6])
     converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)
@@ -299,7 +299,7 @@ def test_dropout_is_an_event(tmp_path: Path) -> None:
 
 
 def test_event_before_the_first_timestamp_has_a_time_since_boot(tmp_path: Path) -> None:
-    """Rejections begin and end on one clock, even if the first messages have no timestamp."""
+    """Even if the first messages have no timestamp, the times at which rejections begin and end are since boot."""
     writer = UlogWriter()
     writer.define([VLP])
     for time in (0, 0, *range(100_000_000, 108_000_000, 100_000)):

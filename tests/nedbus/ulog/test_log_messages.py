@@ -97,7 +97,7 @@ class Log(UlogWriter):
 @pytest.mark.logs
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
 def test_real_log_yields_each_string_and_event_once(path: Path) -> None:
-    """Each event that pyulog finds, and each string without an event, is one message; all others are failed checks."""
+    """Each event that pyulog finds and each string without an event is one message; the others are failed checks."""
     log = ULog(str(path))
     logged = [*log.logged_messages, *(each for tagged in log.logged_messages_tagged.values() for each in tagged)]
     has_metadata = "metadata_events" in log.msg_info_multiple_dict
@@ -130,7 +130,7 @@ CHECKS = {
 
 
 def test_string_that_duplicates_an_event_is_dropped() -> None:
-    """A logged string with a trailing tab duplicates the event before it; other strings become messages."""
+    """A logged string with a trailing tab is dropped if its event precedes it; other strings become messages."""
     log = Log()
     log.event(5_000_000, 1, b"\2", twice=True)
     log.text(5_000_400, b"[commander] Armed by RC switch\t")
@@ -143,7 +143,7 @@ def test_string_that_duplicates_an_event_is_dropped() -> None:
 
 
 def test_event_arguments_are_formatted() -> None:
-    """Numbers with digits and units, enums, bit fields, profiles, links and escapes follow libevents."""
+    """Numbers with digits and units, enums, bit fields, profiles, links and escapes are formatted as by libevents."""
     log = Log()
     log.event(1, 2, struct.pack("<fB", 2.25, 5))
     log.event(2, 2, struct.pack("<fB", float("nan"), 8))
@@ -155,7 +155,7 @@ def test_event_arguments_are_formatted() -> None:
 
 
 def test_failed_check_is_reported_once() -> None:
-    """PX4 repeats all failed checks in each report; one that does not affect the current mode has severity info."""
+    """A failed check, which PX4 repeats in each report, is reported once; it is info if it does not affect the mode."""
     log = Log()
     check = struct.pack("<IB", 1 << 14, 0)
     for time, mode in enumerate((4, 4, 14)):

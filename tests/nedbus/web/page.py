@@ -163,7 +163,7 @@ class RenderedPage:
             self.viewer._drawn.value = str(self.viewer._sent)
 
     def send(self, action: object, value: object = "") -> None:
-        """Send an action as `actions.js` does on a click or key."""
+        """Send an action, as `actions.js` does on a click or key press."""
         self.send_raw(json.dumps([action, value, next(self._numbers)]))
 
     def send_raw(self, message: str) -> None:

@@ -91,7 +91,7 @@ def until_order(page: Tab, *vehicles: str) -> None:
 
 
 def test_simulated_flight_fills_every_panel(url: str, tab: Open, run_nedbus: Start, endpoint: str) -> None:
-    """Counts, row, map with track, numbers, and plots with ground truth are filled by a simulated flight.
+    """A simulated flight fills counts, row, map with track, numbers, and plots with ground truth.
 
     The simulator's second EKF instance does not affect them.
     """
@@ -149,7 +149,7 @@ def fifty_vehicles(bus: nedbus.Bus) -> Iterator[None]:
 @pytest.mark.usefixtures("fifty_vehicles")
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_layout_fits_phone_laptop_and_wide_screen(url: str, tab: Open, theme: str) -> None:
-    """With 50 vehicles, in both themes, no panel is empty, cut off, or covers another one.
+    """With 50 vehicles, in both themes, no panel is empty or cut off, or covers another.
 
     Text has a contrast ratio of 4.5, map labels do not overlap, and the worst vehicles are first in the list and
     counted in the title.
@@ -347,7 +347,7 @@ def test_page_reconnects_after_a_server_restart(web: Web, browser: Browser, fly:
 
 
 def test_playback_controls_move_through_the_recording(web: Web, tab: Open, tmp_path: Path) -> None:
-    """Slider, pause, speed, seeking, keys and events work, and the page shows the state at the playback position."""
+    """Slider, pause, speed, keys and events control the playback; the page shows the state at the playback position."""
     port = free_port()
     web(port, str(write_flight(tmp_path, {VLP: lambda time: {"x": time, "xy_valid": time < 60}}, seconds=120)))
     page = tab(width=1280, height=800)

@@ -62,7 +62,7 @@ def test_state_follows_the_validity_flags(
 def test_secondary_estimates_do_not_affect_the_vehicle_state(
     sim: SimulatedFleet, other: Address, begins_later: bool
 ) -> None:
-    """A bad, slow or silent EKF instance, or a bad ground truth, leaves its vehicle ok, even if it is received first.
+    """A bad, slow or silent EKF instance, or a bad ground truth, leaves its vehicle "ok", even if it is received first.
 
     The description of that stream names the fault.
     """
@@ -159,7 +159,7 @@ def test_vehicles_are_sorted_by_severity_then_name(sim: SimulatedFleet) -> None:
 
 
 def test_gone_vehicle_stays_bad(sim: SimulatedFleet) -> None:
-    """A vehicle that is gone ranks above vehicles to watch until it is forgotten or returns."""
+    """A gone vehicle ranks above vehicles of severity "watch" until it is forgotten or returns."""
     sim.fly(3, WING, QUAD)
     sim.time += 2100
     sim.fly(3, WING, dead_reckoning=True)
@@ -199,7 +199,7 @@ def test_position_replaces_other_streams_at_the_limit(sim: SimulatedFleet, monke
 
 
 def test_status_values_come_from_other_messages(sim: SimulatedFleet) -> None:
-    """Mode, arming, battery and GPS come from other messages; an unknown charge, or a second battery, is not shown."""
+    """Mode, arming, battery and GPS come from other topics; an unknown charge or a second battery is not shown."""
 
     def status() -> list[str]:
         return [fact.text for fact in sim.vehicle().status.values()]
@@ -307,7 +307,7 @@ def test_changing_ref_timestamp_does_not_add_gaps_to_ground_truth(sim: Simulated
 
 
 def test_position_at_a_time_comes_from_both_histories(sim: SimulatedFleet) -> None:
-    """The position at a time is the last valid point before it, in either history, or None."""
+    """The position at a time is the last valid point before it in either history; None if there is no such point."""
     begin = sim.time
     for second in range(200):
         sim.fly(1, x=float(second))
@@ -343,7 +343,7 @@ def test_position_error_requires_a_common_frame(sim: SimulatedFleet) -> None:
 
 
 def test_formatted_time_names_its_clock() -> None:
-    """Live times are UTC; recordings use UTC if known, else time since boot for one vehicle, else since their start."""
+    """Live times are UTC. Those of a recording are UTC if known, else since boot (one vehicle) or since its start."""
     recorded = EventTimeline(EventLog(), times=Times())
     assert recorded.format_clock(75.25) == "75.2 s since the start of the recording"
     recorded.set_clock("1", 70.0, 10.0)

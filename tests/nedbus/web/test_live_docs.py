@@ -53,7 +53,7 @@ def test_hash_table_matches_the_layouts() -> None:
 def test_serve_command_publishes_the_vehicle(
     run_nedbus: Start, endpoint: str, port: int, fly: Fly, command: str
 ) -> None:
-    """With the service and the echo command of the page, a line of the vehicle is printed."""
+    """While a service command of the page is running, the echo command prints a line of the vehicle."""
     where = endpoint if "--connect" in command else free_endpoint()
     others = dict.fromkeys(("tcp/192.168.1.5:7447", "tcp/0.0.0.0:7447"), where)
     arguments = arguments_of(command.replace("0.0.0.0:14540", f"127.0.0.1:{port}"), **others)

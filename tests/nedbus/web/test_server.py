@@ -141,7 +141,7 @@ def test_page_above_the_viewer_limit_shows_a_notice(monkeypatch: pytest.MonkeyPa
 
 
 def test_cross_site_subresources_are_refused(url: str) -> None:
-    """Cross-site images, scripts and frames are refused (Sec-Fetch-Site); links from other sites work."""
+    """Cross-site images, scripts and frames are refused, based on Sec-Fetch-Site; links from other sites work."""
     for path, (site, kind, status) in product(
         PATHS,
         [
@@ -200,7 +200,7 @@ def test_connections_above_the_limit_are_closed(url: str, caplog: pytest.LogCapt
 def test_websocket_without_token_is_refused_without_traceback(
     url: str, protocols: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A WebSocket without the subprotocol or a valid page token is refused."""
+    """A WebSocket without the subprotocol or a valid page token is refused, and nothing is logged."""
     offered = [websockets.Subprotocol(each) for each in protocols]
     with pytest.raises(websockets.InvalidStatus, match="403"):
         connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(url), subprotocols=offered or None)

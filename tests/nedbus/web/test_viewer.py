@@ -187,7 +187,7 @@ def test_ulog_stream_state_is_shown_escaped(sim: SimulatedFleet) -> None:
 
 
 def test_all_panels_show_the_same_snapshot(sim: SimulatedFleet) -> None:
-    """Counts, title, rows, badges and markers agree; before the first message the header shows that it waits."""
+    """Counts, title, rows, badges and markers agree; before the first message the header shows "waiting"."""
     page = Page(sim)
     assert "waiting for the first message" in page.panel("head")
     assert page.vehicles == []
@@ -249,7 +249,7 @@ def test_overloaded_page_is_reported_in_the_header(sim: SimulatedFleet) -> None:
 
 
 def test_streams_without_position_are_listed_but_not_mapped(sim: SimulatedFleet) -> None:
-    """The table of streams shows their rates and states; a vehicle without a position has no marker."""
+    """The table shows rates and states of streams without a position; a vehicle without a position has no marker."""
     attitude, battery = Address("wing", "vehicle_attitude"), Address("far", "battery_status", 0)
     sim.fly(3, WING, attitude, battery, x=4.0)
     page = Page(sim)

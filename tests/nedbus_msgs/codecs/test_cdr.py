@@ -1,4 +1,4 @@
-"""CDR codec, compared with payloads of a real ROS 2 and with rosbags."""
+"""CDR codec, compared with payloads recorded from ROS 2 and with the library `rosbags`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def as_python(value: object) -> object:
 
 @pytest.mark.parametrize(("layout", "vector"), [*vectors(VECTORS), *vectors(SHARED_VECTORS)])
 def test_ros_2_payload_round_trip(layout: str, vector: Mapping[str, Any]) -> None:
-    """Payloads of a real rclpy decode to their fields, with any padding, and the fields encode to the same bytes."""
+    """Payloads from rclpy decode to their fields, whatever the padding bytes; the fields encode with zero padding."""
     clean, raw = bytes.fromhex(vector["cdr_hex"]), bytes.fromhex(vector["cdr_hex_raw"])
     fields = decode_cdr(clean, layout=layout)
     assert list(fields) == list(LAYOUTS[layout].fields)
@@ -96,7 +96,7 @@ def test_other_encapsulation_is_rejected(head: str) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_bool_other_than_0_or_1_is_rejected(layout: str) -> None:
-    """Another byte value means that the payload has another layout."""
+    """A bool byte other than 0 or 1 is rejected, because it means that the payload has another layout."""
     payload = bytearray(encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout))
     payload[4 + 16] = 2
     with pytest.raises(DecodeError, match="xy_valid: 2"):
@@ -130,7 +130,7 @@ def test_padding_is_ignored(layout: str, size: int) -> None:
     ids=lambda value: repr(value)[:20],
 )  # fmt: skip
 def test_value_of_wrong_type_or_range_raises(name: str, value: object) -> None:
-    """The error names the field; rclpy would send these values as 0, 44 or infinity."""
+    """A value that does not fit raises, with the name of the field; rclpy would send it as 0, 44 or infinity."""
     fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {name: value}
     with pytest.raises(EncodeError, match=f"{name}: "):
         encode_cdr(fields, layout="1.16")
@@ -144,7 +144,7 @@ def test_int_is_accepted_for_float() -> None:
 
 @given(st.binary(max_size=300))
 def test_random_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
-    """Random bytes never raise any other error."""
+    """Decoding random bytes succeeds or raises DecodeError, but never another error."""
     for layout in LAYOUTS:
         for data in (payload, b"\x00\x01\x00\x00" + payload):
             with suppress(DecodeError):

@@ -167,7 +167,7 @@ def test_array_round_trip(many: list[VehicleLocalPosition]) -> None:
 
 
 def test_columns_have_px4_types() -> None:
-    """No column is wider than PX4's type."""
+    """Each column of an array has exactly PX4's type."""
     kinds = {"uint64": "u8", "uint8": "u1", "bool": "?", "float32": "f4", "float64": "f8"}
     for name, kind in FIELD_TYPES.items():
         expected = np.dtype(("f4", 2)) if kind == "float32[2]" else np.dtype(kinds[kind])

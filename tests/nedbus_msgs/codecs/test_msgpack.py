@@ -29,7 +29,7 @@ GOLDEN = json.loads((DATA / "golden.json").read_text())
 
 @pytest.mark.parametrize("name", GOLDEN)
 def test_payload_equals_golden_bytes(name: str) -> None:
-    """These bytes are the wire format; changing them breaks compatibility."""
+    """Messages encode to the golden bytes, which are the wire format: a change breaks compatibility."""
     message = VehicleLocalPosition.model_validate_json(json.dumps(GOLDEN[name]["message"]))
     payload = bytes.fromhex(GOLDEN[name]["payload"])
     assert encode(message) == payload
@@ -61,7 +61,7 @@ def test_other_msgpack_encodings_are_decoded(message: VehicleLocalPosition, sing
 
 @given(messages())
 def test_layout_0_is_decoded(message: VehicleLocalPosition) -> None:
-    """V0 has 52 fields, with a single hagl_max."""
+    """A payload of layout 0 has 52 fields, and a single hagl_max for hagl_max_z and hagl_max_xy."""
     older = downgrade(message, "V0")
     decoded = decode(msgpack.packb([0, *older.values()]))
     assert bits(decoded) == bits(message.model_copy(update={"hagl_max_xy": message.hagl_max_z}))
@@ -142,7 +142,7 @@ def test_flipped_bit_has_the_same_effect_in_model_row_and_array() -> None:
 @example(b"\xc7\x0c\xff" + bytes(12))
 @MANY_EXAMPLES
 def test_random_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
-    """Random bytes never raise any other error."""
+    """Decoding random bytes succeeds or raises DecodeError, but never another error."""
     try:
         decode(payload)
     except DecodeError as exc:
@@ -160,7 +160,7 @@ msgpack_values = st.recursive(
 @given(st.sampled_from(FLIGHTS), st.integers(0, 53), msgpack_values)
 @MANY_EXAMPLES
 def test_random_value_is_decoded_unchanged_or_rejected(good: VehicleLocalPosition, index: int, value: object) -> None:
-    """In an otherwise valid payload, a value is decoded up to rounding to float32, or DecodeError is raised."""
+    """In an otherwise valid payload, a value is decoded unchanged up to float32 rounding, or raises DecodeError."""
     array: list[object] = [1, *good.model_dump().values()]
     array[index] = value
     try:
@@ -176,7 +176,7 @@ def test_random_value_is_decoded_unchanged_or_rejected(good: VehicleLocalPositio
 
 
 def test_encoding_after_bypassed_validation_raises() -> None:
-    """A message from model_construct with values that do not fit raises, and never encodes other values."""
+    """Encoding a message from model_construct raises if a value does not fit; it never encodes another value."""
     for field, value in (("x", 1e39), ("timestamp", -1), ("xy_reset_counter", 300), ("x", "1"), ("delta_xy", None)):
         message = VehicleLocalPosition.model_construct(**{**VehicleLocalPosition(timestamp=1).__dict__, field: value})
         with pytest.raises(EncodeError, match="VehicleLocalPosition"):

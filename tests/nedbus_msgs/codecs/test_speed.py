@@ -78,13 +78,13 @@ BOUNDS = {  # baseline, maximum ratio to it, and messages per call
 
 
 MAX_SPREAD = 1.5
-"""Maximum ratio of the time for any flight to the time for the fastest flight, in the same form."""
+"""Maximum ratio of the time for any flight to the time for the fastest flight, for the same operation."""
 
 
 @pytest.mark.slow  # concurrent tests would distort the measurement
 @pytest.mark.timeout(600)
 def test_hot_path_is_within_its_bounds(start: Start) -> None:
-    """For each flight, each form stays below its ratio to the baseline and close to the fastest flight."""
+    """For each flight, each operation stays below its limits relative to the baseline and to the fastest flight."""
     best: dict[str, dict[str, float]] = {}
     for _ in range(6):
         process = start("-c", PROGRAM, str(FLIGHTS), coverage=False, fresh=True)

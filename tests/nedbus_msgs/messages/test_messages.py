@@ -1,4 +1,4 @@
-"""All messages: vectors and hashes of rosbags, all codecs, and a message added as a single file."""
+"""All messages: vectors and type hashes from the library rosbags, all codecs, and a message added as a single file."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_text_may_be_unpadded_but_not_too_long() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fields_of_older_layouts_round_trip_through_the_model(name: str) -> None:
-    """Upgraded to the model and downgraded again, values of an older layout are unchanged."""
+    """Values of an older layout are unchanged after an upgrade to the model and a downgrade back."""
     dropped = {"q_offset", "pose_covariance", "velocity_covariance", "local_frame"}  # VehicleOdometry of 1.13
     for vector in (each for each in vectors() if each["message"] == name):
         known = message_of_type_hash(vector["type_hash"])
@@ -233,7 +233,7 @@ def values_of(kind: FieldType) -> st.SearchStrategy[object]:
 
 @st.composite
 def any_fields(draw: st.DrawFn) -> tuple[Definition[Any], dict[str, object]]:
-    """Return fields of any message, of the right types, which may break its rules."""
+    """Return correctly typed fields of any message, which may break its rules."""
     definition = MESSAGES[draw(st.sampled_from(NAMES))]
     fields = {name: draw(values_of(kind)) for name, kind in definition.types.items()}
     if draw(st.booleans()):  # otherwise almost all messages break a rule
@@ -301,7 +301,7 @@ def test_definition_is_complete(name: str) -> None:
 
 @pytest.mark.process
 def test_generated_pages_and_imports_are_up_to_date() -> None:
-    """Each message has a current page (`make generated`) and an import for type checkers."""
+    """Each message has an up-to-date page (`make generated`) and an import for type checkers."""
     assert [path.name for path, text in committed().items() if not path.exists() or path.read_text() != text] == []
     imports = Path(messages.__file__ or "").read_text()
     assert [name for name in MESSAGES if f"import {name} as {name}\n" not in imports] == []

@@ -49,7 +49,7 @@ def test_float32_field_is_rounded_to_float32(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["ref_lat", "ref_lon"])
 def test_origin_keeps_double_precision(name: str) -> None:
-    """Float32 would have a resolution of 0.4 m."""
+    """Latitude and longitude of the origin keep double precision; float32 would have a resolution of 0.4 m."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, name: 47.397742123456789})
     assert getattr(message, name) == 47.397742123456789
 
@@ -65,7 +65,7 @@ def test_origin_keeps_double_precision(name: str) -> None:
     ],
 )  # fmt: skip
 def test_wrong_type_is_rejected(field: str, value: object) -> None:
-    """No value is converted silently, unlike in rclpy."""
+    """A value of a wrong type or out of range is rejected, not converted silently as in rclpy."""
     assert field in rejection(**{field: value})
 
 
@@ -82,7 +82,7 @@ def test_error_for_broken_rule_names_the_field(changes: dict[str, object]) -> No
 
 
 def test_extreme_valid_values_pass() -> None:
-    """A value on its bound, -0.0, NaN and infinity are valid unless a rule forbids them; so is NaN without its flag."""
+    """A value on its bound, -0.0, NaN and infinity are valid unless a rule forbids them, as is NaN without its flag."""
     for changes in EXTREMES:
         VehicleLocalPosition.model_validate({"timestamp": 1, **changes})
 

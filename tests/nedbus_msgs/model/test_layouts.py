@@ -84,7 +84,7 @@ def test_fields_missing_in_an_old_layout_are_not_provided() -> None:
 
 
 def test_yaw_of_px4_1_11_becomes_heading() -> None:
-    """In logs up to 1.11, yaw is renamed, unknown fields are ignored, and missing ones are not provided."""
+    """In logs of PX4 up to 1.11, yaw is renamed to heading; unknown fields are ignored, missing ones not provided."""
     message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
     assert (message.heading, message.x) == (0.5, 1.0)
     assert message.model_fields_set == {"timestamp", "x", "heading"}

@@ -76,7 +76,7 @@ def odometry(ms: int, row: Row) -> Any:
 
 
 def schedule(streams: list[Stream]) -> Iterator[tuple[float, Build]]:
-    """Yield (seconds since boot, builder) endlessly, at equal times in the order of `streams`."""
+    """Yield (seconds since boot, builder) endlessly; builders due at the same time come in the order of `streams`."""
     heap = [(0.0, order, 0) for order, (rate, _) in enumerate(streams) if rate > 0]
     while True:
         now, order, turn = heapq.heappop(heap)

@@ -102,7 +102,7 @@ def session() -> Session:
     return Session()
 
 
-def test_every_acked_message_is_acknowledged(session: Session) -> None:
+def test_every_logging_data_acked_is_acknowledged(session: Session) -> None:
     """The first heartbeat triggers START; each LOGGING_DATA_ACKED is acknowledged, including retransmissions."""
     session.start()
     session.receive(acked=True, sequence=273)
@@ -169,7 +169,7 @@ def test_in_progress_extends_timeout(session: Session) -> None:
 
 
 def test_unanswered_start_is_reported_after_three_attempts(session: Session) -> None:
-    """With SDLOG_BACKEND 0 no command is answered: START is sent after 0, 1 and 3 s, and then every 30 s."""
+    """An unanswered START, as with SDLOG_BACKEND 0, is sent after 0, 1 and 3 s, then reported, and sent every 30 s."""
     session.wait(0.1)
     for seconds, attempts in ((0.8, 1), (0.4, 2), (1.6, 2), (0.4, 3), (3.5, 3)):
         session.wait(seconds)
@@ -183,7 +183,7 @@ def test_unanswered_start_is_reported_after_three_attempts(session: Session) -> 
 
 
 def test_autopilot_other_than_px4_receives_no_start() -> None:
-    """The client sends nothing, and the reason names the autopilot."""
+    """The client sends nothing to another autopilot, and the reason names that autopilot."""
     session = Session(autopilot=dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
     session.wait(100)
     assert session.sent == []
@@ -192,7 +192,7 @@ def test_autopilot_other_than_px4_receives_no_start() -> None:
 
 
 def test_start_waits_for_disarming() -> None:
-    """START blocks the vehicle's logger, so it waits for disarming; a running stream continues in flight."""
+    """START blocks the vehicle's logger, so it is sent only while disarmed; a running stream continues in flight."""
     session = Session(armed=True)
     session.wait(60)
     assert (session.commands, session.states[1:]) == ([], [("waiting_for_disarm", "armed")])
@@ -223,7 +223,7 @@ class TestOwnership:
     """PX4 streams to one client at a time, and rejects all others."""
 
     def test_rejected_client_without_take_never_sends_stop(self, session: Session) -> None:
-        """Without log=take a rejected client does not send STOP, not even when it stops."""
+        """Without log=take, a rejected client never sends STOP, not even on shutdown."""
         session.wait(0.1)
         for _ in range(4):
             session.answer(START, REJECTED)
@@ -261,7 +261,7 @@ class TestOwnership:
         assert session.states[1:] == [("starting", None), ("header", None)]
 
     def test_log_take_takes_over_only_once(self) -> None:
-        """A client that is rejected again does not repeat STOP; with SDLOG_BACKEND 1 a takeover has no effect."""
+        """If START is rejected again after STOP, as with SDLOG_BACKEND 1, the client does not repeat STOP."""
         session = Session("take")
         session.wait(0.1)
         session.answer(START, REJECTED)
@@ -289,7 +289,7 @@ class TestOwnership:
         assert session.client.status.reason == "taken"
 
     def test_stop_by_another_client_is_detected(self, session: Session) -> None:
-        """PX4 sends only 44 acknowledged messages to the first client, which retries START later."""
+        """After a STOP by another client PX4 sends only 44 more LOGGING_DATA_ACKED; the client retries START later."""
         session.start()
         for _ in range(44):
             session.receive(acked=True)
@@ -300,8 +300,8 @@ class TestOwnership:
         session.wait(3)
         assert session.commands[:2] == ["start", "start"]
 
-    def test_second_start_does_not_affect_stream(self, session: Session) -> None:
-        """A late answer to START, or the rejection of a second START, has no effect."""
+    def test_late_answer_to_start_does_not_affect_stream(self, session: Session) -> None:
+        """While the stream is running, late answers to START have no effect, whether START is accepted or rejected."""
         session.start()
         session.answer(START, REJECTED)
         session.answer(START, ACCEPTED)
@@ -314,7 +314,7 @@ class TestNoData:
     """PX4 accepts START but sends no data if START follows STOP too soon, or if another link has the stream."""
 
     def test_start_without_data_is_followed_by_restart(self, session: Session) -> None:
-        """STOP follows after 1 s, and START 2.5 s after STOP was accepted."""
+        """Without data, STOP is sent 1 s after START was accepted, and START 2.5 s after STOP was accepted."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.wait(0.8)
@@ -331,7 +331,7 @@ class TestNoData:
         assert session.states[1:] == [("starting", None), ("header", None), ("streaming", None)]
 
     def test_start_without_data_fails_after_three_attempts(self, session: Session) -> None:
-        """After three attempts the client sends STOP, and retries every 30 s."""
+        """After three attempts without data the state is "refused", reason "no_data"; START is retried every 30 s."""
         session.wait(0.1)
         for attempts in (3, 4):
             for _ in range(150):
@@ -342,7 +342,7 @@ class TestNoData:
         assert session.states[1:] == [("starting", None), ("refused", "no_data")]
 
     def test_late_data_of_earlier_stream_is_not_a_new_stream(self, session: Session) -> None:
-        """Delayed data of an earlier stream does not count as the requested one."""
+        """Delayed data of an earlier stream is not mistaken for data of the requested stream."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.receive(sequence=300)
@@ -363,7 +363,7 @@ class TestHeader:
 
     @pytest.mark.parametrize("round_trip", [0.03, 0.08, 0.2, 3.0])
     def test_long_round_trip_aborts_header(self, session: Session, round_trip: float) -> None:
-        """The header is aborted early; acknowledgements end as well, or PX4 would ignore STOP during the header."""
+        """If round trips are long, STOP aborts the header, and acknowledgements end, or PX4 would ignore STOP."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         began = session.now
@@ -391,7 +391,7 @@ class TestHeader:
         assert session.client.status.state == "header"
 
     def test_header_with_only_retransmissions_stalls(self, session: Session) -> None:
-        """PX4 repeats a message every 50 ms, and ends the stream silently after 2.5 s without acknowledgement."""
+        """If only retransmissions arrive until PX4 silently gives up after 2.5 s, the header has stalled."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.header(10)
@@ -404,7 +404,7 @@ class TestHeader:
         assert session.commands == ["start", "start"]
 
     def test_header_of_slow_stream_completes_on_rejected_start(self, session: Session) -> None:
-        """With few slow topics no data follows for seconds; PX4 rejects START, which proves that the stream exists."""
+        """With few slow topics no data follows for seconds; the rejection of START proves that the stream exists."""
         session.wait(0.1)
         session.answer(START, ACCEPTED)
         session.header()
@@ -427,7 +427,7 @@ class TestSilence:
     """PX4 does not announce the end of a stream; its answer to START shows whether the stream still exists."""
 
     def test_slow_stream_continues(self, session: Session) -> None:
-        """One topic at 1 Hz fills a message in 5 s: START is sent rarely, and the stream continues."""
+        """If a topic at 1 Hz fills a message only every 5 s, START is rarely sent, and the stream continues."""
         session.start()
         for _ in range(40):
             session.wait(5)
@@ -467,7 +467,7 @@ class TestSilence:
         assert "stop" not in session.commands
 
     def test_silence_in_flight_sends_no_start(self, session: Session) -> None:
-        """START could begin a header in flight, so silence alone ends the stream, and new data resumes it."""
+        """START could begin a header in flight, so it is not sent: silence ends the stream, and new data resumes it."""
         session.start()
         session.armed = True
         session.stream(2)
@@ -481,7 +481,7 @@ class TestSilence:
         assert session.commands == ["start", "start"]
 
     def test_rejected_start_after_disarming_resumes_stream(self, session: Session) -> None:
-        """If PX4 rejects START after disarming, the stream was only slow."""
+        """PX4 rejects START after disarming if the stream still exists: the state is "streaming" again."""
         session.start()
         session.armed = True
         session.wait(20)
@@ -491,8 +491,8 @@ class TestSilence:
         assert session.states[-1] == ("streaming", None)
 
     @pytest.mark.parametrize("seconds", [4.0, 60.0, 600.0])
-    def test_link_outage_does_not_end_stream(self, session: Session, seconds: float) -> None:
-        """PX4 continues without a client; the client sends nothing while the link is silent."""
+    def test_stream_resumes_after_link_outage(self, session: Session, seconds: float) -> None:
+        """PX4 keeps streaming during an outage, so the client sends no START, and the stream resumes with the link."""
         session.start()
         session.wait(seconds, heartbeats=False)
         assert session.states[-1] == ("ended", "link_lost")
@@ -502,7 +502,7 @@ class TestSilence:
         assert session.commands == ["start"]
 
     def test_stream_that_ended_during_outage_restarts(self, session: Session) -> None:
-        """An unacknowledged message ended the stream, so PX4 accepts START."""
+        """If PX4 ended the stream during an outage, for lack of acknowledgements, it accepts START."""
         session.start()
         session.wait(20, heartbeats=False)
         session.wait(1.3)
@@ -551,7 +551,7 @@ class TestStop:
         assert session.commands == ["start", "stop", "stop"]
 
     def test_unanswered_stop_times_out(self, session: Session) -> None:
-        """STOP is sent three times to a vehicle that does not answer."""
+        """If the vehicle does not answer, STOP is sent three times; then the state is "stopped"."""
         session.start()
         session.add(session.client.stop(session.now))
         session.wait(3.5)

@@ -116,12 +116,13 @@ class Link:
 
 
 def test_recorded_stream_arrives_completely() -> None:
-    """At full speed all bytes of the recording arrive; only the 11 messages that it lacks count as lost."""
+    """At full speed all bytes of the recording arrive; only the 11 messages missing in the recording count as lost."""
     with Link("armed").play("default_topics", speed=None) as link:
         link.stop()
     assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
     assert link.peer.commands == [START, STOP]
-    assert link.reassembly.lost == 11  # a busy machine acknowledges late, and the peer repeats messages
+    # Duplicates are not checked: on a busy machine acknowledgements are late, and the peer repeats messages.
+    assert link.reassembly.lost == 11
     assert link.reassembly.bytes + link.reassembly.skipped == recorded_bytes("default_topics")
 
 
@@ -158,14 +159,14 @@ class TestAbnormalStreams:
     """Streams with failures, in real time."""
 
     def test_unacknowledged_message_stalls_stream(self) -> None:
-        """PX4 sends an unacknowledged message 50 times, and then nothing."""
+        """PX4 sends an unacknowledged message 50 times, then nothing more, and the stream is reported as stalled."""
         with Link(acknowledges=False).play("flight1") as link:
             link.expect_states(("starting", None), ("header", None), ("ended", "stalled"))
             link.run(lambda: link.reassembly.counts["duplicate"] == 49)  # the last duplicates may arrive later
         assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
 
     def test_start_without_data_is_repeated(self) -> None:
-        """PX4's logger gives up after 2.5 s, and accepts the next START."""
+        """A logger that sends no data after START gives up after 2.5 s, and accepts the next START."""
         with Link().play("flight1", unsent=1) as link:
             link.expect_states(*STARTED)
         assert [each for each in link.peer.commands if each == START] == [START, START]
@@ -175,17 +176,17 @@ class TestAbnormalStreams:
         """With log=take the other client's stream ends, and this client's begins."""
         with Link("take").play("flight1", owner=OTHERS, is_owner_on_link=is_heard) as link:
             link.expect_states(*STARTED)
-        # STOP takes longer while an acknowledgement of the other client is missing.
+        # STOP may be repeated: it takes effect later while an acknowledgement of the other client is missing.
         assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
 
     def test_stream_of_earlier_process_is_restarted(self) -> None:
-        """The earlier process had the same ids, so its data arrives, but without definitions."""
+        """The stream of an earlier process, with the same ids, arrives without definitions, and is restarted."""
         with Link().play("flight1", owner=OURS, is_owner_on_link=True) as link:
             link.expect_states(("starting", None), ("refused", "taken"), *STARTED)
         assert link.reassembly.counts["no_definitions"]
 
     def test_stop_by_another_client_is_detected(self) -> None:
-        """The last messages are acknowledged, and the stream is not restarted at once."""
+        """After a STOP by another client the last messages are acknowledged; the stream is not restarted at once."""
         with Link("armed").play("flight1") as link:
             link.expect_states(*STARTED)
             link.peer.trigger("foreign_stop")
@@ -193,7 +194,7 @@ class TestAbnormalStreams:
         assert link.reassembly.lost == 0
 
     def test_reboot_triggers_new_stream(self) -> None:
-        """The header arrives again with another start time, followed by the same data."""
+        """After a reboot the header arrives again, with another start time, followed by the same data."""
         with Link("armed").play("flight1") as link:
             link.expect_states(*STARTED)
             link.peer.trigger("reboot")
@@ -201,7 +202,7 @@ class TestAbnormalStreams:
         assert (link.peer.streams, link.reassembly.lost) == (2, 0)
 
     def test_stream_survives_link_outage(self) -> None:
-        """Messages sent while the link is silent for some seconds are counted as lost."""
+        """The stream continues after an outage of some seconds; the messages sent meanwhile are counted as lost."""
         with Link("armed").play("flight1") as link:
             link.expect_states(*STARTED)
             link.peer.trigger("vanish")
@@ -212,7 +213,7 @@ class TestAbnormalStreams:
         assert link.peer.commands == [START]
 
     def test_long_round_trip_aborts_header(self) -> None:
-        """With a round trip of 80 ms the header would take half a minute."""
+        """With a round trip of 80 ms the header is aborted, because it would take half a minute."""
         with Link().play("flight1", round_trip=0.08) as link:
             link.expect_states(("starting", None), ("header", None), ("refused", "slow_link"))
             measured = re.search(r"at (\d+) ms for each", link.client.status.text)

@@ -58,7 +58,7 @@ def test_file_is_valid_after_each_write(tmp_path: Path) -> None:
 
 
 def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
-    """The record cut by a gap is discarded, and a dropout with the duration of the gap is saved."""
+    """The record that a gap interrupts is discarded, and the gap is saved as a dropout with its duration."""
     log, file = small_log(), LogFile(tmp_path, "1")
     file.write(log[: len(log) - 100])
     file.mark_gap(0.25)
@@ -69,7 +69,7 @@ def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
 
 
 def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:
-    """Existing files are never overwritten. The error for a folder that cannot be created names the folder."""
+    """Streams that begin in the same second get separate files; a folder that cannot be created raises."""
     files = [LogFile(tmp_path / "logs", "1") for _ in range(3)]
     for each in files:
         each.close()

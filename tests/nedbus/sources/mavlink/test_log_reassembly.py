@@ -92,7 +92,7 @@ def test_stream_joined_midway_has_no_definitions() -> None:
 
 
 def test_trailing_zeros_are_restored() -> None:
-    """MAVLink 2 truncates trailing zeros of a payload."""
+    """Trailing zeros, which MAVLink 2 truncates, are restored up to the declared length."""
     reassembly = CountingReassembly()
     begin(reassembly)
     assert reassembly.add(1, 6, 0, b"ab").data == b"ab\0\0\0\0"
@@ -336,8 +336,8 @@ class TestImpairedLink:
 
     pytestmark = needs_recordings
 
-    def test_every_complete_message_is_delivered(self, loss: float, burst: int, reorder: float) -> None:
-        """No message is invented, decoding resumes with the next complete record, and the loss count is exact."""
+    def test_every_complete_record_is_delivered(self, loss: float, burst: int, reorder: float) -> None:
+        """Exactly the complete records are delivered, decoding resumes after each gap, and the loss count is exact."""
         messages = recorded("flight1")
         impaired = impair(messages, loss=loss, burst=burst, reorder=reorder)
         records, reassembly = deliver(impaired.messages)

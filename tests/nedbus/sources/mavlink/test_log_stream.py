@@ -164,7 +164,7 @@ def test_published_stream_and_saved_file_equal_log_of_vehicle(tmp_path: Path) ->
 
 @recorded_flight
 def test_log_messages_of_stream_equal_those_of_log() -> None:
-    """Logged strings and events become the log_message of the log; STATUSTEXT is used only before the stream."""
+    """Logged strings and events in a stream become the same log_message as in the log, and replace STATUSTEXT."""
     received = Received("log=1&topics=log_message", FLIGHT)
     texts = [each for each in received.messages if cast("int", each.fields["timestamp"]) > 7_000_000]
     assert {each.source for each in texts} == {"mavlink-ulog"}
@@ -196,7 +196,7 @@ def test_stream_replaces_converted_topics() -> None:
     ("flight1", MESSAGES, 0, 1000, {"loss": 0.05, "burst": 20, "seed": 2}),
 ])  # fmt: skip
 def test_losses_are_within_bounds(name: str, messages: int, lost: int, gaps: int, impairment: dict[str, Any]) -> None:
-    """No value is wrong, and the number of missing messages is within the bounds, for recordings of a PX4 (SITL).
+    """No value is wrong, and the number of missing messages is within the bounds of the status, for recordings of PX4.
 
     `messages`: number in the recording before STOP; `lost`: number missing in both the recording and the log;
     `gaps`: number of lost LOGGING_DATA; with an impairment, its lower bound.

@@ -121,7 +121,7 @@ def test_gps_time_comes_from_system_time() -> None:
             if isinstance(converted, SourceMessage) and "time_utc_usec" in converted.fields:
                 origins.append(int(str(converted.fields["time_utc_usec"])) - int(str(converted.fields["timestamp"])))
     assert len(origins) == 378
-    assert max(origins) - min(origins) < 2_000_000  # simulated time, and the host's clock
+    assert max(origins) - min(origins) < 2_000_000  # simulated time drifts from the host's clock
 
 
 @pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream in {STREAMS}")

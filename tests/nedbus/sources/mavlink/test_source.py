@@ -242,7 +242,7 @@ def test_messages_are_converted_to_chosen_topics(port: int) -> None:
     }  # fmt: skip
 
 
-def test_vehicles_share_a_port(timings: Timings, listener: Listener, port: int) -> None:
+def test_vehicles_on_one_port_are_separate(timings: Timings, listener: Listener, port: int) -> None:
     """Each system id on a port is a separate vehicle, and receives its requests at its own address."""
     timings.source_tick = 0.01
     expected = {32: 20_000, **dict.fromkeys([33, 141, 230, 331], 119_974.875), ORIGIN: 0}
@@ -269,7 +269,7 @@ def test_receive_buffer_holds_a_burst(port: int) -> None:
 
 
 def test_random_datagrams_are_counted_as_rejected(listener: Listener, port: int) -> None:
-    """Random datagrams are counted under one link, and do not affect a vehicle on it."""
+    """Random datagrams are counted as rejected under their link, and do not affect a vehicle on the same link."""
     rng, starts = random.Random(0), (b"", b"\xfd\xff\x00", b"\xfe\x09", b"\xfd\x1c\x00\x00\x00\x01\x01\x20\x00\x00")
     with Autopilot(port) as vehicle, Autopilot(port) as attacker:
         for ms in range(1000, 3000, 50):
@@ -281,7 +281,7 @@ def test_random_datagrams_are_counted_as_rejected(listener: Listener, port: int)
     assert {each.where for each in listener.rejections} == {f"udpin:127.0.0.1:{port}"}
 
 
-def test_late_and_foreign_messages_are_ignored(listener: Listener, port: int) -> None:
+def test_late_and_foreign_messages_are_not_published(listener: Listener, port: int) -> None:
     """Late datagrams and ids of 0 are rejected; the position of a camera is ignored silently."""
     with (
         Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as unnamed,
@@ -303,7 +303,7 @@ def test_late_and_foreign_messages_are_ignored(listener: Listener, port: int) ->
 
 
 def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
-    """Two senders with one system id are logged once, with both addresses; two changes of address are not logged."""
+    """Two senders with the same system id are logged once, with both addresses; two address changes are not logged."""
     with Autopilot(port) as one, Autopilot(port) as other, Autopilot(port) as third:
         for ms, sender in enumerate((one, one, other, other, third, third), start=1000):
             sender.send(local_position(ms))
@@ -319,7 +319,7 @@ def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: py
 
 
 def test_closed_tcp_link_raises_and_can_be_reopened() -> None:
-    """A split message is reassembled; a closed link raises, and can be opened again."""
+    """A message split across TCP segments is reassembled; a closed link raises, and can be reopened."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = f"tcp:127.0.0.1:{server.getsockname()[1]}"
         for ms in (1000, 2000):
@@ -377,6 +377,6 @@ def test_port_in_use_raises(listener: Listener, port: int) -> None:
     ],
 )
 def test_invalid_source_raises(text: str, reason: str) -> None:
-    """The error of an invalid source shows the expected form."""
+    """The error for an invalid source shows the expected form."""
     with pytest.raises(ConfigError, match=reason):
         parse_source(text).open_source(vehicle="1")

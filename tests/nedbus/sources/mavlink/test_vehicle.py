@@ -114,7 +114,7 @@ def test_every_converted_topic_has_a_requested_message() -> None:
 
 
 def test_attitude_replaces_missing_attitude_quaternion() -> None:
-    """ATTITUDE is converted only for a vehicle that sends no ATTITUDE_QUATERNION."""
+    """ATTITUDE is converted only while the vehicle sends no ATTITUDE_QUATERNION."""
     vehicle = new_vehicle("vehicle_attitude")
     converted = handle(vehicle, dialect.MAVLink_attitude_message(1000, 0.1, -0.2, 3.0, 0, 0, 0), 100.0)
     assert quaternion_to_euler(cast("tuple[float, ...]", converted.fields["q"])) == pytest.approx((0.1, -0.2, 3.0))
@@ -172,7 +172,7 @@ def test_arriving_messages_are_requested_three_times(vehicle: Vehicle) -> None:
     assert counts[331] > 3
 
 
-def test_reordered_and_duplicate_messages_are_not_lost(vehicle: Vehicle) -> None:
+def test_reordered_and_duplicate_messages_do_not_count_as_lost(vehicle: Vehicle) -> None:
     """Datagrams that arrive out of order, or twice, do not count as lost."""
     for sequence in (10, 12, 11, 13, 13, 14, 100, 200, 0):
         vehicle.track_sequence(sequence, 100.0)
@@ -203,8 +203,8 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
 
 
-def test_attitude_yaw_replaces_missing_heading(vehicle: Vehicle) -> None:
-    """Without a global position PX4 sends no GLOBAL_POSITION_INT, so the heading is the yaw of ATTITUDE."""
+def test_attitude_yaw_replaces_unknown_heading(vehicle: Vehicle) -> None:
+    """If the heading in GLOBAL_POSITION_INT is unknown (65535), the heading is the yaw of ATTITUDE."""
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
     assert estimate(vehicle, 1, 100.0)["heading"] == pytest.approx(1.25)
@@ -255,7 +255,7 @@ def test_unknown_values_are_not_provided(name: str) -> None:
 
 @pytest.mark.parametrize(("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)])
 def test_unmeasured_clearance_is_invalid(vehicle: Vehicle, clearance: float, is_valid: bool) -> None:
-    """ALTITUDE.bottom_clearance is negative or NaN without a measurement."""
+    """A bottom_clearance that is negative or NaN means no measurement: dist_bottom is invalid, and left out."""
     vehicle.handle(dialect.MAVLink_altitude_message(10**6, 1, 2, 3, 4, NAN, clearance), 100.0)
     fields = estimate(vehicle, 1000, 100.0)
     assert (fields["dist_bottom_valid"], "dist_bottom" in fields) == (is_valid, is_valid)

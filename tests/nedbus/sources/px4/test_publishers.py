@@ -1,4 +1,4 @@
-"""Publishers of rmw_zenoh, with duplicates and restarts, identified by tokens of a real PX4 and of ROS 2 nodes."""
+"""Publishers of rmw_zenoh: duplicates and restarts, detected by liveliness tokens of a real PX4 and of ROS 2 nodes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nedbus_msgs import DecodeError, dds_type
 from tests.flights.local_position import ROS2_TYPE, type_hash
 from tests.flights.messages import VLP
 
-GID = bytes.fromhex("aabbcc00000000000000000000000000")  # of every PX4 in SITL
+GID = bytes.fromhex("aabbcc00000000000000000000000000")  # gid of every PX4 in SITL
 # From ../shared/data/px4/gps_loss_zenoh.jsonl.gz.
 REAL = (
     "@ros2_lv/0/7f683599e27664034d4ab1bf80ed5a2f/0/11/MP/%/%/px4_aabbcc00000000000000000000000000/"
@@ -98,7 +98,7 @@ def test_queued_messages_of_vanished_vehicles_are_rejected(streams: StreamRegist
 
 
 def test_topics_of_one_vehicle_may_share_a_gid(streams: StreamRegistry) -> None:
-    """Two publishers in one session, or two sessions with different topics, are the same vehicle."""
+    """Publishers with one gid in one session, or in two sessions with different topics, are one vehicle."""
     stream = streams.on_message(str(key()), 0.0)
     for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
         streams.add_publisher(token, 100.0)
@@ -128,7 +128,7 @@ def test_ros_2_nodes_of_same_name_are_distinguished_by_gid(streams: StreamRegist
 
 
 def test_restarted_ros_2_publisher_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """The new token shows that the old publisher has gone, which counts as a reboot without losses."""
+    """A publisher that restarts with a new token is accepted at once; the restart counts as a reboot without losses."""
     stream = streams.on_message(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)
@@ -151,8 +151,8 @@ def test_reboot_is_counted_once_per_vehicle(streams: StreamRegistry) -> None:
         vehicle.reverse()
 
 
-def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
-    """The number of tokens stored for one key is bounded, and withdrawn tokens are removed."""
+def test_number_of_publishers_of_a_key_is_limited(streams: StreamRegistry) -> None:
+    """At most 64 tokens are stored for one key, and withdrawn tokens are removed."""
     tokens = [node(str(number)) for number in range(100)]
     for token in tokens:
         streams.add_publisher(token, 0.0)
@@ -163,8 +163,8 @@ def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
     assert not streams._streams
 
 
-def test_keys_are_bounded(monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry) -> None:
-    """The number of keys is bounded; keys of withdrawn publishers without an accepted message do not count."""
+def test_number_of_keys_is_limited(monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry) -> None:
+    """The number of keys is limited; keys of withdrawn publishers without an accepted message do not count."""
     monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
     streams.add_publisher(px4("a"), 0.0)
     for domain in (1, 2):

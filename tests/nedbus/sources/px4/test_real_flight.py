@@ -119,7 +119,7 @@ class Px4:
             "connect/endpoints": [endpoint],
             "connect/timeout_ms": round(1000 * DEADLINE),
             "listen/endpoints": [],
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,  # us; zenoh-pico waits
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,  # us: wait, like zenoh-pico
         }
         config = zenoh.Config()
         for name, value in settings.items():
@@ -360,7 +360,7 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
     lines = list(read_recording(ALIKE))
     second = next(number for number, sent in enumerate(lines) if sent.px4 == 1)
     its_first = next(number for number, sent in enumerate(lines) if sent.px4 == 1 and sent.payload)
-    # There is no order between two sessions: messages of the first one may have arrived later.
+    # Messages of two sessions have no common order: those of the first one may have arrived later.
     overlapping = lines[second : its_first + 1]
     alone = [sent for sent in lines[:second] if sent.payload]
     played = 0
@@ -417,8 +417,8 @@ def is_position(datagram: bytes) -> bool:
     return False
 
 
-def count_late_flags(name: str, rate: float) -> int:
-    """Return the number of positions in a real flight that are converted with a flag other than the logged one.
+def count_outdated_flags(name: str, rate: float) -> int:
+    """Return the number of positions in a real flight that are converted with a flag that differs from the log.
 
     ESTIMATOR_STATUS is simulated at this rate [Hz], with the flags logged at its time.
     """
@@ -453,9 +453,9 @@ def count_late_flags(name: str, rate: float) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
-def test_requested_status_rate_reduces_late_flags(name: str) -> None:
-    """At most a third as many positions have late flags at the rate requested for 57,600 baud as at 2 Hz."""
-    requested, slow = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
+def test_requested_status_rate_reduces_outdated_flags(name: str) -> None:
+    """At the rate requested for 57,600 baud, at most a third as many positions have outdated flags as at 2 Hz."""
+    requested, slow = (count_outdated_flags(name, rate) for rate in (request_rates(30.0, 57600, [VLP])[230], 2.0))
     assert 0 < 3 * requested <= slow
 
 
@@ -463,7 +463,7 @@ def test_requested_status_rate_reduces_late_flags(name: str) -> None:
 def test_converted_positions_equal_log(port: int) -> None:
     """Position and velocity equal the log bit by bit, and so do the flags, except changes since the last status.
 
-    ESTIMATOR_STATUS arrives once a second, so a flag is up to a second late: here at the first status (after 1.15 s),
+    ESTIMATOR_STATUS arrives once a second, so a flag lags by up to a second: here at the first status (after 1.15 s),
     and when GPS is first used (3.15 s), lost (28.15 s) and regained (30.15 s).
     """
     names = ("timestamp", "x", "y", "z", "vx", "vy", "vz")

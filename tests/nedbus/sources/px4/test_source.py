@@ -1,4 +1,4 @@
-"""A simulated Zenoh module of PX4, and other publishers on the same keys."""
+"""The source `px4-zenoh:`, with a simulated Zenoh module of PX4 and other publishers on the same keys."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Px4:
     def raw(self, payload: bytes, *, topic: str = VLP, attachment: bytes | None = None) -> None:
         """Send any payload."""
         if topic not in self._publishers:
-            # PX4's messages are droppable; a test sends faster than any PX4, and counts.
+            # PX4's messages may be dropped, but tests send faster than any PX4, and count them.
             publisher = self._session.declare_publisher(
                 self.key(topic), congestion_control=zenoh.CongestionControl.BLOCK, express=True
             )
@@ -125,7 +125,7 @@ def times(messages: Iterable[SourceMessage]) -> list[object]:
 def test_message_of_px4_reaches_readers(
     serve: Callable[[], Process], zenoh_session: Session, every: nedbus.Subscription
 ) -> None:
-    """A service publishes the message under the vehicle's name; `sample.missing` has the fields its release lacks."""
+    """A service publishes PX4's message for its vehicle; `sample.missing` has the fields that the release lacks."""
     serve()
     px4 = Px4(zenoh_session, layout="1.14")
     sent = message(1, x=0.1, xy_valid=True, y=-1.0, hagl_max_z=5.0)
@@ -229,7 +229,7 @@ WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuin
 def test_user_definition_adds_a_message(
     run_nedbus: Start, endpoint: str, zenoh_session: Session, bus: nedbus.Bus, tmp_path: Path
 ) -> None:
-    """With msg= the message is published, range-checked, and readable without the file; otherwise it is listed."""
+    """With msg= the message is published, range-checked and readable without the file; without, it is "not carried"."""
     (tmp_path / "WheelEncoders.msg").write_text(WHEELS)
     definition = define_msg("WheelEncoders", WHEELS)
     name = ros2_type(definition)
@@ -338,7 +338,7 @@ def test_msg_file_encoding_is_detected(tmp_path: Path, encoding: str) -> None:
 
 
 def test_invalid_input_is_rejected_and_counted(listener: Listener, zenoh_session: Session) -> None:
-    """Wrong hashes, lengths, attachments and random payloads are counted; each key is reported for the log."""
+    """Wrong hashes, lengths and attachments, and random payloads, are counted as rejected, by key."""
     good = Px4(zenoh_session)
     good.put(1)
     unknown = Px4(zenoh_session, domain=1)
@@ -404,7 +404,7 @@ def test_long_keys_do_not_break_the_status(
 
 
 def test_oversized_samples_are_not_queued(listener: Listener, zenoh_session: Session) -> None:
-    """Keys that are too long for ROS 2, and large payloads, are not queued, but counted."""
+    """Keys that are too long for ROS 2, and large payloads, are not queued, but counted as rejected."""
     name = dds_type(ROS2_TYPE)
     wait_for_matching(zenoh_session, f"0/a/{name}/hash")
     for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):
@@ -438,7 +438,7 @@ def test_vehicle_connects_to_router_of_service(run_nedbus: Start) -> None:
 
 
 def test_source_uses_configured_router_of_service(run_nedbus: Start, tmp_path: Path) -> None:
-    """The service's router may have a configuration file, or connect to another router that is down."""
+    """The source uses the service's router even with a configuration file, or connected to a router that is down."""
     own, down = free_endpoint(), free_endpoint()
     file = tmp_path / "router.json5"
     listen = f'listen: {{endpoints: ["{own}"]}}'

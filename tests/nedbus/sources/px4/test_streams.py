@@ -89,7 +89,7 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
 
 
 @pytest.mark.parametrize("namespace", ["", "px4_1"])
-def test_input_has_the_vehicle_of_its_namespace(streams: StreamRegistry, namespace: str) -> None:
+def test_input_topic_has_the_vehicle_of_its_namespace(streams: StreamRegistry, namespace: str) -> None:
     """/fmu/in/... belongs to the vehicle of /fmu/out/...; a restart of its publisher is not a reboot of the vehicle."""
     stream = streams.on_message(key(namespace=namespace, direction="in"), 100.0)
     assert (str(stream.address), stream.is_input) == (f"{namespace or 1}/{VLP}", True)

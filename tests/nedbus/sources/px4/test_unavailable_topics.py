@@ -49,15 +49,15 @@ def test_vehicle_without_any_message_has_no_silent_topics(streams: StreamRegistr
     assert report_after_message(streams, "vehicle_status", 200.0, session="b") == UnavailableTopics()
 
 
-def test_event_topic_is_never_silent(streams: StreamRegistry) -> None:
-    """A topic without a nominal rate, such as home_position, may be silent indefinitely."""
+def test_topic_without_nominal_rate_is_never_reported_as_silent(streams: StreamRegistry) -> None:
+    """A topic without a nominal rate, such as home_position, is never reported as silent."""
     streams.add_publisher(token("home_position"), 100.0)
     assert streams.report(200.0) == UnavailableTopics()
     assert report_after_message(streams, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
 
 
 def test_unsupported_messages_are_listed(streams: StreamRegistry) -> None:
-    """Announced messages without a definition are listed once each, sorted, and in bounded number."""
+    """Announced messages without a definition are listed once each, sorted, and at most 100 of them."""
     for number, name in enumerate(("Rpm", "Airspeed", "Rpm")):
         streams.add_publisher(token(f"topic_{number}", name), 100.0)
     assert streams.on_message(str(token("topic_0", "Rpm").key), 100.0).unsupported == "Rpm"
