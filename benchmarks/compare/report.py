@@ -21,7 +21,7 @@ RESULTS: Final = ROOT / "docs" / "explanation" / "performance.json"
 PAGE: Final = RESULTS.with_suffix(".md")
 README: Final = ROOT / "README.md"
 HEAD: Final = (
-    "| what | bytes | messages/s | of raw | CPU µs/message at full speed, publisher / reader"
+    "| form | bytes | messages/s | relative to raw | CPU µs/message at full speed, publisher / reader"
     " | one-way p50 / p99 at 1 kHz, µs | at 100 Hz, µs | CPU µs/message at 1 kHz |"
 )
 
@@ -112,8 +112,9 @@ def as_markdown(results: Results, rounds: int) -> str:
         f"The message is one of a real flight, {FLIGHTS[DEFAULT_FLIGHT]['from']}: valid, with no origin and no terrain"
         " estimate.\n\n"
         f"{table(results)}\n\n"
-        "With the messages of other flights: messages/s · the reader's CPU at 1 kHz, of raw; and with ten vehicles at"
-        " 100 Hz in one process: publisher's CPU / reader's CPU / p50, of raw:\n\n"
+        "Messages of several flights: each cell has messages/s · the reader's CPU time at 1 kHz. The last column, ten"
+        " vehicles at 100 Hz in one process, has publisher's CPU time / reader's CPU time / p50 latency. CPU times and"
+        " latencies are relative to `raw` (1.00):\n\n"
         f"{flight_table(results)}"
     )
 
