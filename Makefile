@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE  # set in some images: each pytest worker would
 
 SECONDS = 600
 IMAGE_EXTRAS = mavlink mcap metrics pki web
-# Valid on x86-64 and ARM64 and for every supported Python; the address of the package index is left out.
+# The lock files are valid on x86-64 and ARM64 and for every supported Python; they omit the package index's address.
 LOCK = -q --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 
 .PHONY: run check api api-baseline generated docs quick test behaviour slow test-all measured fuzz compose-test wheel lock bench clean

@@ -4,7 +4,7 @@ import nedbus
 
 with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     for sample in bus.subscribe():  # vehicle_local_position of all vehicles, by default
-        position = sample.message.position  # None while it is invalid, or its validity unknown
+        position = sample.message.position  # None while it is invalid or of unknown validity
         if position is None:
             print(sample.vehicle, "has no valid position")
         else:

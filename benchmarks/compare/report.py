@@ -1,4 +1,4 @@
-"""Output of the results: performance.json, two tables for its page, and a table for the README."""
+"""Output of the results: performance.json, two tables for its page, and four rows for the README."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RESULTS: Final = ROOT / "docs" / "explanation" / "performance.json"
 PAGE: Final = RESULTS.with_suffix(".md")
 README: Final = ROOT / "README.md"
 HEAD: Final = (
-    "| what | bytes | messages/s | of raw | CPU µs/message at full speed, publisher / reader"
+    "| form | bytes | messages/s | relative to raw | CPU µs/message at full speed, publisher / reader"
     " | one-way p50 / p99 at 1 kHz, µs | at 100 Hz, µs | CPU µs/message at 1 kHz |"
 )
 
@@ -112,9 +112,9 @@ def as_markdown(results: Results, rounds: int) -> str:
         f"The message is one of a real flight, {FLIGHTS[DEFAULT_FLIGHT]['from']}: valid, with no origin and no terrain"
         " estimate.\n\n"
         f"{table(results)}\n\n"
-        "Messages of other flights: each cell has messages/s · the reader's CPU time at 1 kHz. The last column, ten"
+        "Messages of several flights: each cell has messages/s · the reader's CPU time at 1 kHz. The last column, ten"
         " vehicles at 100 Hz in one process, has publisher's CPU time / reader's CPU time / p50 latency. CPU times and"
-        " latencies are relative to `raw` (1.00).\n\n"
+        " latencies are relative to `raw` (1.00):\n\n"
         f"{flight_table(results)}"
     )
 

@@ -125,7 +125,7 @@ def keys_page() -> str:
             "`[layout, field 1, ... field n]` as msgpack, the fields in the order of "
             "[the message's page](../messages.md)."
             "\nEvery field is written at its full width, so a payload of a message always has the same size, with "
-            "every field at a fixed offset; any other valid msgpack encoding of the array is accepted too."
+            "every field at a fixed offset; any other valid msgpack encoding of the array is also accepted."
             "\nThe Zenoh encoding starts with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
             "mask with one bit for each field that was not provided, the lowest for `timestamp`."
             "\nFor any message that is not in this table, `;hash=...` follows the name: the first 32 hexadecimal "
@@ -164,8 +164,8 @@ def limits_page() -> str:
                     parts[title].append([cell(text), code(numbers[name]), code(name)])
     return page(
         "Limits and constants",
-        "The limits in the code, with the names of their constants. A vehicle name is 1 to 64 of `A-Z a-z 0-9 _ -`, "
-        "an instance 0 to 255.",
+        "The limits in the code, with the names of their constants. A vehicle name has 1 to 64 characters of "
+        "`A-Z a-z 0-9 _ -`, and an instance is a number from 0 to 255.",
         *(section(title, table(["limit", "value", "constant"], rows)) for title, rows in parts.items()),
         section("Durations", table(["duration [s]", "value", "field of `nedbus.timings.TIMINGS`"], _durations())),
     )
