@@ -41,7 +41,7 @@ def define(
 ) -> Definition[Message]:
     """Define a message that is not built in, from a log, a .msg file or a publisher.
 
-    `fields`: names and types, in CDR order. `meanings`: unit and meaning of fields, by name.
+    `fields`: names and types in CDR order, the order of layout "PX4". `meanings`: unit and meaning of fields, by name.
 
     Raises ValueError for an invalid name, a missing timestamp, too many fields or too many bytes.
     """
@@ -68,6 +68,6 @@ def define(
         for name, kind in types.items()
     }
     model = create_model(name, __base__=Message, __doc__="A message defined at run time.", **annotated)
-    model.LAYOUTS, model.RULES = (Layout("PX4", "*"),), rules
+    model.LAYOUTS, model.RULES = (Layout("PX4", " ".join(types)),), rules  # the model has timestamp first
     model.DEFINITION = Definition(model)
     return model.DEFINITION

@@ -258,7 +258,7 @@ class StreamRegistry:
         if own is None and key.type_hash == NO_HASH and len(supplied) == 1:
             [own] = supplied.values()
         if own is not None:
-            return known or own, own.current
+            return known or own, own.layouts["PX4"]
         hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
         if supplied:
             hashes = " or ".join(supplied)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +20,16 @@ import nedbus
 from nedbus.errors import ConfigError
 from nedbus.sources import SourceMessage, parse_source
 from nedbus.transport import NO_HASH, Attachment, Session, TopicKey
-from nedbus_msgs import ANY, VehicleLocalPosition, dds_type, define_msg, encode_with, hash_of, ros2_type
+from nedbus_msgs import (
+    ANY,
+    VehicleLocalPosition,
+    dds_type,
+    define_msg,
+    encode_with,
+    hash_of,
+    hash_of_msg,
+    ros2_type,
+)
 from tests.flights.local_position import (
     LAYOUTS,
     ROS2_TYPE,
@@ -255,6 +265,16 @@ def test_user_definition_adds_a_message(
         assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
     put(501.0)
     wait_for(lambda: source_status(bus).rejected == 1, what="the message out of range")
+
+
+def test_user_definition_has_timestamp_at_any_place(listen: Listen, zenoh_session: Session, tmp_path: Path) -> None:
+    """A message is decoded in the order of its definition, although nedbus's models begin with the timestamp."""
+    text = "float32 speed\nuint64 timestamp\n"
+    (tmp_path / "WheelEncoders.msg").write_text(text)
+    dds_name, type_hash = dds_type(ros2_type(define_msg("WheelEncoders", text))), hash_of_msg("WheelEncoders", text)
+    listener = listen(f"?msg={tmp_path}")
+    zenoh_session.put(f"0/fmu/out/wheel_encoders/{dds_name}/{type_hash}", struct.pack("<4sf4xQ", b"\0\1\0\0", 2.5, 7))
+    assert listener.receive()[0].fields == {"speed": 2.5, "timestamp": 7}
 
 
 def test_user_definition_decodes_newer_layout(
