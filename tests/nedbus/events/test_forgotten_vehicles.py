@@ -30,7 +30,8 @@ class World:
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.now, self.open, self.alive = 0.0, set[Address](), Counter[Address]()
         patch.setattr("nedbus.clock.steady", lambda: self.now)
-        patch.setattr("time.monotonic_ns", lambda: round(self.now * 1e9))
+        patch.setattr("nedbus.clock.utc_ns", lambda: self.now_ns)
+        patch.setattr("time.monotonic_ns", lambda: self.now_ns)
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
         registry = SimpleNamespace(publisher=self._publisher, shared_vehicles=set, publishers=())
         self.daemon._registry = cast("PublisherRegistry", registry)
@@ -43,6 +44,10 @@ class World:
         )
         self.reader, self.fleet = Observer(cast("Bus", bus), Selection("*")), Fleet()
 
+    @property
+    def now_ns(self) -> int:
+        return round(self.now * 1e9)
+
     def _publisher(self, address: Address, *_: object, **__: object) -> SimpleNamespace:
         self.open.add(address)
         known: Any = {"publish": lambda _: None, "relabel": lambda _: None, "close": lambda: self.open.discard(address)}
@@ -51,7 +56,7 @@ class World:
     def receive(self, address: Address) -> None:
         sent = message(round(self.now * 1e6) + 1, **VALID)
         self.output.publish_live(SourceMessage(0.0, address, sent.__dict__))
-        sample = Sample(sent, address, 0, _sent=round(self.now * 1e9))
+        sample = Sample(sent, address, self.now_ns, _sent=self.now_ns)
         self.reader.add(sample)
         self.fleet.add(sample, self.now)
 
