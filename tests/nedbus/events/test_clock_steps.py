@@ -63,6 +63,11 @@ class World:
     def offset(self) -> float:
         return self._step if self.now >= self._at else 0.0
 
+    @property
+    def arrival(self) -> int:
+        """Arrival time [ns] of a message that is read now; the clock is stepped between the two."""
+        return round((START + self.now + (self._step if self.now > self._at else 0.0)) * 1e9)
+
     def receive(self, address: Address, fields: dict[str, Any], lost: int = 0) -> None:
         """Deliver a message with another host's timestamp to the service, live or from a replay, and to the reader."""
         received = SourceMessage(0.0, address, fields, lost=lost)
@@ -72,7 +77,7 @@ class World:
             self.output.publish_replay(received, lossless=False)
         content = SimpleNamespace(**fields)
         sent = round((START + self.now) * 1e9)
-        self.reader.add(Sample(cast("Any", content), address, 0, lost=lost, _sent=sent))
+        self.reader.add(Sample(cast("Any", content), address, self.arrival, lost=lost, _sent=sent))
 
     def run(self) -> Iterator[object]:
         """Simulate GPS loss, silence, a rejection, a reset and losses; yield the events of service and reader."""
@@ -89,7 +94,7 @@ class World:
                 self.receive(address, message(stamp, **fields).__dict__, lost=3 * (tick == 30 * RATE))
             if tick == 20 * RATE:  # retained message of a vehicle switched off ten minutes ago
                 sent = round((START + self.now - 600) * 1e9)
-                self.reader.add(Sample(message(stamp, **VALID), Address("3", VLP), 0, _sent=sent))
+                self.reader.add(Sample(message(stamp, **VALID), Address("3", VLP), self.arrival, _sent=sent))
             if tick == 22 * RATE:
                 self.output.reject(Rejection("port", "not a message", address=ADDRESSES[0]))
             if tick % (RATE // 2) == 0:
