@@ -135,7 +135,7 @@ class Arrays(Generic[M]):
         return self.definition.model(**fields)
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
-        """Encode messages as CDR without validating them, one payload per element; the model must have all fields."""
+        """Encode messages as CDR payloads without validating them; the model must have all fields of the layout."""
         payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), self._cdr(layout))
         for name in layout.types:
             payloads[name] = array[name]

@@ -17,7 +17,7 @@ from .model.rules import Rule
 
 _NAME = re.compile(r"[A-Z][A-Za-z0-9]{0,63}")
 _FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}")
-_MAX_FIELDS: Final = 256  # three times the fields of PX4's largest message
+_MAX_FIELDS: Final = 256  # three times as many as PX4's largest message has
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 
 
@@ -43,16 +43,16 @@ def define(
 
     `fields`: names and types in CDR order, the order of layout "PX4". `meanings`: unit and meaning of fields, by name.
 
-    Raises ValueError for an invalid name, a missing timestamp, too many fields or too many bytes.
+    Raises ValueError for an invalid name, a missing timestamp, too many fields, or a payload beyond the size limit.
     """
     if not _NAME.fullmatch(name):
-        raise ValueError(f"{name!r:.100} is not a message name: expected CamelCase of at most 64 characters")
+        raise ValueError(f"{name!r:.100} is not a message name; expected CamelCase of at most 64 characters")
     types: dict[str, FieldType] = {}
     for field, kind in fields:
         if not _FIELD.fullmatch(field):
-            raise ValueError(f"invalid field name {field!r:.100}: expected lower_snake_case")
+            raise ValueError(f"invalid field name {field!r:.100}; expected lower_snake_case")
         if hasattr(Message, field):
-            raise ValueError(f"invalid field name {field!r}: the Python class Message has a member with this name")
+            raise ValueError(f"invalid field name {field!r}, which is a member of the Python class Message")
         if field in types:
             raise ValueError(f"duplicate field {field!r}, after flattening nested messages")
         types[field] = kind
@@ -62,7 +62,7 @@ def define(
         raise ValueError("missing field 'uint64 timestamp'")
     size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
     if size > PAYLOAD_LIMIT:
-        raise ValueError(f"{size} bytes, more than the limit of {PAYLOAD_LIMIT}")
+        raise ValueError(f"a payload of {size} bytes, more than the limit of {PAYLOAD_LIMIT}")
     annotated: dict[str, Any] = {
         name: (Timestamp if name == "timestamp" else kind.annotation, Field(description=meanings.get(name)))
         for name, kind in types.items()

@@ -1,4 +1,4 @@
-"""Root of the error tree, and the errors of the contract; `nedbus.errors` shows the whole tree."""
+"""The root of the error tree, and the errors that nedbus_msgs raises; `nedbus.errors` shows the whole tree."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -34,7 +34,7 @@ class LayoutError(NedbusError, ValueError):
 
 
 class DecodeError(NedbusError, ValueError):
-    """Raised when a payload is not a valid message of the name `message`; `reason` is one line."""
+    """Raised when a payload is not a valid message of the type `message`; `reason`: the cause, in one line."""
 
     def __init__(self, reason: str, message: str = "message") -> None:
         super().__init__(f"not a {message}: {reason}")
@@ -49,16 +49,15 @@ class UnknownLayoutError(DecodeError):
 
     def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
         readable = ", ".join(map(str, known))
-        super().__init__(
-            f"unknown layout {layout} with {count} fields (known: {readable}): update nedbus_msgs", message
-        )
+        fields = f"{count} field{'s' * (count != 1)}"
+        super().__init__(f"unknown layout {layout} with {fields} (known: {readable}); update nedbus_msgs", message)
         self.layout = layout
         self.count = count
         self.known = tuple(known)
 
 
 class InvalidMessageError(NedbusError, ValueError):
-    """Raised when a message to publish has a wrong type or an unknown field, or breaks a rule.
+    """Raised when a message to publish has an unknown or missing field, or a value of a wrong type, or breaks a rule.
 
     `reason`: one line with each invalid field, the broken rule and the value.
     `violations`: pairs of field and broken rule, without the value; `index`: position of the message in an array.
@@ -75,7 +74,7 @@ class InvalidMessageError(NedbusError, ValueError):
 
 
 class EncodeError(NedbusError, ValueError):
-    """Raised when values do not fit the types of their fields, because validation was bypassed."""
+    """Raised when unvalidated values cannot be encoded: a value does not fit its field, or their number is wrong."""
 
     def __init__(self, reason: str, message: str) -> None:
-        super().__init__(f"this message cannot be encoded ({reason}): build it with {message}(...)")
+        super().__init__(f"the message cannot be encoded ({reason}); create it with {message}(...), which validates it")

@@ -1,6 +1,6 @@
 """Frame conversions as in PX4: NED and ENU, FRD and FLU, local and global positions.
 
-Angles are radians, latitudes and longitudes degrees, lengths metres.
+Angles are in radians, latitudes and longitudes in degrees, lengths in metres.
 Source: PX4's MapProjection (azimuthal equidistant, on a sphere); results agree with PX4's own
 `vehicle_global_position` within 1e-10 degrees.
 """
@@ -49,7 +49,7 @@ def frd_to_flu(vector: Vector) -> Vector:
 
 
 def yaw_ned_to_enu(yaw: float) -> float:
-    """Convert a heading, clockwise from north, to ENU, counterclockwise from east, or vice versa; within [-pi, pi]."""
+    """Convert a heading (clockwise from north) to ENU yaw (counterclockwise from east) in [-pi, pi], or vice versa."""
     return wrap(math.pi / 2 - yaw)
 
 
@@ -60,12 +60,12 @@ def variances_ned_to_enu(variances: Vector) -> Vector:
 
 
 def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
-    """Convert an attitude (w, x, y, z) from PX4's rotation, FRD to NED, to ROS's, FLU to ENU, or vice versa."""
+    """Convert an attitude (w, x, y, z) from PX4's convention (FRD to NED) to ROS's (FLU to ENU), or vice versa."""
     w, x, y, z = (value * math.sqrt(0.5) for value in q)
     return w + z, x + y, x - y, w - z
 
 
-# Swaps of two axes, and half turns, are their own inverses.
+# Each conversion swaps axes or is a half turn, and is therefore its own inverse.
 enu_to_ned, flu_to_frd, yaw_enu_to_ned = ned_to_enu, frd_to_flu, yaw_ned_to_enu
 variances_enu_to_ned, quaternion_enu_to_ned = variances_ned_to_enu, quaternion_ned_to_enu
 
@@ -129,7 +129,7 @@ class MapProjection:
 
 
 class GlobalPosition(NamedTuple):
-    """Latitude and longitude [deg, WGS84], altitude above mean sea level [m], NaN if unknown."""
+    """Latitude and longitude [deg, WGS84], and altitude above mean sea level [m], which is NaN if unknown."""
 
     latitude: float
     longitude: float
@@ -137,7 +137,7 @@ class GlobalPosition(NamedTuple):
 
 
 def to_global(message: Message) -> GlobalPosition | None:
-    """Return the global position of a message, None without a global origin (`xy_global` is false) or x and y.
+    """Return the global position of a message; None if `xy_global` is false, or if x or y is not finite.
 
     The altitude is NaN while only the horizontal origin is known.
     x, y and z are converted whether valid or not; `message.global_position` is None while one of them is invalid.
@@ -149,7 +149,7 @@ def to_global(message: Message) -> GlobalPosition | None:
 
 
 def to_local(position: GlobalPosition, origin: Message) -> Vector | None:
-    """Return x, y and z of a global position in the local frame of a message, None without a global origin.
+    """Return x, y and z of a global position in the local frame of the message `origin`; None without a global origin.
 
     z is NaN while only the horizontal origin is known.
     """

@@ -39,7 +39,7 @@ class Provenance:
     `source`: the kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if unknown.
     `missing`: the fields that the source does not provide; they hold NaN, false or 0.
 
-    Raises ArgumentError for a source that is not 1 to 32 of a-z 0-9 _ -.
+    Raises ArgumentError for a source that is not 1 to 32 characters of a-z 0-9 _ -.
     """
 
     source: str | None = None

@@ -26,7 +26,7 @@ _VALUES: Final[Mapping[Quantity, tuple[str, ...]]] = {
 RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: f"{name}_reset_counter" for name in _VALUES}
 """The field that counts the resets of each quantity, modulo 256."""
 
-_TOLERANCE: Final = 2.0  # m between the observed jump at a new origin and a candidate explanation
+_TOLERANCE: Final = 2.0  # [m]; maximum difference between the observed jump at a new origin and a candidate
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Continuous:
 class ResetTracker:
     """Tracker of one stream, that is, one address; each EKF has its own resets and origin.
 
-    PX4's EKF2 selector does not report resets of `dist_bottom`, so that track may jump.
+    PX4's EKF2 selector does not report resets of `dist_bottom`, whose track may therefore jump.
     """
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class ResetTracker:
     def add(self, message: Message) -> Continuous:
         """Add the next message of the stream and return its values without jumps.
 
-        All tracks restart when the timestamp goes back, because the vehicle has rebooted.
+        All tracks restart when the timestamp goes back, which counts as a reboot of the vehicle.
         """
         last, self._last = self._last, message
         reset: set[Quantity] = set()
@@ -117,7 +117,7 @@ def _delta(name: Quantity, message: Message, count: int) -> Point | None:
 
 
 def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: int) -> Point | None:
-    """Return the jump at a new origin: zero, the delta or the shift of the origin, if one fits the values."""
+    """Return the jump at a new origin: zero, the delta or the origin's shift, by best fit; None if none fits."""
     fields = _VALUES[name]
     candidates = [(0.0,) * len(fields), _delta(name, message, count)]
     step = message.ref_alt - last.ref_alt

@@ -36,10 +36,10 @@ _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 class Address:
     """The address of a stream: vehicle, topic and, where the topic has instances, the uORB instance.
 
-    Addresses sort by these fields; no instance sorts before instance 0.
+    Addresses sort by these fields; an address without an instance sorts before instance 0.
 
-    Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, a topic that `get_topic` rejects, a
-    missing instance where the topic has instances, or an instance where it has none.
+    Raises AddressError for a vehicle that is not 1 to 64 characters of A-Z a-z 0-9 _ -, a topic that `get_topic`
+    rejects, an instance of a topic without instances, or none for a topic with instances.
     """
 
     vehicle: str
@@ -73,7 +73,7 @@ class Address:
         return self.key(prefix=prefix + REJECTED)
 
     def rate_key(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of this stream downsampled to `rate` messages per second; "*" is any rate."""
+        """Return the key expression of this stream downsampled to `rate` messages/s; "*" matches any rate."""
         return f"{self.key(prefix=prefix)}{RATE}{rate}"
 
     @property
@@ -133,7 +133,7 @@ class Selection:
         return f"{prefix}/{self.vehicle}/@alive/*/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
 
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of these streams downsampled to `rate` messages per second; "*" is any rate."""
+        """Return the key expression of these streams downsampled to `rate` messages/s; "*" matches any rate."""
         return f"{self.key_expr(prefix=prefix)}{RATE}{rate}"
 
 
@@ -162,7 +162,7 @@ def ack_key(key_expr: str) -> str:
 
 
 def get_topic(name: object) -> Topic:
-    """Return a topic by name; an unknown name counts as a PX4 topic that is not built in.
+    """Return a topic by name; an unknown name is assumed to be a PX4 topic that is not built in.
 
     Raises AddressError for a name that is not lower_snake_case, or looks like a misspelling of a built-in topic.
     """
@@ -219,7 +219,7 @@ def vehicle_name(vehicle: str | int) -> str:
 
 
 def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
-    """Return the topic of a message: a name as given; for a class, `topic` or its first topic.
+    """Return the topic of a message: a topic name unchanged; for a class, `topic` or, if None, its first topic.
 
     Raises AddressError for a topic of another message, and for a class that declares no topics.
     """
@@ -252,6 +252,6 @@ def _check_instance(topic: str, instance: int | None) -> None:
 
 
 def check_prefix(prefix: str) -> None:
-    """Raise AddressError for an invalid key prefix; it must be plain chunks separated by slashes."""
+    """Raise AddressError for a key prefix that is not chunks of A-Z a-z 0-9 _ - separated by slashes."""
     if not all(_CHUNK.fullmatch(chunk) for chunk in prefix.split("/")):
         raise AddressError("prefix", prefix, "chunks of A-Z a-z 0-9 _ - separated by /")

@@ -50,15 +50,15 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     cdr = cdr_layout(layout)
     min_size = len(HEADER) + cdr.body.size
     if payload[:2] != HEADER[:2]:
-        start = payload[:2].hex(" ") or "nothing"
-        raise DecodeError(f"payload starts with {start}, which is not little-endian CDR", definition.name)
+        start = f"starts with {payload[:2].hex(' ')}" if payload else "empty"
+        raise DecodeError(f"the payload is not little-endian CDR ({start})", definition.name)
     if not min_size <= len(payload) <= cdr.limit:
         sizes = f"{min_size}" if cdr.limit == min_size else f"{min_size} to {cdr.limit}"
         raise DecodeError(f"{len(payload)} bytes, expected {sizes} for layout {layout.name}", definition.name)
     if wrong := int.from_bytes(payload[:min_size], "little") & cdr.bool_mask:
         offset = ((wrong & -wrong).bit_length() - 1) // 8
         name = next(name for name, first in reversed([*cdr.offsets.items()]) if first <= offset)
-        raise DecodeError(f"{name}: {payload[offset]} is not a bool (0 or 1)", definition.name)
+        raise DecodeError(f"{name} is {payload[offset]}, not a bool (0 or 1)", definition.name)
     return cdr.validation.by_name(cdr.validation.unflatten(cdr.body.unpack_from(payload, len(HEADER))))
 
 
@@ -74,10 +74,10 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
     try:
         return HEADER + cdr.body.pack(*cdr.validation.flatten(cdr.validation.validate(row)))
     except ValidationError as exc:
-        name, problem = list(layout.types)[int(exc.errors()[0]["loc"][0])], "is not a"
+        name, problem = list(layout.types)[int(exc.errors()[0]["loc"][0])], "is not of type"
     except OverflowError:
         (name, _), problem = next(cdr.validation.overflows(fields)), "is beyond the range of"
-    raise EncodeError(f"{name}: {fields[name]!r:.40} {problem} {layout.types[name]}", definition.name)
+    raise EncodeError(f"{name}={fields[name]!r:.40} {problem} {layout.types[name]}", definition.name)
 
 
 @cached_on_owner

@@ -198,25 +198,26 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: NewerLayo
     try:
         array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0, unicode_errors="surrogateescape")
     except (ValueError, msgpack.UnpackException) as exc:
-        raise reject(f"{len(payload)} bytes are not a single msgpack value ({exc or type(exc).__name__})") from exc
+        reason = exc or type(exc).__name__
+        raise reject(f"the {len(payload)}-byte payload is not a single msgpack value ({reason})") from exc
     if not isinstance(array, tuple) or not array or type(array[0]) is not int:
-        raise reject("not an array that starts with a layout number")
+        raise reject("the payload is not an array that starts with a layout number")
     layout, *values = array
     known = {each.wire: each.fields for each in definition.layouts.values() if each.wire is not None}
     names = {**newer, **known}.get(layout)
     if names is None:
         raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
     if len(values) != len(names):
-        raise reject(f"{len(values)} fields, expected {len(names)} for layout {layout}")
+        raise reject(f"{len(values)} field{'s' * (len(values) != 1)}, expected {len(names)} for layout {layout}")
     fields: dict[str, object] = {}
     for name, value in zip(names, values, strict=True):
         # No field has nested arrays, and formatting a deeply nested value would overflow the stack.
         parts = value if isinstance(value, tuple) else (value,)
         if any(isinstance(part, tuple) for part in parts):
-            raise reject(f"{name}: nested array")
+            raise reject(f"{name} has a nested array")
         is_text = name in definition.types and definition.types[name].is_text
-        # The model would accept the float names of JSON, such as "NaN".
+        # The model would accept floats as text, such as "NaN", for JSON.
         if not is_text and any(isinstance(part, str) for part in parts):
-            raise reject(f"{name}: text, expected numbers or bools")
+            raise reject(f"{name} has text, expected numbers or bools")
         fields[name] = decode_text(value.encode(errors="surrogateescape")) if isinstance(value, str) else value
     return fields

@@ -12,7 +12,7 @@ class BatteryStatus(Message):
     One uORB instance per battery; id (from 1) identifies the battery on its vehicle.
     Unknown values are -1 in current_a, current_average_a, discharged_mah, remaining and scale, NaN in time_remaining_s
     and temperature, and 0 in the others. Simulators always report a current of -1 and no cell voltages.
-    Bit n (1 << n) of faults is number n of FAULT_; values 6 and 7 of warning are STATE_UNHEALTHY and STATE_CHARGING.
+    Bit n (1 << n) of faults stands for the FAULT_ constant n; warning may also be STATE_UNHEALTHY or STATE_CHARGING.
     """
 
     TOPICS = (Topic("battery_status", 1.0, "each battery's driver or estimator", instances=True, plain_first=True),)

@@ -7,10 +7,10 @@ from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, field
 class FailsafeFlags(Message):
     """Mode requirements and unmet conditions: the reasons why a vehicle does not arm, and the triggers of failsafes.
 
-    Bit n (1 << n) of a mode_req_ mask is mode n of VehicleStatus.NAVIGATION_STATE_.
-    An unmet requirement blocks a mode: for example, its bit in mode_req_local_position with local_position_invalid.
+    Bit n (1 << n) of a mode_req_ mask stands for mode n of VehicleStatus.NAVIGATION_STATE_.
+    A mode is blocked while, for example, its bit in mode_req_local_position and local_position_invalid are both set.
     Flags are false without a fault; remote_id_unhealthy and the like are also set if no such system is installed.
-    primary_geofence_breached (1.14) and local_position_accuracy_low (up to 1.16) have their current names here.
+    primary_geofence_breached (1.14) and local_position_accuracy_low (up to 1.16) are now without primary_ and local_.
     """
 
     TOPICS = (Topic("failsafe_flags", 2.0, "the commander", on_change=True),)

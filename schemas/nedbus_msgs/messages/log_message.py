@@ -7,7 +7,7 @@ from nedbus_msgs.model.px4_types import Char127, Uint8, field
 class LogMessage(Message):
     """A text message from the vehicle, such as "Failsafe activated"; it may contain any characters.
 
-    From a log: logged messages, and events formatted with the log's own metadata; over MAVLink: STATUSTEXT.
+    From a log, it is a logged message, or an event formatted with the log's own metadata; over MAVLink, a STATUSTEXT.
     A message that PX4 sends in several forms is published once.
     Text is truncated to 127 bytes of UTF-8. Messages come in bursts: subscribe in mode "every" to receive all of them.
     """

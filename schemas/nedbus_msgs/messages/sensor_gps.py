@@ -21,7 +21,7 @@ class SensorGps(Message):
 
     Layouts 1.13 and 1.14 have integers for latitude and longitude (1e-7 deg) and altitudes (mm), converted both ways.
     Since 1.17 jamming_state and spoofing_state 2 and 3 mean "mitigated" and "detected";
-    before, "warning" and "critical" (jamming), "indicated" and "multiple" (spoofing).
+    before 1.17, "warning" and "critical" (jamming), or "indicated" and "multiple" (spoofing).
     """
 
     TOPICS = (

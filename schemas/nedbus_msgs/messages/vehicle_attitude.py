@@ -12,7 +12,7 @@ class VehicleAttitude(Message):
     The attitude is unknown if the first element of q is NaN.
 
     delta_q_reset holds the latest reset: it explains a jump only if quat_reset_counter rose by exactly 1.
-    Some ground truth has all zeros there, which is not a rotation.
+    In some ground truth, delta_q_reset is all zeros, which is not a rotation.
     """
 
     TOPICS = (

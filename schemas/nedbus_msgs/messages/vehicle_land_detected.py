@@ -7,8 +7,8 @@ from nedbus_msgs.model.px4_types import Bool, field
 class VehicleLandDetected(Message):
     """Output of the land detector: in the air or on the ground, and the conditions behind it.
 
-    A multicopter lands in three stages, each after its conditions have held for a while: ground_contact, maybe_landed,
-    landed. So landed is set some time after touchdown; other vehicle types mostly use landed alone.
+    A multicopter's landing is detected in three stages, each after its conditions have held for a while:
+    ground_contact, maybe_landed, landed. So landed is set some time after touchdown; other types mostly use it alone.
     The flags from in_descend to close_to_ground_or_skipped_check are these conditions, for diagnosis.
     """
 

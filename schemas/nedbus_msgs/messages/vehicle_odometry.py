@@ -13,9 +13,9 @@ class VehicleOdometry(Message):
     reset_counter counts resets of all kinds; no field holds their deltas.
     timestamp_sample may be from another computer's clock, and later than timestamp.
 
-    Layout 1.13: its covariance matrices and q_offset are dropped on upgrade, NaN on downgrade; it has no quality.
+    Layout 1.13 lacks quality; its covariance matrices and q_offset are dropped on upgrade, and NaN on downgrade.
     local_frame (0 NED, 1 FRD, 2 other) becomes pose_frame. velocity_frame is copied, although 1.13 numbers it like
-    local_frame (and 3 body): EKF2 of 1.13 sends 1 for a velocity in NED, which is correct in newer layouts.
+    local_frame (plus 3 for body): EKF2 of 1.13 sends 1 for a velocity in NED, which is correct in newer layouts.
     """
 
     TOPICS = (

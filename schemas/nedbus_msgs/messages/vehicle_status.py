@@ -8,7 +8,7 @@ class VehicleStatus(Message):
     """State of a vehicle from PX4's commander: arming, mode, failsafe, links.
 
     nav_state is the active mode; nav_state_user_intention is the user's choice, which a failsafe does not change.
-    Bit n (1 << n) of a mask is mode n of NAVIGATION_STATE_; modes 23 to 30 are external modes of a companion.
+    Bit n (1 << n) of a mask stands for mode n of NAVIGATION_STATE_; modes 23 to 30 are external modes of a companion.
 
     The constants are those of main; some numbers had another meaning in older releases. Mode 8 was landing after an
     engine failure in 1.13. Up to 1.17, ARM_DISARM_REASON_ 6 was the safety button, 7 landing, 8 no take-off, 9 the

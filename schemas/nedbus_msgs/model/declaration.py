@@ -49,10 +49,10 @@ class Topic:
 class Layout:
     """One layout of a message.
 
-    `name`: the first PX4 release with it.
-    `text`: its field names, `*` for those of the model, or the difference from another layout:
-    `1.13, without a b, c: d e` lacks a and b, and has d and e after c; `d:uint8` overrides the type in the model.
-    `wire`: its number in payloads, or None.
+    `name`: the first PX4 release that has it.
+    `text`: its field names, `*` for those of the model, or a layout and the changes to it:
+    `1.13, without a b, c: d e` is 1.13 without a and b, and with d and e after c; `d:uint8` overrides the model's type.
+    `wire`: its number in payloads; None if it is not used in payloads.
     `aliases`: other ROS 2 types with this layout.
     `types`: its fields and their types in order, parsed from `text` by the definition.
     `caches`: see `cached_on_owner`.

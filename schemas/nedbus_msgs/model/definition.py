@@ -86,7 +86,7 @@ class Definition(Generic[M_co]):
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
-        """PX4's layouts by name, oldest first; the last one is the model's."""
+        """PX4's layouts by name, oldest first; the last one has exactly the model's fields."""
         found = {layout.name: replace(layout, types=self._types_of(layout.text)) for layout in self.model.LAYOUTS}
         if all(layout.wire is None for layout in found.values()):
             fields = list(self.types.items())
@@ -113,7 +113,7 @@ class Definition(Generic[M_co]):
         return type(f"{self.name}Row", (Row,), {**members, "__slots__": (), "_fields": self.names, "DEFINITION": self})
 
     def layout_of_release(self, release: str) -> Layout | None:
-        """Return the layout with this name or of this PX4 release; None if the release lacks the message."""
+        """Return the layout with this name or of this PX4 release; None if there is none."""
         if release in self.layouts or release not in RELEASES:
             return self.layouts.get(release)
         until = RELEASES[: RELEASES.index(release) + 1]
@@ -158,7 +158,7 @@ class Definition(Generic[M_co]):
         return UpgradePlan(frozenset({*direct, *converted}), in_order, converted)
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
-        """Convert to an older layout, in its field order; fields that the model lacks become "not provided"."""
+        """Convert the model's values to a layout, in its order; fields without a fitting value are "not provided"."""
         found: dict[str, object] = {}
         for name, kind in layout.types.items():
             value, old = values.get(name, kind.absent), self.older.get(name)

@@ -70,7 +70,7 @@ class Message(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Validate; if that fails, retry with NumPy and JSON values converted to Python's."""
+        """Validate; if that fails, retry with NumPy and JSON values converted to Python types."""
         try:
             return validate(fields)
         except ValidationError:
@@ -133,7 +133,7 @@ def _is_same(one: object, other: object) -> bool:
 
 
 def _to_python(value: Any, kind: FieldType | None) -> object:
-    """Convert a NumPy scalar or array, a list, or a float name in JSON to a Python value.
+    """Convert a NumPy scalar or array, a list, a char array, or a float as text, such as "NaN", to a Python value.
 
     Anything else is returned unchanged, for the model to reject.
     """
@@ -158,7 +158,7 @@ def fill(message: M, values: dict[str, object], given: Set[str]) -> M:
     return message
 
 
-# The slots that Pydantic's own validator sets (2.12 to 2.x); set directly because models are frozen.
+# The slots that Pydantic's own validator sets (since 2.12); set directly because models are frozen.
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
     for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")

@@ -46,7 +46,7 @@ ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 
 
 class FieldType(str):
-    """A PX4 field type by its name, such as `float32[4]`, with derived properties; `field_type` creates it.
+    """The name of a PX4 field type, such as `float32[4]`, with derived properties; created by `field_type`.
 
     `base`: the type of one value; `length`: number of elements of an array, None for a single value.
     `is_text`: True for a char array. `char[127]` is a single value, a `str` of at most 127 bytes of UTF-8, which ends
@@ -54,7 +54,7 @@ class FieldType(str):
     `is_array`: True for a type whose value is a tuple. `values`: number of values.
     `form`: the struct format of all values. `size`: size of one value in bytes.
     `is_float`: True for float types, whose values may be NaN. `limits`: minimum and maximum of an integer type.
-    `absent`: value of a field that is not provided: NaN, false or 0; in an array, for each element.
+    `absent`: value of a field that is not provided: NaN, false, 0 or empty text; an array has it in each element.
     """
 
     def __init__(self, _: str) -> None:
@@ -71,9 +71,9 @@ class FieldType(str):
         self.limits = (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
     def fit(self, value: Any) -> Any:
-        """Convert a number, or a tuple of at most this length, to this type; return None if a value would change.
+        """Convert a value, or a tuple of at most `length` values, to this type; return None if a value would change.
 
-        A shorter array is padded with "not provided".
+        A shorter tuple is padded with the value for "not provided".
         """
         base = BASES[self.base]
         if self.is_text:
@@ -128,12 +128,12 @@ class FieldType(str):
 
 
 def encode_text(text: str) -> bytes:
-    """Encode text as UTF-8 up to its first NUL; raise TypeError for any other type."""
+    """Encode text as UTF-8 up to its first NUL; raise TypeError if it is not a str."""
     return str.encode(text, "utf-8", "replace").partition(b"\0")[0]
 
 
 def decode_text(data: bytes) -> str:
-    """Decode a char array up to its first NUL; "?" replaces invalid UTF-8, and never makes the text longer."""
+    """Decode a char array up to its first NUL; invalid UTF-8 becomes "?", which, unlike U+FFFD, takes one byte."""
     return data.partition(b"\0")[0].decode(errors="replace").replace("\ufffd", "?")
 
 
@@ -145,14 +145,14 @@ def field_type(text: str) -> FieldType:
     """
     found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text, re.ASCII)
     if found is None:
-        raise ValueError(f"{text!r} is not a type: expected one such as uint8 or float32[4]")
+        raise ValueError(f"{text!r} is not a type; expected one such as uint8 or float32[4]")
     base, length = found.groups()
     if not (base == "char" and length):
         base = ALIASES.get(base, base)
     if base not in BASES:
-        raise ValueError(f"{base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
+        raise ValueError(f"{base!r} is not a type; expected {', '.join(BASES)}, or an array of fixed length")
     if length and not 0 < int(length) <= _MAX_ARRAY:
-        raise ValueError(f"array of {int(length)} elements: expected 1 to {_MAX_ARRAY}")
+        raise ValueError(f"array of {int(length)} elements; expected 1 to {_MAX_ARRAY}")
     return FieldType(f"{base}[{int(length)}]" if length else base)
 
 

@@ -81,7 +81,7 @@ class Validation:
         return self.by_name(self.unflatten(self._struct.unpack(packed)))
 
     def unpack(self, packed: bytes) -> Values:
-        """Unpack the values of all fields from consecutive native values."""
+        """Unpack the values of all fields from bytes in native order, without padding."""
         return self.unflatten(self._struct.unpack(packed))
 
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -45,14 +45,14 @@ def hash_of(layout: Layout, ros2_type: str) -> str:
 
 
 def type_hash(*types: tuple[str, Sequence[Mapping[str, object]]]) -> str:
-    """Return the RIHS01 hash of a type, given by name and fields, followed by its nested types sorted by name."""
+    """Return the RIHS01 hash of the first type, as name and fields; its nested types follow, sorted by name."""
     root, *referenced = [{"type_name": name, "fields": fields} for name, fields in types]
     content = {"type_description": root, "referenced_type_descriptions": referenced}
     return _RIHS01 + sha256(json.dumps(content).encode()).hexdigest()
 
 
 def describe_field(name: str, type_id: int, length: int, nested: str = "") -> Mapping[str, object]:
-    """Return a field of a type description; `length`: that of an array, else 0; `nested`: type of a nested message."""
+    """Return a field of a type description; `length`: 0 unless it is an array; `nested`: type of a nested message."""
     type_id += _ARRAY if length else 0
     kind = {"type_id": type_id, "capacity": length, "string_capacity": 0, "nested_type_name": nested}
     return {"name": name, "type": kind}

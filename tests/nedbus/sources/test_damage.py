@@ -431,7 +431,7 @@ def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
     service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
     assert service.exit_code == 0, service.err
     assert "rejected: message 2 of the recording: " in service.err
-    assert "xy_valid: 2 is not a bool (0 or 1)" in service.err
+    assert "xy_valid is 2, not a bool (0 or 1)" in service.err
     assert "done, 2 published, 1 rejected" in service.err
 
 

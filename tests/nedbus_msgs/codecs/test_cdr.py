@@ -99,7 +99,7 @@ def test_bool_other_than_0_or_1_is_rejected(layout: str) -> None:
     """A bool byte other than 0 or 1 is rejected, because it means that the payload has another layout."""
     payload = bytearray(encode_cdr(downgrade(VehicleLocalPosition(timestamp=7), layout), layout=layout))
     payload[4 + 16] = 2
-    with pytest.raises(DecodeError, match="xy_valid: 2"):
+    with pytest.raises(DecodeError, match="xy_valid is 2"):
         decode_cdr(bytes(payload), layout=layout)
 
 
@@ -132,7 +132,7 @@ def test_padding_is_ignored(layout: str, size: int) -> None:
 def test_value_of_wrong_type_or_range_raises(name: str, value: object) -> None:
     """A value that does not fit raises, with the name of the field; rclpy would send it as 0, 44 or infinity."""
     fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {name: value}
-    with pytest.raises(EncodeError, match=f"{name}: "):
+    with pytest.raises(EncodeError, match=f"{name}="):
         encode_cdr(fields, layout="1.16")
 
 

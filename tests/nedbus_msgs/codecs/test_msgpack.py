@@ -83,9 +83,9 @@ def test_newer_layout_is_decoded_by_field_names() -> None:
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
-        (b"", "0 bytes are not a single msgpack value"),
-        (b"\xc1", "1 bytes"),
-        (b"hello", "5 bytes"),
+        (b"", "the 0-byte payload is not a single msgpack value"),
+        (b"\xc1", "the 1-byte payload"),
+        (b"hello", "the 5-byte payload"),
         (msgpack.packb({"x": 1}), "not a single msgpack value"),
         (msgpack.packb([]), "does not start|not an array that starts"),
         (msgpack.packb(["1"]), "not an array that starts"),
@@ -95,9 +95,9 @@ def test_newer_layout_is_decoded_by_field_names() -> None:
         (b"\x00" * (PAYLOAD_LIMIT + 1), "4097 bytes, more than the limit of 4096"),
         (b"\xdd\xff\xff\xff\xff", "not a single msgpack value"),
         (b"\x91" * 4000, "not a single msgpack value"),
-        (REAL[0] + b"\x00", "245 bytes are not a single msgpack value"),
-        (REAL[0][:-1], "243 bytes are not a single msgpack value"),
-        (REAL[0][1:], "243 bytes are not a single msgpack value"),
+        (REAL[0] + b"\x00", "the 245-byte payload is not a single msgpack value"),
+        (REAL[0][:-1], "the 243-byte payload is not a single msgpack value"),
+        (REAL[0][1:], "the 243-byte payload is not a single msgpack value"),
     ],
 )
 def test_invalid_payload_error_states_the_reason(payload: bytes, reason: str) -> None:
@@ -188,5 +188,5 @@ def test_deeply_nested_array_is_rejected() -> None:
     deep = b"\x91" * 400 + b"\x01"
     values = [msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()]
     values[6] = deep
-    with pytest.raises(DecodeError, match="x: nested array"):
+    with pytest.raises(DecodeError, match="x has a nested array"):
         decode(b"\xdc\x00\x36\x01" + b"".join(values))
