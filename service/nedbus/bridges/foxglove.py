@@ -112,7 +112,7 @@ class FoxgloveServer:
             self._unseen.pop(address, None)
             channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
         elif not get_topic(address.topic).rate:
-            self._unseen[address] = message, time_ns  # the stream may have no other message
+            self._unseen[address] = message, time_ns  # the stream may never have another message
 
     def _log_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         if vehicle not in self._channels:
