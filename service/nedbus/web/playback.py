@@ -83,7 +83,7 @@ class Recording:
 
 
 class Player:
-    """Playback of a recording for one viewer; `fleet` is at the playback position.
+    """Playback of a recording for one viewer; `fleet`: its state at the playback position.
 
     `on_seek`: called after each seek; `controls`: play button, speed menu and slider.
     """
