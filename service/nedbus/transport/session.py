@@ -24,7 +24,7 @@ from .tls import Tls
 Session = zenoh.Session
 RawSample = zenoh.Sample
 
-# Shared memory limits a router to 351 local sessions, without any gain at 244 bytes.
+# Shared memory limits a router to 351 local sessions, without any gain for messages of 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
 # Queues are longer than Zenoh's default: two batches are too few for the bursts of a fleet.
 # Sessions add no timestamps: publishers stamp each message, so a router never replaces a timestamp.

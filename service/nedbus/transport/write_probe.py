@@ -1,6 +1,6 @@
 """Probe for write permission: Zenoh drops forbidden messages without an error at the sender.
 
-One session subscribes to vehicles' keys that are not topics, and another session publishes on them. If no message
+One session subscribes to a key below each vehicle that is not a topic; another session publishes on it. If no message
 arrives although the router has announced the subscriber to the publisher, the router denies the write.
 """
 
