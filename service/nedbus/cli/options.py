@@ -173,7 +173,7 @@ _FACTORIES: Final[Mapping[str, Callable[..., Any]]] = {
 }  # fmt: skip
 
 
-def require_one(flags: Mapping[str, bool]) -> None:
+def allow_one(flags: Mapping[str, bool]) -> None:
     """Raise ConfigError if more than one of these flags is set."""
     given = [name for name, is_set in flags.items() if is_set]
     if len(given) > 1:

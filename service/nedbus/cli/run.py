@@ -99,9 +99,9 @@ def _await_end(thread: threading.Thread, closing: threading.Event, signals: list
         thread.join(_CLOSE_TIMEOUT)
         if not thread.is_alive():
             return
-        reason = f"links not closed within {_CLOSE_TIMEOUT:g} s: messages not yet sent on them are lost"
+        reason = f"links not closed within {_CLOSE_TIMEOUT:g} s, exiting anyway: messages not yet sent on them are lost"
     else:
-        reason = f"still running {_END_TIMEOUT:g} s after the signal: unfinished work is lost"
+        reason = f"command still running {_END_TIMEOUT:g} s after the signal, exiting anyway: unfinished work is lost"
     _log.error(reason, extra=about("shutdown"))
     sys.stderr.flush()
     os._exit(130 if signals[0] == signal.SIGINT else 1)

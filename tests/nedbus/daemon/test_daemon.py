@@ -504,7 +504,7 @@ def test_duplicate_vehicle_is_logged_and_reported(run_nedbus: Start, endpoint: s
     assert bus.publishers()[Address("1", VLP)] == 2
     unhealthy = run_command("health", NEDBUS_CONNECT=endpoint)
     assert unhealthy.exit_code == 1
-    assert "vehicle 1 has several publishers: stop one, or give it another vehicle" in unhealthy.err
+    assert "vehicle 1 has several publishers: stop one, or give it another vehicle id" in unhealthy.err
     measured = run_command("hz", "--duration", "2", "--json", VLP, NEDBUS_CONNECT=endpoint)
     assert '"state": "duplicate", "reason": "2 publishers: ' in measured.out
     assert f"1/{VLP}" in (listed := run_command("list", NEDBUS_CONNECT=endpoint).out)

@@ -155,7 +155,7 @@ class CsvLines:
             self._head = head
             return f"{csv_line(head)}\n{csv_line(cells)}"
         if head != self._head:
-            text = f"a table has only one message type, and {sample.address} has another: select a topic"
+            text = f"a CSV table has only one message type, but {sample.address} has another: select a topic"
             raise ConfigError("--csv", text)
         return csv_line(cells)
 
