@@ -182,7 +182,7 @@ class FoxgloveServer:
 def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
     """Return the rotation from FLU to ENU as (x, y, z, w).
 
-    Its source is a VehicleAttitude within 0.5 s of the position, else the heading; without either, it faces east.
+    It comes from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, FLU faces east.
     """
     if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
         w, x, y, z = quaternion_ned_to_enu(attitude.q)

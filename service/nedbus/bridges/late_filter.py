@@ -1,4 +1,4 @@
-"""Filter for late samples that needs no synchronized clocks; no I/O."""
+"""Filter for late samples, without synchronized clocks; no I/O."""
 
 from collections import Counter
 from typing import Any, Final
@@ -62,7 +62,7 @@ class LateFilter:
 class _PublisherClock:
     """Clock offset of one publisher, estimated from timestamps and arrival times [ns].
 
-    Arrival time minus timestamp is clock offset plus transit time; the fastest sample has the minimum. The lateness of
+    Arrival time minus timestamp is clock offset plus transit time, and smallest for the fastest sample. The lateness of
     a sample is its excess over this minimum, so clocks need not agree. A clock set back is detected within 2 * DRIFT.
     """
 

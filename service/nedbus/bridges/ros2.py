@@ -57,7 +57,7 @@ class Ros2Bridge:
 
     `selection`: the addresses to publish, by default all; `layout`: a PX4 release or a layout.
     `hashed`: False for ROS 2 Humble, whose keys have no type hash.
-    `observer`: a second session to the same router, to detect access control, which denies silently.
+    `observer`: a second session to the same router, to detect access control, which denies without an error.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -217,7 +217,7 @@ class Ros2Bridge:
         return transport.TopicKey(self._domain, self._arbiter.topic_of(address), name, type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
-        """Return whether an address is selected and the workspace has its message; log a missing message once."""
+        """Return whether an address is selected and the workspace has its message type; log a missing type once."""
         if not self._selection.matches(address):
             return False
         if address.topic in self._types:

@@ -29,7 +29,7 @@ def probe_writes(
 
     `timeout`: time for the router to announce the subscriber, and again for an allowed message to arrive [s].
     """
-    probe = f"@doctor/{secrets.token_hex(8)}"  # `**` of readers does not match a chunk with @
+    probe = f"@doctor/{secrets.token_hex(8)}"  # the `**` of readers does not match a chunk that starts with @
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
     missing = dict(keys)
 

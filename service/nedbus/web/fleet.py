@@ -81,7 +81,7 @@ class VehicleView:
 
     @property
     def grade(self) -> str:
-        """The severity of the state, "ok" instead of "info"."""
+        """The severity of the state, with "ok" for "info"."""
         return "ok" if self.state.severity == "info" else self.state.severity
 
     @property

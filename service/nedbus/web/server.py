@@ -86,7 +86,7 @@ def serve_recording(
 ) -> None:
     """Serve a page of recordings until `stop` is set; each viewer has its own playback position.
 
-    Raises ConfigError and SourceError if a file cannot be read, and the errors of `serve_live`.
+    Raises ConfigError or SourceError if a file cannot be read, and the errors of `serve_live`.
     """
     recording, background = Recording(*paths), None if options.background is None else Background(options.background)
 

@@ -102,7 +102,7 @@ class Viewer:
             player.on_seek = self._update_text_soon
 
     def update(self) -> None:
-        """Send changes: map at each tick, text and plots twice a second; do nothing while the browser falls behind."""
+        """Send changes: map at each tick, text and plots twice a second; do nothing while the browser is behind."""
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]

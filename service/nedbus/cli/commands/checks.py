@@ -45,7 +45,7 @@ def health(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Check services, sources, messages and vehicles; exit 0 if healthy.
+    """Check services, sources, messages and vehicles; exit with 0 if healthy.
 
     Otherwise exits with 1, and writes one line per fault to stderr.
 
@@ -219,7 +219,7 @@ def check(
 ) -> None:
     """Check settings and router files.
 
-    Reports every mistake with file, line and column. Exits with 2 if there is one.
+    Reports every mistake with file, line and column. Exits with 2 if there are any.
     """
     mistakes = [] if files else check_service(offline=offline)
     for file in files or ():
@@ -229,7 +229,7 @@ def check(
 
 
 def report_mistakes(mistakes: Iterable[ConfigError]) -> None:
-    """Write each mistake to stderr once; exit with 2 if there is one."""
+    """Write each mistake to stderr once; exit with 2 if there are any."""
     lines = dict.fromkeys(map(str, mistakes))
     for line in lines:
         write_stderr(f"nedbus: {line}")

@@ -28,7 +28,7 @@ _HINT: Final = """In a second terminal:
 
 
 def log_progress(daemon: Daemon) -> Iterator[None]:
-    """Log the progress of a daemon when a report is due; to be advanced several times a second.
+    """Log the progress of a daemon when a report is due; advance it several times a second.
 
     Once the daemon is ready, commands to try in a second terminal are written to stderr.
     """
