@@ -245,7 +245,7 @@ def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.
     file = tmp_path / "router.json5"
     file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
     open_router(listen=(free_endpoint(),), config_file=file).close()
-    ignored = "plugin rest and plugin storage_manager not loaded: unlike zenohd, this router loads no plugins"
+    ignored = "plugin rest and plugin storage_manager not loaded, because this router, unlike zenohd, loads no plugins"
     assert caplog.messages == [f"{file}: {ignored}"]
     file.write_text("{ plugins: { rest: { __required__: true } } }")
     with pytest.raises(ConfigError, match="it requires plugin rest, but this router loads no plugins: run it with"):

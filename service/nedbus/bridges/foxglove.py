@@ -112,7 +112,7 @@ class FoxgloveServer:
             self._unseen.pop(address, None)
             channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
         elif not get_topic(address.topic).rate:
-            self._unseen[address] = message, time_ns  # the stream may have no other message
+            self._unseen[address] = message, time_ns  # the stream may never have another message
 
     def _log_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         if vehicle not in self._channels:
@@ -182,7 +182,7 @@ class FoxgloveServer:
 def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
     """Return the rotation from FLU to ENU as (x, y, z, w).
 
-    Its source is a VehicleAttitude within 0.5 s of the position, else the heading; without either, it faces east.
+    It comes from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, FLU faces east.
     """
     if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
         w, x, y, z = quaternion_ned_to_enu(attitude.q)

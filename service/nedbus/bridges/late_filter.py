@@ -1,4 +1,4 @@
-"""Filter for late samples that needs no synchronized clocks; no I/O."""
+"""Filter for late samples, without synchronized clocks; no I/O."""
 
 from collections import Counter
 from typing import Any, Final
@@ -50,10 +50,10 @@ class LateFilter:
         if not self._held:
             return None
         first, *others = sorted(self._held)
-        addresses = f"{first} and {len(others)} others" if others else f"{first}"
+        addresses = f"{first} and {len(others)} more" if others else f"{first}"
         lateness = f", up to {self._latest / 1e9:.1f} s late" if self._latest else ""
         count = self._held.total()
-        text = f"{addresses}: {count} old message{'s' if count > 1 else ''} held back{lateness}"
+        text = f"held back {count} old message{'s' if count > 1 else ''} of {addresses}{lateness}"
         self._held.clear()
         self._latest = 0
         return text
@@ -62,8 +62,8 @@ class LateFilter:
 class _PublisherClock:
     """Clock offset of one publisher, estimated from timestamps and arrival times [ns].
 
-    Arrival time minus timestamp is clock offset plus transit time; the fastest sample has the minimum. The lateness of
-    a sample is its excess over it, so the clocks need not agree. A clock set back is detected within 2 * DRIFT.
+    Arrival time minus timestamp is clock offset plus transit time, and smallest for the fastest sample. The lateness of
+    a sample is its excess over this minimum, so clocks need not agree. A clock set back is detected within 2 * DRIFT.
     """
 
     def __init__(self, sent: int, arrived: int) -> None:

@@ -39,11 +39,11 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
-_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; longer than the 20 s of recovery
+_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; longer than the 20 s of loss recovery
 _MAX_UNSUPPORTED: Final = 1000  # addresses that are logged as unsupported
 _REFUSALS: Final = {
-    "conflict": "%s is not published: %s already uses the topic /%s: set --namespace",
-    "defer": "%s is not published: node %s already publishes /%s",
+    "conflict": "%s is not published to ROS 2, because %s already uses the topic /%s: set --namespace",
+    "defer": "%s is not published to ROS 2, because node %s already publishes /%s",
 }  # by action
 
 
@@ -51,13 +51,13 @@ class Ros2Bridge:
     """Publish addresses of a bus to ROS 2 nodes that use rmw_zenoh on the router of `session`.
 
     While a vehicle is published, `ros2 topic list` shows its topics as `/fmu/out/<topic>`, prefixed with a namespace
-    (see `Ros2Arbiter`). Instances are named `estimator_local_position_0`, `_1` and so on; the first instance of
-    `battery_status` and other topics of PX4's default list has no suffix.
-    A topic that another node already publishes is not published, for example that of a PX4 with its own Zenoh client.
+    (see `Ros2Arbiter`). The topic of an instance ends with its number, as in `estimator_local_position_0`; the first
+    instance of `battery_status` and other topics of PX4's default list has no suffix.
+    A topic that another node, such as PX4's Zenoh module, already publishes in the same layout is not published.
 
     `selection`: the addresses to publish, by default all; `layout`: a PX4 release or a layout.
     `hashed`: False for ROS 2 Humble, whose keys have no type hash.
-    `observer`: a second session to the same router, to detect access control, which denies silently.
+    `observer`: a second session to the same router, to detect access control, which denies without an error.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -122,7 +122,7 @@ class Ros2Bridge:
                 end = time.monotonic() + TIMINGS.token_visible  # restart the timeout while there is no link
             elif time.monotonic() > end:
                 raise NedbusError(
-                    "the router's access control denies ROS 2's keys, so no ROS 2 node sees this bridge:"
+                    "no ROS 2 node sees this bridge, probably because the router's access control denies ROS 2's keys:"
                     " start ROS 2's router and set its endpoint with --to"
                 )
             stop.wait(0.05)
@@ -149,7 +149,7 @@ class Ros2Bridge:
     def _poll(self) -> None:
         """Report late samples, query the bus and the ROS 2 nodes, and apply the decisions."""
         if held_back := self._late_filter.report():
-            _log.warning("%s: ROS 2 nodes would treat them as current", held_back, extra=about("bridge_late"))
+            _log.warning("%s; ROS 2 nodes would treat old messages as current", held_back, extra=about("bridge_late"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
             self._held.pop(address, None)
@@ -217,7 +217,7 @@ class Ros2Bridge:
         return transport.TopicKey(self._domain, self._arbiter.topic_of(address), name, type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
-        """Return whether an address is selected and the workspace has its message; log a missing message once."""
+        """Return whether an address is selected and the workspace has its message type; log a missing type once."""
         if not self._selection.matches(address):
             return False
         if address.topic in self._types:

@@ -31,7 +31,7 @@ class Decision:
 class Ros2Arbiter:
     """Decide which addresses to publish, from those on the bus and the publishers of other ROS 2 nodes.
 
-    The topics of every vehicle except "1" have a namespace: the one in `namespaces`, else the vehicle's name, with the
+    The namespace of a vehicle's topics is the one in `namespaces`, else none for "1", else the vehicle's name, with the
     prefix `px4_` unless it starts with a letter.
     `published`: the topic of each published address.
 
@@ -60,7 +60,7 @@ class Ros2Arbiter:
     ) -> list[Decision]:
         """Return the changes since the last call.
 
-        `addresses`: the addresses on the bus; `other_nodes`: the other node that publishes the topic of an address.
+        `addresses`: the addresses on the bus; `other_nodes`: by address, the other node that publishes its topic.
         `now`: time on any monotonic clock [s].
         """
         present = set(addresses)

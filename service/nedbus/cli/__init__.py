@@ -16,14 +16,14 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the imports
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass  # a socket could reuse the descriptor of a closed standard stream, and receive the output
+        pass  # otherwise a socket could get the descriptor of a closed standard stream, and receive the output
     os.close(descriptor)
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - open until exit
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # before the slow imports below
         return
-    atexit.register(_give_up_stderr)
+    atexit.register(_discard_broken_stderr)
     gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
     from .app import app
 
@@ -31,7 +31,7 @@ def main() -> None:
     app()
 
 
-def _give_up_stderr() -> None:
+def _discard_broken_stderr() -> None:
     """Redirect stderr to /dev/null if its terminal is gone: flushing it at exit would fail with exit code 120."""
     try:
         sys.stderr.flush()

@@ -25,7 +25,7 @@ def follow(
 ) -> None:
     """Handle samples until `count` are counted or `duration` [s] has passed.
 
-    `handle` returns False for a sample that does not count. Once a second it checks the link and calls `each_second`.
+    `handle` returns False for a sample that does not count. Every second, the link is checked and `each_second` called.
 
     Raises NoDataError if no sample was counted.
     """
@@ -38,7 +38,7 @@ def follow(
             next_second = max(next_second + 1.0, now)
             if connected != bus.connected:
                 connected = not connected
-                text = "the link to %s is up again" if connected else "the link to %s is lost: still trying"
+                text = "the link to %s is up again" if connected else "the link to %s is lost: reconnecting"
                 event = "link_up" if connected else "link_lost"
                 _log.warning(text, " or ".join(bus.routers), extra=about(event))
             each_second()
@@ -57,4 +57,4 @@ def follow(
 
 def write_notice(subscription: Subscription) -> None:
     """Notify the user on stderr that a subscription has not received a message yet."""
-    write_stderr(f"nothing on {subscription.name} yet, still waiting; 'nedbus list' shows the published streams")
+    write_stderr(f"no message on {subscription.name} yet, still waiting; 'nedbus list' shows the published streams")

@@ -87,7 +87,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options_of(factory: Callable[..., object]) -> list[inspect.Parameter]:
-    """Return the parameters with defaults; `**settings_options` expands to those of `_read_settings`."""
+    """Return a factory's parameters that have defaults; `**settings_options` expands to those of `_read_settings`."""
     parameters = [*inspect.signature(factory, eval_str=True).parameters.values()]
     options = [each for each in parameters if each.default is not each.empty]
     return [*_options_of(_read_settings), *options] if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD else options
@@ -173,7 +173,7 @@ _FACTORIES: Final[Mapping[str, Callable[..., Any]]] = {
 }  # fmt: skip
 
 
-def require_one(flags: Mapping[str, bool]) -> None:
+def allow_one(flags: Mapping[str, bool]) -> None:
     """Raise ConfigError if more than one of these flags is set."""
     given = [name for name, is_set in flags.items() if is_set]
     if len(given) > 1:

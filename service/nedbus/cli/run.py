@@ -37,7 +37,7 @@ def run_until_stopped(
     `on_stop` is called from the signal handler, `on_tick` twice a second from the main thread. `on_hangup` is called
     instead of stopping after a SIGHUP that does not come from a closed terminal. `nohup` keeps SIGHUP ignored.
     `body` sets `closing` when only its session is left to close, which has a shorter timeout.
-    The main thread does nothing else, to handle signals at once even while Zenoh blocks.
+    The main thread does nothing else, so it handles signals at once even while Zenoh blocks.
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
@@ -99,9 +99,9 @@ def _await_end(thread: threading.Thread, closing: threading.Event, signals: list
         thread.join(_CLOSE_TIMEOUT)
         if not thread.is_alive():
             return
-        reason = f"links not closed within {_CLOSE_TIMEOUT:g} s: messages not yet sent on them are lost"
+        reason = f"links not closed within {_CLOSE_TIMEOUT:g} s, exiting anyway: messages not yet sent on them are lost"
     else:
-        reason = f"still running {_END_TIMEOUT:g} s after the signal: unfinished work is lost"
+        reason = f"command still running {_END_TIMEOUT:g} s after the signal, exiting anyway: unfinished work is lost"
     _log.error(reason, extra=about("shutdown"))
     sys.stderr.flush()
     os._exit(130 if signals[0] == signal.SIGINT else 1)

@@ -46,7 +46,7 @@ class Notifier:
 
     WATCHDOG is sent only while everything works: Zenoh returns the number of sessions, the main thread has called
     `tick` since the last ping, and no source has spent half of systemd's limit on one message.
-    A separate thread sends it: the main thread must handle signals even while Zenoh blocks.
+    A separate thread sends it, because the main thread must handle signals even while Zenoh blocks.
     """
 
     def __init__(self, daemon: Daemon, *, environment: Mapping[str, str] = os.environ) -> None:

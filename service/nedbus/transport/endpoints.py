@@ -44,7 +44,7 @@ def resolution_error(endpoints: Sequence[str]) -> str | None:
             return None
         hosts.append(parts[1])
     names = " and ".join(hosts)
-    return f"cannot resolve {names}: correct the name, or use the IP address" if hosts else None
+    return f"cannot resolve {names}; check the spelling, or use an IP address" if hosts else None
 
 
 def dial_endpoint(endpoint: str) -> str:

@@ -33,9 +33,9 @@ class LivelinessTokens:
     """The liveliness tokens that match a key expression. Not thread-safe.
 
     A router sends a new subscriber all tokens at once, then each change. Listing takes time quadratic in the number of
-    tokens: one second for 4,000. The reply to a query on a key without a token (the probe) follows all tokens, and so
-    marks the end of the list. If the queue of changes overflows, the subscription is declared again. At most 10,000
-    tokens are stored; a warning is logged if there are more.
+    tokens, about one second for 4,000. The reply to a query on a key without a token (the probe) follows all tokens,
+    and so marks the end of the list. If the queue of changes overflows, the subscription is declared again. At most
+    10,000 tokens are stored; a warning is logged if there are more.
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
@@ -98,7 +98,7 @@ class LivelinessTokens:
             return False
         if alive and len(self._keys) >= MAX_REPLIES:
             if self._retry == math.inf:
-                text = "%s: more than %d liveliness tokens: some vehicles are missing"
+                text = "%s: more than %d liveliness tokens, so some streams are missing"
                 _log.warning(text, self._key_expr, MAX_REPLIES, extra=about("incomplete"))
             self._retry = time.monotonic() + TIMINGS.tokens_retry
             return False

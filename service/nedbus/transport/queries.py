@@ -78,8 +78,8 @@ def query(session: Session, selector: str, *, timeout: float) -> list[RawSample]
         else:
             accepted.append(sample)
     if dropped:
-        text = "%s: dropped %d replies beyond the limits of a query"
-        _log.warning(text, selector, dropped, extra=about("incomplete"))
+        text = "%s: dropped %d of %d replies beyond the limits of a query, so the result is incomplete"
+        _log.warning(text, selector, dropped, len(accepted) + dropped, extra=about("incomplete"))
     return accepted
 
 

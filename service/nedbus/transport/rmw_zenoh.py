@@ -118,7 +118,7 @@ def gid_of_token(token: str) -> bytes:
 
 
 def node_token(domain: int, session: str, node: str) -> str:
-    """Return the liveliness token of a node without a namespace, which makes ROS 2 list it."""
+    """Return the liveliness token that makes ROS 2 list a node; the node has no namespace."""
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{node}"
 
 

@@ -57,8 +57,8 @@ def open_router(
         settings = {
             **COMMON_SETTINGS,
             "mode": "router",
-            # Longer than the lease of clients, so a router drops a silent client before it joins another router: if two
-            # routers have the same client, Zenoh 1.10.2 loses its queryables on a third router that joins later.
+            # Longer than the clients' lease, so a router drops a silent client before the client joins another router.
+            # If two routers have the same client, Zenoh 1.10.2 loses its queryables on a third router that joins later.
             "transport/link/tx/lease": round(1000 * TIMINGS.router_lease),
             "scouting/delay": 0,  # do not wait 0.5 s for scouting replies: scouting is off
             "listen/endpoints": list(router_endpoints(listen)),
@@ -71,7 +71,7 @@ def open_router(
     else:
         config = _read_config(config_file)
         if plugins := _get(config, "plugins"):
-            text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
+            text = "%s: %s not loaded, because this router, unlike zenohd, loads no plugins"
             _log.warning(text, config_file, _plugin_names(plugins), extra=about("router"))
         for name, file in _tls_files(config).items():  # because Zenoh's error does not name the file
             if not os.access(file, os.R_OK):
@@ -190,7 +190,7 @@ def _parse_config(path: Path) -> zenoh.Config:
 
 @dataclass(frozen=True, slots=True)
 class RouterState:
-    """State of a router: Zenoh id, number of open sessions, including sessions to other routers, and session limit.
+    """State of a router: Zenoh id, number of open sessions (including those to other routers), and session limit.
 
     `max_sessions`: None unless the router's configuration has it in `metadata`; Zenoh does not report its limit.
     """

@@ -73,7 +73,7 @@ class Uplinks:
                 text = f"joined {name}" if was_up is None else f"the link to {name} is up after {lasted:.0f} s"
                 _log.info("%s", text, extra=about("link_up"))
             elif was_up:
-                _log.warning("the link to %s is lost: still trying", name, extra=about("link_lost"))
+                _log.warning("the link to %s is lost: reconnecting", name, extra=about("link_lost"))
             else:
                 _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link_lost"))
 
@@ -91,7 +91,7 @@ class Uplinks:
     def _explain(self, endpoint: str) -> str:
         if not endpoint.startswith(("tls/", "quic/")):
             return ""
-        missing = "no certificates are configured: set tls_ca, tls_certificate and tls_key"
+        missing = "set tls_ca, tls_certificate and tls_key, which are missing"
         explanation = self._tls.explain() if self._tls else missing
         return f" ({explanation})" if explanation else ""
 

@@ -24,7 +24,7 @@ from .tls import Tls
 Session = zenoh.Session
 RawSample = zenoh.Sample
 
-# Shared memory limits a router to 351 local sessions, without any gain at 244 bytes.
+# Shared memory limits a router to 351 local sessions, without any gain for messages of 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
 # Queues are longer than Zenoh's default: two batches are too few for the bursts of a fleet.
 # Sessions add no timestamps: publishers stamp each message, so a router never replaces a timestamp.
@@ -86,7 +86,7 @@ def open_client(
         "connect/timeout_ms": 0,
         "connect/retry": random_backoff(),
         "listen/endpoints": [],
-        # With key and headers; larger messages from peers are rejected.
+        # Including key and headers; larger messages from peers are rejected.
         "transport/link/rx/max_message_size": MAX_REPLY_BYTES + 2**12,
     }
     timeout = math.inf if timeout is None else timeout
@@ -113,7 +113,7 @@ def open_client(
 
 
 def random_backoff() -> dict[str, float]:
-    """Return Zenoh's `connect/retry` section with a random backoff, so a fleet does not reconnect all at once."""
+    """Return Zenoh's `connect/retry` section with a random backoff, so a fleet does not reconnect simultaneously."""
     first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - not a secret
     return {"period_init_ms": round(first), "period_max_ms": round(longest), "period_increase_factor": 1.5}
 
@@ -145,7 +145,7 @@ def translate_zenoh_errors() -> Iterator[None]:
 def translate_error(error: zenoh.ZError) -> NedbusError:
     """Return the error that `translate_zenoh_errors` raises for a Zenoh error.
 
-    The text decides, because `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
+    The error text decides, because `Session.is_closed` waits for a Zenoh lock without releasing the GIL.
     """
     return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
 

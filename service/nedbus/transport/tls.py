@@ -41,7 +41,7 @@ class Tls:
     def zenoh_settings(self) -> dict[str, object]:
         """Return Zenoh's `transport/link/tls` section.
 
-        Raises ConfigError for a file that is unreadable or of another kind, and for a key that does not match.
+        Raises ConfigError for a file that is unreadable or of the wrong kind, and for a key that does not match.
         """
         check_pem(self.ca, "CERTIFICATE")
         settings: dict[str, object] = {"root_ca_certificate": str(self.ca)}

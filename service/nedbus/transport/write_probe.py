@@ -1,6 +1,6 @@
 """Probe for write permission: Zenoh drops forbidden messages without an error at the sender.
 
-One session subscribes to vehicles' keys that are not topics, and another session publishes on them. If no message
+One session subscribes to a key below each vehicle that is not a topic; another session publishes on it. If no message
 arrives although the router has announced the subscriber to the publisher, the router denies the write.
 """
 
@@ -29,7 +29,7 @@ def probe_writes(
 
     `timeout`: time for the router to announce the subscriber, and again for an allowed message to arrive [s].
     """
-    probe = f"@doctor/{secrets.token_hex(8)}"  # `**` of readers does not match a chunk with @
+    probe = f"@doctor/{secrets.token_hex(8)}"  # the `**` of readers does not match a chunk that starts with @
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
     missing = dict(keys)
 

@@ -72,7 +72,7 @@ class Background:
             raise ValueError(f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES")
         width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
         if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
-            raise ValueError("world file is not north up in degrees: convert with gdalwarp -t_srs EPSG:4326")
+            raise ValueError("the image is not north up in degrees: convert it with gdalwarp -t_srs EPSG:4326")
         try:
             with Image.open(path) as image:
                 columns, rows = image.size

@@ -81,7 +81,7 @@ class VehicleView:
 
     @property
     def grade(self) -> str:
-        """The severity of the state, "ok" instead of "info"."""
+        """The severity of the state, with "ok" for "info"."""
         return "ok" if self.state.severity == "info" else self.state.severity
 
     @property
@@ -199,7 +199,7 @@ class Fleet:
         self.snapshot = FleetSnapshot(time, vehicles, tuple(self._reports), rejected, len(self._left_out), alarms)
 
     def _evict(self, time: float) -> bool:
-        """Remove the stream silent for longest, positions last and only if silent; return True if one was removed."""
+        """Evict the longest-silent stream, positions last and only if silent; return True if one was evicted."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False

@@ -53,7 +53,7 @@ class Map:
         self.figure = self._draw()
 
     def update(self, snapshot: FleetSnapshot, overview: Fleet, chosen: VehicleView | None) -> None:
-        """Move the markers and extend the tracks; `chosen`: the selected vehicle, `overview`: its long histories."""
+        """Move the markers and extend the tracks; `chosen`: the selected vehicle, `overview`: long histories."""
         tracks: dict[Address, Track] = {}
         for each in sorted(snapshot.vehicles, key=lambda each: each.number):
             for stream in each.streams:
@@ -120,7 +120,7 @@ class Map:
         if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
             scale, right = (end - start) / width, end
         places = [(each, at.east / scale, at.north / scale) for each, at in shown]
-        # Labels of these vehicles may cover markers.
+        # Labels of these vehicles may cover the markers of all others.
         severe = {each.vehicle for each, _ in shown if each.grade == "bad" or each is chosen}
         taken = [(each.vehicle, x - _MARK, x + _MARK, y - _MARK, y + _MARK) for each, x, y in places]
         labels: dict[str, bool] = {}

@@ -26,7 +26,7 @@ from .stream import is_position
 _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s of history loaded before the playback position
-_OVERVIEW: Final = 20_000, 0.5  # number of points of a whole flight, and s between two points
+_OVERVIEW: Final = 20_000, 0.5  # maximum number of points of a whole flight, and s between two points
 _STATUS_TOPICS: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
@@ -35,10 +35,10 @@ class Recording:
     """The messages of one or more files in chronological order, loaded in a background thread.
 
     `overview`: the whole flight at two points per second; `timeline`: the events, in seconds since the first message.
-    `entries`: the address of each message with its payload (positions and status topics), rejection reason, or only
-    PX4's timestamp (other topics). `dues`: time of each message since the first one [s].
+    `entries`: the address of each message, with its payload (positions and status topics), the reason if it was
+    rejected, or only PX4's timestamp (other topics). `dues`: time of each message since the first one [s].
 
-    Raises ConfigError and SourceError if a file cannot be read.
+    Raises ConfigError or SourceError if a file cannot be read.
     """
 
     def __init__(self, *paths: Path) -> None:
@@ -83,7 +83,7 @@ class Recording:
 
 
 class Player:
-    """Playback of a recording for one viewer; `fleet` is at the playback position.
+    """Playback of a recording for one viewer; `fleet`: its state at the playback position.
 
     `on_seek`: called after each seek; `controls`: play button, speed menu and slider.
     """

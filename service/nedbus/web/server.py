@@ -50,7 +50,7 @@ _MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
 _MAX_WAITING: Final = 4 * MAX_VIEWERS  # pages without a WebSocket, including expiring ones
 _MAX_CONNECTIONS: Final = 512  # or half of RLIMIT_NOFILE, if that is less
 _PING: Final = 15.0  # s between WebSocket pings; without a pong before the next one, the connection is closed
-_UNUSED_LIFETIME: Final = 15_000  # ms that a page is kept without a connection, e.g. from a suspended browser
+_UNUSED_LIFETIME: Final = 15_000  # ms for which a page without a connection is kept, e.g. of a suspended browser
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ def serve_recording(
 ) -> None:
     """Serve a page of recordings until `stop` is set; each viewer has its own playback position.
 
-    Raises ConfigError and SourceError if a file cannot be read, and the errors of `serve_live`.
+    Raises ConfigError or SourceError if a file cannot be read, and the errors of `serve_live`.
     """
     recording, background = Recording(*paths), None if options.background is None else Background(options.background)
 
@@ -216,7 +216,7 @@ def _log_once(text: str, limit: int) -> None:
 
 
 class _HostCheck(NullAuth):
-    """Reject requests with a foreign Host header before each response; all viewers are the same user."""
+    """Bokeh's auth hook, without a login: reject foreign hosts, cross-site requests and invalid tokens."""
 
     login_url = "/"  # required by Bokeh, never used
 

@@ -1,4 +1,4 @@
-"""A stream on the page: its last sample and, for positions, histories at 10 Hz and 1 Hz; no I/O."""
+"""A stream on the page: its last sample and, for positions, a history at 10 Hz and a long one; no I/O."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class PageStream:
 
 
 def _distance(position: Position, message: VehicleLocalPosition, truth: PageStream | None) -> float:
-    """Return the distance to the ground truth, extrapolated to the same time [m]; NaN if there is none."""
+    """Return the distance to the ground truth, extrapolated to the same time [m]; NaN if they are not comparable."""
     if truth is None or not math.isfinite(position.north):
         return math.nan
     real = truth.last.message

@@ -30,7 +30,7 @@ from .time_plots import Plots, TimelinePlot, notable, set_time_range
 
 _TICK: Final = 100  # ms between updates of the map
 _TEXT_TICKS: Final = 5  # map updates per update of text and plots
-_MAX_AHEAD: Final = 2  # updates sent before the browser has drawn them
+_MAX_AHEAD: Final = 2  # maximum number of updates that the browser has not drawn yet
 _MINUTE: Final = 60.0  # s
 _AROUND: Final = 30.0  # s shown before and after a selected moment
 _SECONDS: Final = re.compile(r"[0-9]{1,10}(\.[0-9])?")
@@ -102,7 +102,7 @@ class Viewer:
             player.on_seek = self._update_text_soon
 
     def update(self) -> None:
-        """Send changes: map at each tick, text and plots twice a second; do nothing while the browser falls behind."""
+        """Send changes: map at each tick, text and plots twice a second; do nothing while the browser is behind."""
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]

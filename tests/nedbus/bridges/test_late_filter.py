@@ -48,7 +48,7 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
     assert burst == sorted(burst), "after the first current sample all are current"
     assert 900 <= burst.count(False) <= 960
     assert all(admitted(late, *((13 + each / 100, 13 + each / 100) for each in range(200))))
-    assert late.report() == f"{ONE}: {burst.count(False)} old messages held back, up to 10.0 s late"
+    assert late.report() == f"held back {burst.count(False)} old messages of {ONE}, up to 10.0 s late"
     assert late.report() is None
 
 
@@ -66,7 +66,7 @@ def test_retained_sample_is_held_back() -> None:
     late = LateFilter()
     assert not late.admits(sample(NOW, retained=True), arrived=50 * SECOND)
     assert admitted(late, (3600.0, 3650.0)) == [True]
-    assert late.report() == f"{ONE}: 1 old message held back"
+    assert late.report() == f"held back 1 old message of {ONE}"
 
 
 def test_clock_set_back_is_accepted_within_two_minutes() -> None:
@@ -117,4 +117,4 @@ def test_report_names_one_address_and_counts_the_others() -> None:
     late = LateFilter()
     for name in "abc":
         assert not late.admits(sample(NOW, address=Address(name, ONE.topic), retained=True), arrived=0)
-    assert late.report() == "a/vehicle_local_position and 2 others: 3 old messages held back"
+    assert late.report() == "held back 3 old messages of a/vehicle_local_position and 2 more"

@@ -236,7 +236,7 @@ def test_retained_message_is_not_bridged(
     wait_for(bus.latest, what="the last value")
     subscriber = zenoh_session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1000))
     run_bridge()
-    wait_for(lambda: "->" in caplog.text and "1 old message held back" in caplog.text, what="the topic and the report")
+    wait_for(lambda: "->" in caplog.text and "held back 1 old message" in caplog.text, what="the topic and the report")
     wait_for_matching(zenoh_session, f"nedbus/1/{VLP}")
     for timestamp in range(2, 402):
         publisher.publish(message(timestamp))
@@ -273,7 +273,7 @@ def test_late_messages_of_a_returning_vehicle_are_held_back(
         what="the timestamp to be late",
     )
     put(2, late)
-    wait_for(lambda: "1 old message held back, up to" in caplog.text, what="the report")
+    wait_for(lambda: f"held back 1 old message of 1/{VLP}, up to" in caplog.text, what="the report")
     current = count(3)
     with repeating(
         lambda: put(next(current), zenoh_session.new_timestamp().get_time())
@@ -313,7 +313,7 @@ def test_recovered_messages_are_not_bridged(run_nedbus: Start, tmp_path: Path) -
             first = len(published)
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
-            wait_for(lambda: " s late: ROS 2 nodes would treat them as current" in bridge.err, what="the recovery")
+            wait_for(lambda: " s late; ROS 2 nodes would treat old messages as" in bridge.err, what="the recovery")
             last = len(published)
             wait_for(lambda: has_received(last), what="a current message")
         flight.result()
@@ -351,7 +351,7 @@ def test_topic_of_another_node_is_not_published_twice(
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = zenoh_session.liveliness().declare_token(key.token("MP", "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
-    refused, published = f"is not published: node px4_0001 already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
+    refused, published = f"because node px4_0001 already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
     run_bridge(layout="1.14")
     wait_for(lambda: refused in caplog.text, what="the warning")
     assert published not in caplog.text

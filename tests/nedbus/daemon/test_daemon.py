@@ -308,7 +308,7 @@ def test_uplink_state_of_a_router_is_logged(caplog: pytest.LogCaptureFixture) ->
     caplog.set_level("INFO", "nedbus")
     expected = [
         f"no link to {far}: still trying", f"the link to {far} is up after 3 s",
-        f"the link to {far} is lost: still trying", f"the link to {far} is up after 12 s",
+        f"the link to {far} is lost: reconnecting", f"the link to {far} is up after 12 s",
     ]  # fmt: skip
     session = open_router(listen=(free_endpoint(),), connect=(far,))
     uplinks = Uplinks(session, (far,), now=lambda: now)
@@ -345,10 +345,10 @@ def test_uplink_state_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) ->
 
         assert has_logged()
         router.close()
-        wait_for(lambda: has_logged("lost: still trying"), what="the loss")
+        wait_for(lambda: has_logged("lost: reconnecting"), what="the loss")
         now = 12.0
         router = open_router(listen=(here,))
-        wait_for(lambda: has_logged("lost: still trying", "up after 12 s"), what="the link to recover")
+        wait_for(lambda: has_logged("lost: reconnecting", "up after 12 s"), what="the link to recover")
     router.close()
 
 
@@ -504,7 +504,7 @@ def test_duplicate_vehicle_is_logged_and_reported(run_nedbus: Start, endpoint: s
     assert bus.publishers()[Address("1", VLP)] == 2
     unhealthy = run_command("health", NEDBUS_CONNECT=endpoint)
     assert unhealthy.exit_code == 1
-    assert "vehicle 1 has several publishers: stop one, or give it another vehicle" in unhealthy.err
+    assert "vehicle 1 has several publishers: stop one, or give it another vehicle id" in unhealthy.err
     measured = run_command("hz", "--duration", "2", "--json", VLP, NEDBUS_CONNECT=endpoint)
     assert '"state": "duplicate", "reason": "2 publishers: ' in measured.out
     assert f"1/{VLP}" in (listed := run_command("list", NEDBUS_CONNECT=endpoint).out)

@@ -321,7 +321,7 @@ def test_public_http_address_logs_a_warning(caplog: pytest.LogCaptureFixture) ->
     """An address other than loopback logs a warning that anyone on the network can read the pages."""
     for where, count in ((f"[::1]:{free_port()}", 0), (f"0.0.0.0:{free_port()}", 1)):
         with serve_pages(where, {}):
-            assert caplog.text.count(f"no password protects {where}") == count
+            assert caplog.text.count(f"{where} has no password") == count
 
 
 def streams(count: int, topic: str = VLP) -> list[MeasuredStream]:

@@ -395,8 +395,8 @@ def test_recording_without_messages_warns_and_removes_the_file(
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1
     assert existed == [True]
-    assert "nothing on nedbus/9/** yet, still waiting; 'nedbus list' shows" in recorder.err
-    assert f"{path}: 0 messages: empty file removed" in recorder.err
+    assert "no message on nedbus/9/** yet, still waiting; 'nedbus list' shows" in recorder.err
+    assert f"{path}: 0 messages, removed the empty file" in recorder.err
     assert "nothing arrived on nedbus/9/** within" in recorder.err
     assert not path.exists()
 

@@ -382,11 +382,11 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     if certificate == "vehicle-1":  # a certificate without a rule denies the status, too
         info = run_command("info", *reader)
         assert info.exit_code == 0, info.err
-        assert "refused by the router: vehicle 2" in info.out
+        assert "vehicles refused by the router: 2" in info.out
         assert re.search(rf"2/{VLP} .*refused by the router", info.out)
         health = run_command("health", *reader)
         assert health.exit_code == 1
-        assert "the router refuses vehicle 2" in health.err
+        assert "the router refuses messages of vehicle 2: allow them in its access rules" in health.err
 
     write_access_rules(file, ["1", "2"])
     own = '{ rules: ["vehicle-2-in"], subjects: ["vehicle-2"] }'

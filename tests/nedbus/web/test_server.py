@@ -263,7 +263,7 @@ def test_listening_on_all_interfaces_warns(run_nedbus: Start, endpoint: str) -> 
     port = free_port()
     url, listen = f"http://127.0.0.1:{port}", f"--http=0.0.0.0:{port}"
     process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", coverage=False)
-    wait_for(lambda: "no password protects" in process.err, what="the warning")
+    wait_for(lambda: "has no password" in process.err, what="the warning")
     assert status_of(f"{url}/healthz", Host="evil.example") == 200
     assert status_of(url, Host="ground.example:8420") == 200
     assert status_of(url, Host="evil.example:8420") == 403

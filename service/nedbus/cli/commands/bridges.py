@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -22,6 +22,7 @@ from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY, RELEASES, Selection
 
 _log = logging.getLogger("nedbus")
+_OPEN: Final = "%s has no password: every client can read it, but not write; listen on loopback to prevent this"
 
 MapOption = Annotated[
     Path | None,
@@ -32,7 +33,7 @@ MapOption = Annotated[
 NamespaceOption = Annotated[
     list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help="Publish as /NAMESPACE/fmu/out/...; repeatable")
 ]
-HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Address to listen on (port 0: any)")]
+HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Address to listen on (port 0: any free)")]
 
 
 @command
@@ -50,7 +51,7 @@ def web(
     ] = None,
     background: MapOption = None,
 ) -> None:
-    """Serve a web page with map, faults and plots of all vehicles."""
+    """Serve a web page with a map, the faults and plots of all vehicles."""
     host, port = _split_http("--http", http)
     for name in origin or ():
         _split_http("--origin", name)
@@ -60,7 +61,7 @@ def web(
     def on_listening(url: str) -> None:
         write_stderr(f"open {url} in a browser; Ctrl-C stops the server")
         if not is_loopback(host):
-            write_stderr(f"no password protects {http}: every client that reaches it can view, but not change anything")
+            write_stderr(_OPEN % http)
 
     if files:
         run_until_stopped(lambda stop: page.serve_recording(files, options, stop=stop, on_listening=on_listening))
@@ -89,11 +90,11 @@ def foxglove(
 ) -> None:
     """Serve live vehicles to Foxglove until Ctrl-C.
 
-    Foxglove can plot every field, show poses in 3D and positions on the map.
+    Foxglove can plot every field, and show poses in 3D and positions on a map.
     """
     host, port = _split_http("--http", http)
     with open_bus() as bus, bridges.FoxgloveServer(bus, host=host, port=port) as server:
-        write_stderr(f"open {server.url} in Foxglove: Open connection, Foxglove WebSocket")
+        write_stderr(f"in Foxglove, choose Open connection > Foxglove WebSocket, and enter {server.url}")
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
 
 
@@ -106,7 +107,7 @@ def ros2(
     layout: Annotated[
         str, typer.Option(help=f"PX4 release of px4_msgs in the ROS 2 workspace: {', '.join(RELEASES)}")
     ] = RELEASES[-1],
-    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
+    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain id")] = 0,
     namespace: NamespaceOption = None,
     to: Annotated[
         str | None, typer.Option(metavar="ENDPOINT", help="ROS 2's router (default: nedbus's router)")
@@ -133,10 +134,9 @@ def ros2(
 def serve_pages(where: str, pages: Mapping[str, Callable[[], monitoring.Page]]) -> Iterator[None]:
     """Serve pages on HOST:PORT inside a `with` block."""
     with closing(monitoring.HttpServer(where, pages)):
-        text = "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status"
-        _log.info(text, where, extra=about("http"))
+        _log.info("serving http://%s/metrics, /healthz, /readyz, /vehicles and /status", where, extra=about("http"))
         if not is_loopback(split_http(where)[0]):
-            _log.warning("no password protects %s: every client can read it, but not write", where, extra=about("http"))
+            _log.warning(_OPEN, where, extra=about("http"))
         yield
 
 

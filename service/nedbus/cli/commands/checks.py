@@ -23,8 +23,8 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
 _HOST: Final = socket.gethostname()
 _REFUSED: Final = (
-    ", although its service reports it as published: check that the router allows the service to write this vehicle,"
-    " and this client to read it (docs/security.md)"
+    ", although its service reports it as published: check that the access rules of the router allow the service to"
+    " publish this vehicle, and this client to read it (docs/security.md)"
 )
 
 
@@ -45,7 +45,7 @@ def health(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Check services, sources, messages and vehicles; exit 0 if healthy.
+    """Check services, sources, messages and vehicles; exit with 0 if healthy.
 
     Otherwise exits with 1, and writes one line per fault to stderr.
 
@@ -72,9 +72,9 @@ def health(
             write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
         raise NedbusError(faults[-1])
     if not json_output:
-        newest = format_duration(min(check.ages.values())) if check.ages else "an unknown time"
+        newest = f"{format_duration(min(check.ages.values()))} old" if check.ages else "of unknown age"
         found = f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
-        write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest} old")
+        write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest}")
 
 
 def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ class _Check:
             self.ages = {vehicle: newest} if latencies and newest is not None else {}
 
     def service_faults(self) -> Iterator[str]:
-        """Yield the first fault of the services, their sources, or the age of the newest message."""
+        """Yield at most one fault: of a service or a source, or that the newest message is missing or too old."""
         refused = sorted({to_text(name, 64) for service in self.services for name in service.refused})
         failed = [source for source in self.sources if source.state in {"retrying", "failed"}]
         if self._count is not None and len(self.services) < self._count:
@@ -124,7 +124,8 @@ class _Check:
         elif not self.services and self._is_local:
             yield f"no service of {_HOST} answers at {self._routers}: to accept other hosts, use --services 1"
         elif refused and self._vehicle is None:
-            yield f"the router refuses vehicle {', '.join(refused)[:300]}: add it to its access rules"
+            noun, names = "vehicle" if len(refused) == 1 else "vehicles", ", ".join(refused)[:300]
+            yield f"the router refuses messages of {noun} {names}: allow them in its access rules"
         elif failed and self._vehicle is None:
             source = failed[0]
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
@@ -148,7 +149,7 @@ class _Check:
         shared = {address.vehicle for address, count in self._publishers.items() if count > 1}
         for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
             if not expected.expect or name in expected.expect:
-                yield f"vehicle {name} has several publishers: stop one, or give it another vehicle"
+                yield f"vehicle {name} has several publishers: stop one, or give it another vehicle id"
         vehicles: dict[str, VehicleReport] = {}
         for sample in others:
             if sample.topic == DEFAULT_TOPIC:
@@ -165,8 +166,7 @@ class _Check:
             with_history = {report.service for report in self._reports}
             for service in self.services:
                 if service.service not in with_history:
-                    name = to_text(service.service, 64)
-                    yield f"service {name} keeps no history of its vehicles: update nedbus there"
+                    yield f"service {to_text(service.service, 64)} keeps no event history: update nedbus on its host"
 
 
 @command
@@ -177,14 +177,14 @@ def doctor(
         str | None, typer.Option("--vehicle", "-v", help="Examine only this vehicle; also test the write permission")
     ] = None,
     mavlink: Annotated[
-        str | None, typer.Option(metavar="LINK", help="Also listen to a MAVLink link, such as udpin:0.0.0.0:14550")
+        str | None, typer.Option(metavar="LINK", help="Also listen on a MAVLink link, such as udpin:0.0.0.0:14550")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Diagnose why no messages arrive.
 
     Checks router, certificates, permissions, clocks, vehicles and MAVLink; lists the worst findings last.
-    Takes a few seconds and changes nothing. Exits with 1 if a finding has the state wrong.
+    Takes a few seconds and changes nothing. Exits with 1 if the state of a finding is "wrong".
     """
     if vehicle is not None:
         check_vehicle(vehicle)
@@ -219,7 +219,7 @@ def check(
 ) -> None:
     """Check settings and router files.
 
-    Reports every mistake with file, line and column. Exits with 2 if there is one.
+    Reports every mistake with file, line and column. Exits with 2 if there are any.
     """
     mistakes = [] if files else check_service(offline=offline)
     for file in files or ():
@@ -229,7 +229,7 @@ def check(
 
 
 def report_mistakes(mistakes: Iterable[ConfigError]) -> None:
-    """Write each mistake to stderr once; exit with 2 if there is one."""
+    """Write each mistake to stderr once; exit with 2 if there are any."""
     lines = dict.fromkeys(map(str, mistakes))
     for line in lines:
         write_stderr(f"nedbus: {line}")

@@ -15,9 +15,9 @@ from nedbus.cli.options import (
     DurationOption,
     FieldOption,
     JsonOption,
+    allow_one,
     command,
     parse_fields,
-    require_one,
 )
 from nedbus.cli.output.samples import CsvLines, Lines, to_fields, to_json
 from nedbus.cli.output.streams import write, write_stderr
@@ -49,8 +49,8 @@ def echo(
 
     If the terminal or pipe is too slow, older messages are skipped (see --every).
     """
-    require_one({"--full": full, "--json": json_output, "--csv": csv_output})
-    require_one({"--once": once, "--count": count is not None})
+    allow_one({"--full": full, "--json": json_output, "--csv": csv_output})
+    allow_one({"--once": once, "--count": count is not None})
     if max_rate is not None:
         check_max_rate(max_rate)
     fields = parse_fields(field, selection)

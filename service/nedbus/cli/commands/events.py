@@ -12,7 +12,7 @@ import typer
 
 from nedbus import clock
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, command, require_one
+from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, allow_one, command
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.client import Bus, format_duration
@@ -62,11 +62,11 @@ def events(
     """Show vehicle events and their evidence, live or from a file.
 
     Events are PX4's own log messages, and those derived from messages: validity, dead reckoning, resets, origin, GPS,
-    fusion, failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. An event's
-    evidence is earlier events that may explain it, up to ten seconds old or still active. Live events are shown until
-    Ctrl-C.
+    fusion, failsafe, mode, arming, landing, battery, reboot, silence, loss, rejected messages and the link. The
+    evidence of an event is earlier events that may explain it: those of the ten seconds before it, and those whose
+    condition is still active. Live events are shown until Ctrl-C.
     """
-    require_one({"--json": json_output, "--csv": csv_output})
+    allow_one({"--json": json_output, "--csv": csv_output})
     for option, value, choices in (("--severity", severity, SEVERITIES), ("--origin", origin, ("px4", "nedbus", ANY))):
         if value not in choices:
             raise ConfigError(option, f"{value!r}: expected {' or '.join(choices)}")
@@ -103,8 +103,8 @@ def events(
     begin({read.times.clock(event) for event in found})
     show(found, read.times)
     vehicles = sorted(each for each in read.event_log.vehicles.items() if vehicle in (ANY, each[0]))
-    if texts := [f"{name}: {each.held_from_start}" for name, each in vehicles if each.held_from_start]:
-        write_stderr(f"throughout the file: {'; '.join(texts)}")
+    if texts := [f"{name}: {held}, throughout the file" for name, each in vehicles if (held := each.held_from_start)]:
+        write_stderr("\n".join(texts))
     elif not found:
         limit = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
         write_stderr(f"{_name(files)}: no events{limit} in {read.end:.0f} s")
@@ -122,9 +122,9 @@ def why(
 ) -> None:
     """Show the verdict on each vehicle, live or from a file: usable or not, since when, for how long, and why.
 
-    --all shows start, duration and possible causes of each fault: events of the ten seconds before it, and conditions
-    that were already active; and missing topics that might explain it, with a hint. Live verdicts use the event history
-    of the nedbus services. Exits with 0 even if there are faults.
+    --all shows start, duration and possible causes of each fault: events of the ten seconds before it, conditions that
+    were already active, and missing topics that might explain it, with a hint. Live verdicts use the event history of
+    the nedbus services. Exits with 0 even if there are faults.
     """
     if files:
         read, found = _read(files)
@@ -135,11 +135,11 @@ def why(
             reports = bus.accounts(within=_DAY)
             published = bus.vehicles()
             routers = " or ".join(bus.routers)
-        found, times, where, advice = _merge(reports), Times(is_live=True), "the network", _LIVE_ADVICE
+        found, times, where, advice = _merge(reports), Times(is_live=True), "the history of the services", _LIVE_ADVICE
     reporting, faults, texts = by_vehicle(reports), 0, list[str]()
     if not files and vehicle in published and vehicle not in reporting:
         hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
-        raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
+        raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its event history: {hint}")
     if not files and not reporting:
         raise NedbusError(f"no nedbus service at {routers} has data on any vehicle: start one with 'nedbus serve'")
     _require_vehicle(where, reporting, vehicle)
@@ -177,7 +177,7 @@ def _describe(vehicle: str, story: Story, times: Times, end: float, advice: str)
             text = _before(each, story.since) if title == "before it" else _shown(each)
             yield fold(f"    {times.text(each)}  ", text)
     if not (story.before or story.meanwhile) and story.begin is not None:
-        yield f"  no evidence in the {WINDOW:.0f} s before"
+        yield f"  no evidence in the {WINDOW:.0f} s before it"
     if story.lacking:
         yield fold("  ", f"missing topics that may explain it: {', '.join(story.lacking)}; {advice}")
 
@@ -283,5 +283,5 @@ def _verdict_fields(verdict: Verdict, times: Times) -> dict[str, object]:
 def _require_vehicle(where: object, names: Collection[str], vehicle: str) -> None:
     if vehicle != ANY and vehicle not in names:
         check_vehicle(vehicle)
-        shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
-        raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}: choose one of {shown}")
+        known = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT)
+        raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}{known and f': choose one of {known}'}")

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from nedbus import clock
 from nedbus.cli.follow import follow
-from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, command, require_one
+from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, allow_one, command
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import live_table
 from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, format_duration, stream_state
@@ -37,7 +37,7 @@ def hz(
     Updates every second; the worst streams come first. With --json and --csv, each second has a line for every stream
     that received messages or changed its state.
     """
-    require_one({"--json": json_output, "--csv": csv_output})
+    allow_one({"--json": json_output, "--csv": csv_output})
     monitor = Monitor()
     written: dict[Address, tuple[int, str]] = {}
     with bus.subscribe_to(selection, mode="every") as subscription, live_table(_HEAD, _OPTIONAL) as show_table:

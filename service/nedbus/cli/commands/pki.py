@@ -10,7 +10,7 @@ import typer
 
 from nedbus import clock
 from nedbus import pki as certificates
-from nedbus.cli.options import JsonOption, command, require_one
+from nedbus.cli.options import JsonOption, allow_one, command
 from nedbus.cli.output.streams import counted, write, write_stderr
 from nedbus.cli.output.table import to_table
 from nedbus.errors import ConfigError, PkiError
@@ -19,7 +19,7 @@ from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
 pki = typer.Typer(help="Manage keys, certificates and access rules for tls/ endpoints.", no_args_is_help=True)
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
-WithinOption = Annotated[int, typer.Option(min=0, help="Days before expiry when a certificate becomes due")]
+WithinOption = Annotated[int, typer.Option(min=0, help="Days before expiry when a certificate is due for renewal")]
 DaysOption = Annotated[int | None, typer.Option(min=1, help=f"Validity in days (default: {certificates.DAYS})")]
 
 
@@ -69,7 +69,7 @@ def enroll(
         folder, vehicle, output, routers=router, sources=source or (), target=target, days=days
     )
     _write_paths(made)
-    write_stderr(f"{output} contains the only key of the vehicle: move it there, see its README.txt")
+    write_stderr(f"move {output} to the vehicle and follow its README.txt: it has the only copy of the private key")
 
 
 @command
@@ -104,26 +104,26 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
 @command
 def renew(
     folder: FolderArgument,
-    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all expiring soon")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Default: all that expire soon")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
     new_key: Annotated[bool, typer.Option("--new-key", help="Also create new keys")] = False,
     days: DaysOption = None,
 ) -> None:
-    """Renew certificates with their names, hosts and (without --new-key) keys.
+    """Renew certificates; names, hosts and, without --new-key, keys stay the same.
 
     The old certificates remain valid until they expire.
     """
     now = clock.now()
     entries = certificates.list_certificates(folder)
     if unknown := sorted({*(names or ())} - {entry.name for entry in entries}):
-        raise PkiError(f"{folder} has no certificate of {unknown[0]!r}: 'nedbus pki list' shows all names")
+        raise PkiError(f"{folder} has no certificate named {unknown[0]!r}: 'nedbus pki list' shows all names")
     due = [entry for entry in entries if entry.certificate.is_due(now, within) and not entry.problem]
     chosen = [entry for entry in entries if entry.name in names] if names else due
     for entry in chosen:
         _write_paths(certificates.renew_certificate(entry, replace_key=new_key, days=days))
     if chosen:
-        write_stderr("replace the old files with these, and restart routers: they read their certificate at start")
+        write_stderr("replace the old files with these, and restart routers: they read certificates only at startup")
     else:
         write_stderr(f"no certificate expires within {within} days: 'nedbus pki list' shows all")
 
@@ -133,16 +133,16 @@ def rules(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Router file, such as config/router-secure.json5")],
     vehicles: Annotated[list[str] | None, typer.Argument(metavar="VEHICLE", help="Vehicle ids")] = None,
     *,
-    source: Annotated[Path | None, typer.Option("--from", help="File of ids, stdin (-), or PKI folder")] = None,
-    add: Annotated[bool, typer.Option("--add", help="Add these vehicles to the file's")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove these vehicles from the file's")] = False,
+    source: Annotated[Path | None, typer.Option("--from", help="Read ids from a file, stdin (-) or PKI folder")] = None,
+    add: Annotated[bool, typer.Option("--add", help="Add these vehicles to those in the file")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove these vehicles from the file")] = False,
     prefix: Annotated[str, typer.Option("--prefix", help="Key prefix")] = "nedbus",
 ) -> None:
     """Set or show the vehicles in the access rules of a router file.
 
-    The rules then allow exactly these vehicles; see --add and --remove. Without vehicles, lists those of the file.
+    Without --add or --remove, the rules then allow only the given vehicles. Without vehicles, lists those in the file.
     """
-    require_one({"--add": add, "--remove": remove})
+    allow_one({"--add": add, "--remove": remove})
     before = certificates.read_access_rules(file)
     if not vehicles and source is None:
         for name in before:
@@ -172,7 +172,7 @@ def _write_paths(paths: list[Path]) -> None:
 
 def _write_pair(paths: list[Path]) -> None:
     _write_paths(paths)
-    write_stderr(f"{paths[0]} is a private key, readable by its owner only: do not share it")
+    write_stderr(f"{paths[0]} is a private key, readable only by its owner: do not share it")
 
 
 for _command in (ca, cert, enroll, list_, renew, rules):

@@ -1,4 +1,4 @@
-"""Commands that send one query: list, get, info, schema."""
+"""Commands that query the network once: list, get, info, schema."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ import typer
 
 from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
-from nedbus.cli.output.streams import to_text, write, write_stderr
+from nedbus.cli.output.streams import counted, to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
 from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state
 from nedbus.errors import AddressError, ConfigError, ConnectError
@@ -32,7 +32,7 @@ _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
     """List the published streams with the state of each and the age of its last message.
 
-    Exits with 1 if the list is incomplete because the router is too slow or refuses the query.
+    Exits with 1 if the given vehicle is not published, or if the router is too slow or refuses the query.
     """
     selection = Selection(ANY, vehicle)
     everything = bus.publishers(timeout=TIMINGS.list_timeout)
@@ -57,7 +57,7 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         if others := sorted({address.vehicle for address in everything}):
             hint = f"choose one of {to_text(', '.join(others[:20]))}"
         elif bus.services():
-            hint = "a service answers: see 'nedbus info', and check its and your permissions (docs/security.md)"
+            hint = "a service answers: see 'nedbus info' and the access rules for it and this client (docs/security.md)"
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         known = "is published" if everything.complete else "is known yet"
         write_stderr(f"{what} {known} at {' or '.join(bus.routers)}: {hint}")
@@ -112,15 +112,15 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         for each in (log for source in service.sources for log in source.log_streams):
             write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
         if refused := service.refused:
-            write(fold("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES)))
+            write(fold("vehicles refused by the router: ", to_text(", ".join(refused), _MAX_VEHICLES)))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
         if streams:
             table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
             write(f"\n{table}")
     if len(services) > _MAX_ROWS:
-        write(f"{len(services) - _MAX_ROWS} more services")
+        write(counted(len(services) - _MAX_ROWS, "more service"))
     if not services:
-        write_stderr("no nedbus service answers")
+        write_stderr("no nedbus service answers: start one with 'nedbus serve', or run 'nedbus doctor'")
 
 
 @command
@@ -152,7 +152,7 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     except AddressError:
         pass
     except ConnectError as exc:
-        reason = f"and no publisher can be queried: {exc}"
+        reason = f"and no publisher can be queried ({exc})"
     near = get_close_matches(topic, [*MESSAGES, *TOPICS], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
     raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")

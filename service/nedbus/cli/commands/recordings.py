@@ -53,7 +53,7 @@ def record(
             with show_progress() as show, suppress(typer.Exit):  # Ctrl-C is the normal end of a recording
                 run_until_stopped(lambda stop: recorder.run(stop, duration=duration), on_tick=tick)
         except NoDataError:
-            write_stderr(f"{output}: {recorder.status}: empty file removed")
+            write_stderr(f"{output}: {recorder.status}, removed the empty file")
             raise
     write_stderr(f"{output}: {recorder.status}")
 
@@ -107,8 +107,7 @@ def plot(
         found = recording.matching(source, flight.addresses, selection)
         selected = [address for address in found if address.topic in DEFAULT.topics]
         if len(selected) > limit:
-            hint = f"plotting the first {limit}: choose others with -v, -t, -i"
-            write_stderr(f"{source}: {len(selected)} streams, {hint}")
+            write_stderr(f"{source}: plotting {limit} of {len(selected)} streams; choose others with -v, -t or -i")
         streams = [(address, messages) for address, (messages, _) in flight.read(selected[:limit]).items()]
         for warning in flight.warnings:
             write_stderr(f"{source}: {warning}")

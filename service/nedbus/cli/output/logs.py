@@ -17,7 +17,7 @@ from typing import Final, Literal, TextIO
 from nedbus.errors import NedbusError
 from nedbus.log_event import EVENTS, About, about
 
-from .streams import MAX_TEXT, STRUCTURED, printable, to_text
+from .streams import MAX_TEXT, STRUCTURED, counted, printable, to_text
 
 BURST: Final = 50  # lines of one kind that may be logged at once
 PER_MINUTE: Final = 6  # lines of one kind that may be logged per minute after a burst
@@ -44,7 +44,7 @@ class TextFormatter(logging.Formatter):
         return super().formatMessage(record)
 
     def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - overrides logging
-        """Return the last part of a traceback, printable."""
+        """Return the end of a traceback, with control characters escaped."""
         return printable(super().formatException(ei)[-_MAX_TRACEBACK:])
 
 
@@ -131,7 +131,7 @@ class RateLimit(logging.Filter):
                 bucket.tokens -= 1
                 return True
             if not bucket.suppressed:
-                text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
+                text = f"suppressed %s like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
                 names = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname}
                 bucket.first = {**names, "msg": text}
             bucket.suppressed += 1
@@ -143,7 +143,8 @@ class RateLimit(logging.Filter):
         with self._lock:
             for (_, event, _), bucket in self._buckets.items():
                 if bucket.suppressed and is_due(bucket):
-                    about, args = About("suppressed", count=bucket.suppressed, of=event), (bucket.suppressed,)
+                    count = bucket.suppressed
+                    about, args = About("suppressed", count=count, of=event), (counted(count, "more line"),)
                     reports.append(logging.makeLogRecord({**bucket.first, "args": args, "about": about}))
                     bucket.suppressed = 0
         for report in reports:

@@ -16,7 +16,7 @@ from nedbus.log_event import about
 from nedbus.timings import TIMINGS
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 
-from .streams import is_log_structured, write_stderr
+from .streams import counted, is_log_structured, write_stderr
 
 _log = logging.getLogger("nedbus")
 
@@ -28,7 +28,7 @@ _HINT: Final = """In a second terminal:
 
 
 def log_progress(daemon: Daemon) -> Iterator[None]:
-    """Log the progress of a daemon when a report is due; to be advanced several times a second.
+    """Log the progress of a daemon when a report is due; advance it several times a second.
 
     Once the daemon is ready, commands to try in a second terminal are written to stderr.
     """
@@ -46,12 +46,12 @@ def log_progress(daemon: Daemon) -> Iterator[None]:
             counts[status.source] = status.published
             if status.state == "running":
                 name = status.source.rstrip(":")
-                text = f"{status.published} messages"
+                text = counted(status.published, "message")
                 text += f" ({status.done / status.total:.0%})" if status.total else ""
                 text += f", {count / elapsed:.0f}/s"
                 text += f", {status.rejected} rejected" if status.rejected else ""
                 text += f", {status.lost} lost" if status.lost else ""
-                text += f", gone: {', '.join(status.stale)}" if status.stale else ""
+                text += f" (gone: {', '.join(status.stale)})" if status.stale else ""
                 _log.info("%s: %s", name, text, extra=about("progress", source=name))
 
 
@@ -71,7 +71,7 @@ def suggested_commands(endpoints: Sequence[str]) -> str:
     """Return commands to try in a second terminal; a hint if all endpoints require a client certificate."""
     plain = [each for each in endpoints if not each.startswith(("tls/", "quic/"))]
     if not plain:
-        return f"Readers at {endpoints[0]} need their own certificate, see docs/security.md"
+        return f"Clients of {endpoints[0]} need their own certificate, see docs/security.md"
     here = [dial_endpoint(each) for each in plain]
     is_on_path = Path(sys.argv[0]).name != "nedbus" or shutil.which("nedbus") is not None
     program = "nedbus" if is_on_path else sys.argv[0]

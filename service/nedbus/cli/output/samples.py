@@ -87,7 +87,7 @@ class Lines:
 
 
 def _to_state(sample: Sample[Any]) -> str:
-    """Return the doubtful flags of a sample, or "ok"; then its age if it is old, and the number lost before it."""
+    """Return a sample's doubtful flags, or "ok"; then its age if old, and the number of messages lost before it."""
     is_position = sample.message.DEFINITION is DEFAULT
     return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(sample)
 
@@ -155,7 +155,7 @@ class CsvLines:
             self._head = head
             return f"{csv_line(head)}\n{csv_line(cells)}"
         if head != self._head:
-            text = f"a table has only one message type, and {sample.address} has another: select a topic"
+            text = f"a CSV table has only one message type, but {sample.address} has another: select a topic"
             raise ConfigError("--csv", text)
         return csv_line(cells)
 

@@ -1,4 +1,4 @@
-"""Writing to stdout and stderr: printable characters only; a closed stdout is a one-line error."""
+"""Writing to stdout and stderr: printable characters only; a closed stdout causes a one-line error."""
 
 import csv
 import errno

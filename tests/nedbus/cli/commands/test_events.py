@@ -221,7 +221,7 @@ def test_estimate_that_was_never_valid_is_reported(tmp_path: Path) -> None:
     for tenth in range(1, 50):
         writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
     log = str(writer.write(tmp_path / "never.ulg"))
-    assert run_command("events", log).err == "throughout the file: 1: xy not valid\n"
+    assert run_command("events", log).err == "1: xy not valid, throughout the file\n"
     begin = "1: not usable: xy not valid from the first message until the end (4.8 s)."
     assert run_command("why", log).out.startswith(begin)
 
@@ -307,7 +307,7 @@ def test_why_live_uses_service_history(
     assert result.out.endswith("\n2: no faults in the services' history\n")
     bus.publisher(VLP, vehicle="mocap1").publish(message(1))
     result = run_command("why", "-c", endpoint, "-v", "mocap1")
-    reason = "vehicle mocap1 is published, but no nedbus service keeps its history"
+    reason = "vehicle mocap1 is published, but no nedbus service keeps its event history"
     hint = "follow it with 'nedbus events --vehicle mocap1'"
     assert (result.exit_code, result.err) == (1, f"nedbus: {reason}: {hint}\n")
     assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the services' history\n"
@@ -327,7 +327,7 @@ def test_why_live_uses_service_history(
     result = run_command("why", "-c", endpoint, "-v", "7")
     assert (result.exit_code, result.err) == (
         2,
-        "nedbus: --vehicle: no vehicle 7 in the network: choose one of 1, 2\n",
+        "nedbus: --vehicle: no vehicle 7 in the history of the services: choose one of 1, 2\n",
     )
 
 

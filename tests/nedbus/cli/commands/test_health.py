@@ -218,4 +218,4 @@ def test_service_without_history_is_a_fault(endpoint: str, zenoh_session: Sessio
         for option in ("--valid", "xy"), ("--within", "60"):
             result = health("--services", "1", *option)
             assert result.exit_code == 1
-            assert "service old keeps no history of its vehicles: update nedbus there" in result.err
+            assert "service old keeps no event history: update nedbus on its host" in result.err

@@ -95,7 +95,7 @@ def test_incomplete_list_exits_with_1(bus: nedbus.Bus, endpoint: str, monkeypatc
     publishers = [bus.publisher(VLP, vehicle=number) for number in (1, 2)]
     listed = run_command("list", "-c", endpoint)
     assert listed.exit_code == 1
-    assert "some vehicles are missing" in listed.err
+    assert "some streams are missing" in listed.err
     assert sum(str(each.address) in listed.out for each in publishers) == 1
 
 

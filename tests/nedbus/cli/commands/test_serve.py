@@ -17,7 +17,7 @@ def test_suggested_commands_use_an_endpoint_without_tls() -> None:
     assert " list  published" in suggested_commands([DEFAULT_ENDPOINT])
     assert " hz -c tcp/b:1 " in suggested_commands(["tls/a:1", "tcp/b:1"])
     for endpoint in ("tls/a:1", "quic/a:1"):
-        hint = f"Readers at {endpoint} need their own certificate, see docs/security.md"
+        hint = f"Clients of {endpoint} need their own certificate, see docs/security.md"
         assert suggested_commands([endpoint]) == hint
 
 

@@ -283,7 +283,7 @@ def test_lost_link_is_reported(run_nedbus: Start, command: str) -> None:
     follower = run_nedbus(command, "-c", where, "--json")
     wait_for(lambda: follower.out, what="data")
     router.close()
-    wait_for(lambda: f"the link to {where} is lost: still trying" in follower.err, what="the break")
+    wait_for(lambda: f"the link to {where} is lost: reconnecting" in follower.err, what="the break")
     if command == "hz":
         wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
     with closing(open_router(listen=(where,))):
