@@ -147,7 +147,7 @@ class Vehicle:
                 del self._changes[key]
 
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
-        """Update from the state of the position stream: "stale", "gone", "duplicate" or another, None if unknown."""
+        """Update from the state of the position stream ("stale", "gone", "duplicate", ...), None if not observed."""
         self.settle(time)
         if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
@@ -223,7 +223,7 @@ class Vehicle:
 
     @property
     def held_from_start(self) -> str:
-        """Conditions, other than info, active since the first message, as text; "" if none."""
+        """Bad and watch conditions active since the first message, as text; "" if none."""
         held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
         return ", ".join(dict.fromkeys(held))
 
@@ -241,7 +241,7 @@ class Vehicle:
             unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
-        if instance and topic not in (*POSITIONS, _EKF):  # only the first sensor and battery
+        if instance and topic not in (*POSITIONS, _EKF):  # only the first instance of sensors and batteries
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
@@ -269,7 +269,7 @@ class Vehicle:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
-        """Without a selector: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
+        """Without EKF_SELECTOR: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
         vehicle = _read_sample(None if self._position is None else self._position.last)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))
