@@ -1,4 +1,4 @@
-"""Observation of a network for a few seconds as input for the checks: services, tokens, messages and routers."""
+"""Observation of a network for a few seconds: services, tokens, messages and routers, which the checks evaluate."""
 
 import time
 from collections import Counter
@@ -44,9 +44,9 @@ class Observation:
     """The network as seen by this client, and the scope of the examination.
 
     `version`: version of this nedbus. `vehicle`: vehicle to check, None for all; `verdict`: its write permission.
-    `services`: status of each service; clocks were read at `asked` +- `error` by this host's clock [Unix, s].
+    `services`: status of each service; their clocks were read at `asked` +- `error` on this host's clock [Unix, s].
     `alive`: number of publishers by address, from liveliness tokens.
-    `ages`: age of the last message by address at the end of the observation [s]; None without timestamp.
+    `ages`: age of the last message by address at the end of the observation [s]; None without a timestamp.
     `delays`: minimum latency by address with messages, from the clocks of both hosts [s]; None without timestamps.
     `errors`: last decoding error by address. `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes. `ros2`: publishers of ROS 2 topics.
@@ -133,7 +133,7 @@ def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSamp
 
 
 def _age_of(sample: RawSample) -> float | None:
-    """Return the time since a sample's Zenoh timestamp [s]; None without timestamp."""
+    """Return the time since a sample's Zenoh timestamp [s]; None without a timestamp."""
     stamp = sample.timestamp
     return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
