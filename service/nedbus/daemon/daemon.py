@@ -32,7 +32,7 @@ _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 
 def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[PlannedSource], list[ConfigError]]:
-    """Return the sources of a service with these endpoints, and the configuration errors, at most one per source."""
+    """Return the planned sources and the configuration errors, at most one per source; `endpoints`: of the service."""
     plan: list[PlannedSource] = []
     mistakes: list[ConfigError] = []
     if not settings.source and "source" not in settings.left_out:

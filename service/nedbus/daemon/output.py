@@ -19,7 +19,7 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
 _log = logging.getLogger(__name__)
 
-_MAX_ADDRESSES: Final = 1000  # addresses of one live source
+_MAX_ADDRESSES: Final = 1000  # published and stale addresses of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one per origin (`where`)
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
 _MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
@@ -62,7 +62,7 @@ class SourceOutput:
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # addresses logged as silent
         self._invalid = 0
-        self._is_full = False  # all addresses are published, none is stale
+        self._is_full = False  # the address limit is reached, and no address is stale
 
     @property
     def addresses(self) -> list[Address]:
@@ -104,7 +104,7 @@ class SourceOutput:
         if stream.publisher is not None:
             if not _differs(definition, stream.publisher.definition):
                 return
-            stream.publisher.close()  # different firmware after a reboot
+            stream.publisher.close()  # another layout, for example of new firmware
             stream.publisher = None
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
@@ -127,7 +127,7 @@ class SourceOutput:
         start = time.perf_counter()
         try:
             fields = upgrade_fields(stream.publisher.definition, message.fields)
-            fields.setdefault("timestamp", None)  # invalid if missing: the time of this host is never used
+            fields.setdefault("timestamp", None)  # invalid if missing, because this host's time is no substitute
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
             field, violation = exc.violations[0]

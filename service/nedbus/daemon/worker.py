@@ -184,7 +184,7 @@ class Worker:
                 self._end("failed", self._error)
                 return
             if self._clock.now() - start > TIMINGS.backoff[-1]:
-                failures = 0  # it ran without errors before this failure
+                failures = 0  # it ran for longer than the maximum backoff
             self._clock.wait(TIMINGS.backoff[min(failures, len(TIMINGS.backoff) - 1)])
             failures += 1
 

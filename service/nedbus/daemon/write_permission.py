@@ -101,7 +101,7 @@ class WritePermission:
                 self._denials[vehicle] = 0
             elif verdict == "denied":
                 self._denials[vehicle] = number + 1
-            elif not number:  # else the router was slow, because rules do not change while a link is up
+            elif not number:  # else keep the count: the router was slow, and rules do not change while a link is up
                 self._denials.pop(vehicle, None)
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
@@ -130,7 +130,7 @@ class WritePermission:
                 if not (shared := _routers_of(reader)) or not shared <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
-                # A missing probe message counts only if no link was lost during the check.
+                # A missing probe message means a denial only if no link was lost during the check.
                 return verdicts if _routers_of(reader) == shared and _routers_of(self._session) == routers else {}
         return {}
 

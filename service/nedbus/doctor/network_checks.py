@@ -13,7 +13,7 @@ from .observation import Observation
 _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _MAX_TEXT: Final = 300  # characters of text from a peer
-_SILENT_PERIODS: Final = 3.0  # message intervals without a message
+_SILENT_PERIODS: Final = 3.0  # message intervals after which an address is silent
 _MAX_TIME: Final = 1e11  # s; maximum Unix time accepted from a service
 _CLOCK_WARNING: Final = 0.5  # s
 _CLOCK_WRONG: Final = 5.0  # s
@@ -44,7 +44,7 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
         yield Finding("write", "", "unknown", "write permission not tested", "test it with 'nedbus doctor --vehicle 1'")
     elif seen.verdict == "allowed":
         yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe arrived")
-    elif seen.verdict == "denied":  # not a fault of a reader
+    elif seen.verdict == "denied":  # a reader needs no write permission
         state: State = "warning" if reading.state == "unknown" else "ok" if reading.state == "ok" else "wrong"
         text = f"the router silently drops messages that this client publishes as vehicle {vehicle}"
         advice = f"fine for a reader; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"

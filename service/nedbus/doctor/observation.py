@@ -89,10 +89,10 @@ class Observation:
         self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
         tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
-        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # nedbus bridges
+        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             if (address := self._address_of(str(sample.key_expr))) is not None:
-                # several publishers, or a storage, may answer
+                # several publishers, or a storage, may answer for one key
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
         others = {key for key in token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT) if not key.startswith("@")}

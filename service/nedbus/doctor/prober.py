@@ -30,7 +30,7 @@ _OTHER_HOST: Final = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADD
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
-    """Yield findings on one router; stop at the first wrong one."""
+    """Yield findings on one router; stop at the first one that is "wrong"."""
     if unreachable := reach_endpoint(endpoint):
         yield unreachable
         return

@@ -144,7 +144,7 @@ def detection_of(message: str) -> Detection | None:
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield conditions that begin or end; a change from or to an unknown value is not an event."""
     for kind in kinds:
-        found: dict[tuple[bool, Change], list[str]] = {}  # flags, by whether the change is an event, and by change
+        found: dict[tuple[bool, Change], list[str]] = {}  # flags by (is an event, change)
         for name in kind.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == kind.bad and kind.initial:

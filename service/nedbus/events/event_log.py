@@ -159,7 +159,7 @@ class EventLog:
             return new[::-1], self.reported
 
     def label_first_events(self) -> None:
-        """For files: set the time since boot of the events before the first message that contained it."""
+        """For files: set the time since boot of events that were reported before a message contained it."""
         for number, event in self._events.items():
             known = self.vehicles.get(event.vehicle)
             if event.boot is None and known is not None and known.boot is not None:

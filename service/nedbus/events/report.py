@@ -53,7 +53,7 @@ class VehicleReport:
 
 @dataclass(frozen=True, slots=True)
 class AccountReport:
-    """Report of one service; times are Unix times by its host's clock [s]."""
+    """Report of one service; times are Unix times on its host's clock [s]."""
 
     service: str
     host: str

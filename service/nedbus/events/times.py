@@ -15,7 +15,7 @@ _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?
 
 CLOCKS: Final[Mapping[str, str]] = {
     "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
-    "boot": "seconds since boot, no message contains UTC", "start": "seconds since the start of the recording",
+    "boot": "seconds since boot, because no message contains UTC", "start": "seconds since the start of the recording",
 }  # fmt: skip
 """Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles."""
 

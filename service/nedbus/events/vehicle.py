@@ -39,7 +39,7 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
     `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
     `last_seen`: time of the last message on the event log's clock [s], or of the last update with a live publisher.
-    `time`: time of the last message with a detector [s]. `boot`: its time since boot [s].
+    `time`: time of the last message with a detector [s]. `boot`: the time since boot in it [s].
     `recent`: recent events, searched for evidence.
     """
 
@@ -47,7 +47,7 @@ class Vehicle:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
-        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; effective once armed
+        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; take effect once armed
         self._armed_at = math.inf
         self.topics: set[str] = set()
         self.main: Address | None = None
@@ -92,8 +92,8 @@ class Vehicle:
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
-        # If the message before the previous one is close in time, the previous one was damaged: no reboot.
-        # PX4's log messages are queued, and a log may begin with old ones.
+        # If the message before the previous one is close in time, only the previous one was damaged.
+        # PX4's log messages are queued, and a log may begin with old ones, so their timestamps reveal no reboot.
         is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
         if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
@@ -179,7 +179,7 @@ class Vehicle:
             if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
                 kinds.add(event.kind)
                 found.append(Condition(event.kind, event.severity, f"{event.text} (flapping)", event.time, event))
-        return state_of(dict.fromkeys(found))  # a condition with several flags counts once
+        return state_of(dict.fromkeys(found))  # a condition with several flags appears once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
         """Begin or end the conditions of a finding; report its event unless it is initial or flapping.

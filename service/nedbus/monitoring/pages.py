@@ -11,7 +11,7 @@ from nedbus.extras import import_optional
 
 from .http_server import Page
 
-_MAX_BUSY: Final = 20.0  # s per message and source
+_MAX_BUSY: Final = 20.0  # s that a source may spend on one message
 
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
