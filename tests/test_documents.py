@@ -159,7 +159,7 @@ class Runner:
 
     @staticmethod
     def _has_output(process: Process) -> bool:
-        return bool(process.out or " router on " in process.err or re.search("client of|http|ws:|->", process.err))
+        return bool(process.out or " router on " in process.err or re.search("connecting to|http|ws:|->", process.err))
 
     def _run_python(self, block: Block, shown: Iterable[str]) -> str:
         """Run a script until it ends, or has printed three lines and all shown lines."""

@@ -32,7 +32,7 @@ _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 
 def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[PlannedSource], list[ConfigError]]:
-    """Return the sources of a service with these endpoints, and the configuration errors, at most one per source."""
+    """Return the planned sources and the configuration errors, at most one per source; `endpoints`: of the service."""
     plan: list[PlannedSource] = []
     mistakes: list[ConfigError] = []
     if not settings.source and "source" not in settings.left_out:
@@ -121,7 +121,7 @@ class Daemon:
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """Whether access rules deny each published vehicle; vehicles of unknown permission are omitted."""
+        """Whether access rules deny each published vehicle; vehicles whose permission is unknown are omitted."""
         return {} if self._permission is None else self._permission.refused
 
     @property
@@ -260,7 +260,7 @@ class Daemon:
             return session
         setter = settings.set_by("connect")  # NEDBUS_CONNECT may have been set for scripts
         hint = "" if setter == "connect" else f", set by {setter}; use --listen to run a router instead"
-        _log.info("client of %s%s", endpoints, hint, extra=about("client"))
+        _log.info("connecting to a router at %s%s", endpoints, hint, extra=about("client"))
         logged = False
         while not self._stop.is_set():
             try:

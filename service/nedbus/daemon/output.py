@@ -19,10 +19,10 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
 _log = logging.getLogger(__name__)
 
-_MAX_ADDRESSES: Final = 1000  # addresses of one live source
-_MAX_WARNINGS: Final = 50  # rejections kept and logged, one per `where`
+_MAX_ADDRESSES: Final = 1000  # published and stale addresses of one live source
+_MAX_WARNINGS: Final = 50  # rejections kept and logged, one per origin (`where`)
 _MAX_TEXT: Final = 300  # characters of a rejection, whose text may come from a peer
-_MAX_LOGGED: Final = 5  # logged invalid messages of a source
+_MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
 _MAX_RULES: Final = 50  # rules with a separate counter
 _NO_MESSAGE: Final = "input that is no message"
 TOO_MANY: Final = "too many addresses"
@@ -62,7 +62,7 @@ class SourceOutput:
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # addresses logged as silent
         self._invalid = 0
-        self._is_full = False  # all addresses are published, none is stale
+        self._is_full = False  # the address limit is reached, and no address is stale
 
     @property
     def addresses(self) -> list[Address]:
@@ -104,7 +104,7 @@ class SourceOutput:
         if stream.publisher is not None:
             if not _differs(definition, stream.publisher.definition):
                 return
-            stream.publisher.close()  # different firmware after a reboot
+            stream.publisher.close()  # another layout, for example of new firmware
             stream.publisher = None
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
@@ -127,7 +127,7 @@ class SourceOutput:
         start = time.perf_counter()
         try:
             fields = upgrade_fields(stream.publisher.definition, message.fields)
-            fields.setdefault("timestamp", None)  # invalid if missing: the time of this host is never used
+            fields.setdefault("timestamp", None)  # invalid if missing, because this host's time is no substitute
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
             field, violation = exc.violations[0]
@@ -159,8 +159,8 @@ class SourceOutput:
         if stream is None or publisher is None or _differs(message.definition, publisher.definition):
             resumed = stream is not None and stream.last_received is not None
             if not resumed and len(self._streams) >= _MAX_ADDRESSES and not self._evict_stale():
-                reason = f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"
-                self.reject(Rejection("vehicles", reason), rule=TOO_MANY)
+                reason = f"the limit is {_MAX_ADDRESSES}, and {address} is the first one ignored"
+                self.reject(Rejection("further addresses", reason), rule=TOO_MANY)
                 return
             try:
                 self.claim(address, message.definition)
@@ -214,7 +214,7 @@ class SourceOutput:
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"
-            text = f"{where}: rejected: {reason}"
+            text = f"{where} rejected: {reason}"
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
@@ -226,7 +226,7 @@ class SourceOutput:
         self.unavailable = unavailable
         if new := [address for address in unavailable.silent if address not in self._silent]:
             self._silent.update(new)
-            text = f"advertised, but no message arrives: {', '.join(new)}; run 'nedbus doctor'"
+            text = f"announced, nothing arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))
 
     def _republish_retained(self, message: SourceMessage) -> None:

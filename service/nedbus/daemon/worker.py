@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, cast, get_args
 
 from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, stream_state
-from nedbus.errors import ClosedError, NedbusError
+from nedbus.errors import ClosedError, NedbusError, SourceError
 from nedbus.events import EventLog
 from nedbus.log_event import about
 from nedbus.sources import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceMessage, UnavailableTopics
@@ -169,11 +169,8 @@ class Worker:
             except ClosedError as exc:
                 self._end("failed", str(exc))
                 return
-            except NedbusError as exc:
-                self._fail(str(exc))
             except BaseException as exc:  # noqa: BLE001 - fails only this source; a Rust panic is not an Exception
-                _log.exception("%s: unexpected error", self._name, extra=about("retrying", source=self._name))
-                self._fail(_describe(exc))
+                self._fail(exc)
             else:
                 if isinstance(self.source, LiveSource) or self.source.finite:
                     self._end("failed" if self._error else "done", self._error)
@@ -187,7 +184,7 @@ class Worker:
                 self._end("failed", self._error)
                 return
             if self._clock.now() - start > TIMINGS.backoff[-1]:
-                failures = 0  # it ran without errors before this failure
+                failures = 0  # it ran for longer than the maximum backoff
             self._clock.wait(TIMINGS.backoff[min(failures, len(TIMINGS.backoff) - 1)])
             failures += 1
 
@@ -214,7 +211,8 @@ class Worker:
                 early = start + message.due / speed - self._clock.now()
                 if early < -_MAX_DELAY:
                     extra = about("replay_late", source=self._name)
-                    _log.warning("%s: %.1f s late, shifting the schedule", self._name, -early, extra=extra)
+                    text = "%s: the replay is %.1f s behind its schedule, so later messages are delayed by as much"
+                    _log.warning(text, self._name, -early, extra=extra)
                     start -= early
                 elif early > 0:
                     self._clock.wait(early)
@@ -268,17 +266,19 @@ class Worker:
             event = "failed" if state == "failed" else "done"
             _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
-    def _fail(self, reason: str) -> None:
-        """Store the reason and release all addresses, because another source may use them during the backoff."""
+    def _fail(self, error: BaseException) -> None:
+        """Log and store the reason; release all addresses, because another source may use them during the backoff."""
+        reason, bug = _describe(error), None if isinstance(error, NedbusError) else error
         self._state, self._error = "retrying", reason
         self._retries += 1
-        event = "retrying" if self._retry else "failed"
-        _log.error("%s", reason, extra=about(event, source=self._name, reason=reason))
+        text = reason if isinstance(error, SourceError) else f"{self._name}: {reason}"
+        event, again = ("retrying", "; trying again") if self._retry else ("failed", "")
+        _log.error("%s%s", text, again, exc_info=bug, extra=about(event, source=self._name, reason=reason))
         self._output.release()
 
 
 def _describe(error: BaseException) -> str:
-    return f"unexpected {type(error).__name__}: {error}"
+    return str(error) if isinstance(error, NedbusError) else f"unexpected {type(error).__name__}: {error}"
 
 
 def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:

@@ -1,7 +1,7 @@
 """Write permission at the router, whose access rules drop messages without an error at the sender.
 
 Only services with a certificate are checked, because access rules refer to certificates. Each check briefly opens a
-second session: soon after the link comes up or a vehicle appears, later rarely: rules change at router restarts only.
+second session, soon after a link or vehicle appears and then rarely, because rules change only when a router restarts.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class WritePermission:
 
     @property
     def refused(self) -> dict[str, bool]:
-        """Whether access rules deny each vehicle; vehicles of unknown permission are omitted."""
+        """Whether access rules deny each vehicle; vehicles whose permission is unknown are omitted."""
         known = self._denials.copy().items()
         return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _CONFIRMED}
 
@@ -101,19 +101,19 @@ class WritePermission:
                 self._denials[vehicle] = 0
             elif verdict == "denied":
                 self._denials[vehicle] = number + 1
-            elif not number:  # else the router was slow: rules do not change while a link is up
+            elif not number:  # else keep the count: the router was slow, and rules do not change while a link is up
                 self._denials.pop(vehicle, None)
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
-                "the router refuses %s: its messages reach no reader; check that the access rules name it, and that"
-                " %s is its certificate ('nedbus pki rules', docs/security.md); still checking",
+                "the router refuses messages of %s, so they reach no reader: check that its access rules allow them for"
+                " the certificate %s ('nedbus pki rules', docs/security.md); the check is repeated",
                 _list_vehicles(new),
                 self._tls.certificate,
                 extra=about("access_denied"),
             )
         if accepted := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router accepts %s now", _list_vehicles(accepted), extra=about("access_granted"))
+            _log.info("the router now accepts messages of %s", _list_vehicles(accepted), extra=about("access_granted"))
         if any(verdict == "denied" and self._denials[vehicle] < _CONFIRMED for vehicle, verdict in verdicts.items()):
             return TIMINGS.probe_confirm
         return TIMINGS.probe_pause if set(verdicts.values()) == {"allowed"} else TIMINGS.probe_unsure
@@ -130,7 +130,7 @@ class WritePermission:
                 if not (shared := _routers_of(reader)) or not shared <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=TIMINGS.probe)
-                # A missing probe message counts only if no link was lost during the check.
+                # A missing probe message means a denial only if no link was lost during the check.
                 return verdicts if _routers_of(reader) == shared and _routers_of(self._session) == routers else {}
         return {}
 
@@ -143,4 +143,4 @@ def _routers_of(session: Session) -> set[str]:
 
 def _list_vehicles(vehicles: Sequence[str]) -> str:
     more = f" and {len(vehicles) - _MAX_NAMED} more" if len(vehicles) > _MAX_NAMED else ""
-    return f"vehicle {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"
+    return f"vehicle{'s' * (len(vehicles) > 1)} {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"

@@ -112,7 +112,7 @@ def _addresses(planned: PlannedSource, *, offline: bool) -> Collection[Address]:
 
 
 def _try_listen(endpoint: str) -> Finding | None:
-    """Return a finding if the address is not one of this host; ignore the port, which a running service may use."""
+    """Return a finding if this host does not have the address; ignore the port, which a running service may use."""
     parts = split_endpoint(endpoint)
     if parts is None:  # a Unix domain socket
         return None
@@ -126,11 +126,11 @@ def _try_listen(endpoint: str) -> Finding | None:
 
 
 def _reason(finding: Finding | None) -> str:
-    """Return the text of a mistake, "" for none; an unknown state, for example without a package, is only logged."""
+    """Return the text of a mistake, "" for none; only log an unknown state, for example if a package is missing."""
     if finding is None or finding.state == "ok":
         return ""
     subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""
-    text = f"{subject}{finding.seen}" + (f": {finding.advice}" if finding.advice else "")
+    text = f"{subject}{finding.seen}" + (f"; {finding.advice}" if finding.advice else "")
     if finding.state == "unknown":
         _log.warning("%s", text, extra=about("notice"))
         return ""

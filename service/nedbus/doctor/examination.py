@@ -51,7 +51,7 @@ def examine(
     findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
     answering = [each.subject for each in findings if (each.check, each.state) == ("endpoint", "ok")]
     if answering:
-        for index, each in enumerate(findings):  # one router is enough: the others do not explain missing data
+        for index, each in enumerate(findings):  # one router is enough, so the others do not explain missing data
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
         seen = Observation(settings.prefix, version, vehicle)
@@ -101,7 +101,7 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         except (NedbusError, OSError) as exc:
             found[name] = [Finding(*name, "wrong", f"check failed: {exc}")]
         except BaseException as exc:  # noqa: BLE001 - includes Zenoh's panics
-            _log.exception("unexpected error in a check", extra=about("internal_error"))
+            _log.exception("unexpected error in check %s", " ".join(filter(None, name)), extra=about("internal_error"))
             seen = f"check failed: unexpected {type(exc).__name__}: {exc}"
             found[name] = [Finding(*name, "unknown", seen, "a bug in nedbus: report it with the traceback above")]
 
@@ -113,7 +113,7 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         thread.start()
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
-    late, advice = f"no result within {seconds:g} s", "try again; if it persists, a DNS server may not be answering"
+    late, advice = f"no result within {seconds:g} s", "try again; if this persists, a DNS server may not be answering"
     for name in checks:
         found.setdefault(name, [Finding(*name, "wrong" if name[0] == "endpoint" else "unknown", late, advice)])
     return [each for name in checks for each in found[name]]

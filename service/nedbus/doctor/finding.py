@@ -1,4 +1,4 @@
-"""Finding of a check: state of a subject, observation and advice."""
+"""Finding of a check: its subject, the subject's state, the observation and advice."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -42,7 +42,8 @@ def limit_findings(findings: Iterable[Finding]) -> list[Finding]:
     ordered = sort_findings(findings)
     rest, kept = ordered[:-_MAX_FINDINGS], ordered[-_MAX_FINDINGS:]
     if rest:
-        kept.insert(0, Finding(kept[0].check, "", worst_state(rest), f"{len(rest)} more findings of this check"))
+        text = f"{len(rest)} more finding{'s' * (len(rest) > 1)} of this check"
+        kept.insert(0, Finding(kept[0].check, "", worst_state(rest), text))
     return kept
 
 

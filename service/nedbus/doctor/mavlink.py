@@ -32,16 +32,16 @@ def check_mavlink(link: str) -> Iterator[Finding]:
             senders, systems, faults = _listen(opened)
     except SourceError as exc:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
-        advice = "check address, port or device, and permissions"
+        advice = "check the address and port, or the device and its permissions"
         if is_taken:
-            advice = "fine if 'nedbus serve' uses it; else stop the process shown by 'ss -ulpn', or use another port"
+            advice = "fine if 'nedbus serve' uses it; else stop the process that 'ss -ulpn' shows, or use another port"
         yield Finding("mavlink", link, "warning" if is_taken else "wrong", exc.reason, advice)
         return
     if not senders:
         advice = "check firewalls, and that the vehicle sends to this host and port ('mavlink status' in PX4's shell)"
         yield Finding("mavlink", link, "wrong", f"no packet within {TIMINGS.listen:g} s", advice)
     elif not systems and not faults:
-        seen = f"{senders.total()} packets from {list_names(sorted(senders))}, none of them MAVLink"
+        seen = f"no MAVLink among the packets from {list_names(sorted(senders))} (total: {senders.total()})"
         advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
     yield from limit_findings(
@@ -66,7 +66,7 @@ def _listen(link: Link) -> tuple[Counter[str], dict[int, list[Any]], dict[tuple[
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
     )
     while (now := time.monotonic()) < end:
-        if link.peer is not None and now >= next_heartbeat:  # some peers only send where they received from
+        if link.peer is not None and now >= next_heartbeat:  # some peers send only to addresses that they received from
             next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
         for data, peer in link.read(_READ_TIMEOUT):
@@ -100,10 +100,10 @@ def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
     counts = Counter(message.get_type() for message in messages)
     types = list_names(type_ for type_, _ in counts.most_common())
     if counts[_POSITION]:
-        seen = f"{_POSITION} at {counts[_POSITION] / TIMINGS.listen:.0f} Hz, of {types}"
+        seen = f"{_POSITION} at {counts[_POSITION] / TIMINGS.listen:.0f} Hz; messages: {types}"
         advice = "" if counts["ODOMETRY"] else "evh and evv come from ODOMETRY, which 'nedbus serve' requests"
         return Finding("mavlink", name, "ok", seen, advice)
-    seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}: {types}"
+    seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}, only {types}"
     advice = (
         f"'nedbus serve --source mavlink:{link}' requests it; if none arrives, PX4 may have no estimate, or may need"
         f" 'mavlink stream -s {_POSITION} -r 30' in its shell"
@@ -112,7 +112,7 @@ def _check_system(link: str, number: int, messages: Sequence[Any]) -> Finding:
 
 
 def _check_log(link: str, number: int, messages: Sequence[Any]) -> Finding:
-    """Check whether a PX4 can send its ULog stream on this link, without requesting it."""
+    """Check whether PX4 can send its ULog stream on this link, without requesting it."""
     name = f"{link} system {number}"
     data = [message for message in messages if message.get_type().startswith("LOGGING_DATA")]
     if clients := {f"system {each.target_system} component {each.target_component}" for each in data}:
@@ -127,6 +127,6 @@ def _check_log(link: str, number: int, messages: Sequence[Any]) -> Finding:
         seen = f"{_BACKEND} is {backend}: PX4 refuses to send its ULog stream"
         return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 (file and MAVLink), and restart PX4")
     size = sum(len(message.get_msgbuf()) for message in messages)
-    seen = f"a PX4; the link carries {size / TIMINGS.listen / 1000:.0f} kB/s"
-    advice = f"for all fields of all topics: 'nedbus serve --source \"mavlink:{link}?log=1\"': docs/live.md"
+    seen = f"PX4 found; the link carries {size / TIMINGS.listen / 1000:.0f} kB/s"
+    advice = f"for all fields of all topics, run 'nedbus serve --source \"mavlink:{link}?log=1\"' (docs/live.md)"
     return Finding("mavlink", name, "ok", seen, advice)

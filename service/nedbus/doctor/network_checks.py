@@ -1,4 +1,4 @@
-"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks and other keys."""
+"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks and other prefixes."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -13,7 +13,7 @@ from .observation import Observation
 _NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _MAX_TEXT: Final = 300  # characters of text from a peer
-_SILENT_PERIODS: Final = 3.0  # message intervals without a message
+_SILENT_PERIODS: Final = 3.0  # message intervals after which an address is silent
 _MAX_TIME: Final = 1e11  # s; maximum Unix time accepted from a service
 _CLOCK_WARNING: Final = 0.5  # s
 _CLOCK_WRONG: Final = 5.0  # s
@@ -29,7 +29,7 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
         if router.load is not None and router.load >= _NEARLY_FULL:
-            advice = "raise max_sessions and the limit of open files, or run a second router: docs/hosts.md"
+            advice = "raise max_sessions and the limit of open files, or run a second router (docs/hosts.md)"
             yield Finding("router", router.zid, "warning", text, advice)
         else:
             yield Finding("router", router.zid, "ok", text)
@@ -44,13 +44,13 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
         yield Finding("write", "", "unknown", "write permission not tested", "test it with 'nedbus doctor --vehicle 1'")
     elif seen.verdict == "allowed":
         yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe arrived")
-    elif seen.verdict == "denied":  # not a fault of a reader
+    elif seen.verdict == "denied":  # a reader needs no write permission
         state: State = "warning" if reading.state == "unknown" else "ok" if reading.state == "ok" else "wrong"
         text = f"the router silently drops messages that this client publishes as vehicle {vehicle}"
         advice = f"fine for a reader; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"
         yield Finding("write", vehicle, state, text, advice)
     else:
-        text = f"unknown: the router does not let this client read a probe for vehicle {vehicle}"
+        text = f"write permission not tested: the router does not let this client read a probe for vehicle {vehicle}"
         advice = f"allow {seen.prefix}/*/@doctor/* as in config/router-secure.json5, or run the doctor as a reader"
         yield Finding("write", vehicle, "unknown", text, advice)
 
@@ -100,10 +100,10 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         ends = "it has stopped" if state == "failed" else "it is being restarted"
         yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; see the log of its service")
     elif state in {"waiting", "starting"}:
-        advice = "check that the vehicle is on and sends here; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
+        advice = "check that the vehicle sends to the service; for MAVLink, run 'nedbus doctor --mavlink LINK' there"
         yield Finding("source", name, "warning", f"{state}: no message yet", advice)
     if source.silent:
-        advice = "PX4 may be losing them: remove rel= from all lines of its zenoh/pub.csv, see docs/live.md"
+        advice = "PX4 may be losing them: remove rel= from all lines of its zenoh/pub.csv (docs/live.md)"
         seen = f"announced, but silent while other topics arrive: {list_names(source.silent, 20)}"
         yield Finding("source", name, "warning", seen, advice)
     if source.not_carried:
@@ -116,16 +116,16 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
             seen = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
             yield Finding("source", stream, "warning", seen, "see 'The ULog stream' in docs/live.md")
         if log.gaps:
-            seen = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages in {log.gaps} gaps"
-            advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
+            seen = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages; gaps: {log.gaps}"
+            advice = "raise the rate of the link, or log fewer topics; see the table of rates in docs/live.md"
             yield Finding("source", stream, "warning", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
         advice = "check that the vehicle is on and its link is up; the source recovers automatically"
         yield Finding("source", name, "warning", f"no more messages of {list_names(stale)}", advice)
     if source.rejected > 0:
-        why = f": {list_names(source.rejections)}" if source.rejections else ""
+        why = f" ({list_names(source.rejections)})" if source.rejections else ""
         advice = "rejected messages are not published; see the service's log or the @rejected keys for reasons"
-        yield Finding("source", name, "warning", f"{source.rejected} messages rejected{why}", advice)
+        yield Finding("source", name, "warning", f"messages rejected: {source.rejected:,}{why}", advice)
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
@@ -144,7 +144,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
     for each in hidden if arrived or seen.ages else ():  # otherwise this client may lack read permission
-        advice = "check that the router's access rules allow that service to write this vehicle: docs/security.md"
+        advice = "check that the router's access rules allow that service to write this vehicle (docs/security.md)"
         yield Finding("vehicle", each, "wrong", "reported as published by a service, but no message arrives", advice)
     if flowing := [address for address in known if address in arrived]:
         vehicles = {address.vehicle for address in flowing}
@@ -171,7 +171,7 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
         advice = "check that nedbus publishes this key; a newer message layout needs a newer nedbus on this host"
         yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {error[:_MAX_TEXT]}", advice)
     if (publishers := seen.alive[address]) > 1:
-        advice = "readers receive a mixture of both: stop one, or give it another --vehicle"
+        advice = "readers receive a mixture of their messages: stop all but one, or give each its own --vehicle"
         yield Finding("vehicle", name, "wrong", f"{publishers} publishers of this address", advice)
 
 
@@ -193,7 +193,7 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         yield _clock_finding("this host", "this host's clock", -middle, others, _SYNCHRONISE)
         return
     only = len(clocks) == len(off)
-    blame = "either clock may be off." if only else "the other clocks agree with this host's: set this one."
+    blame = "either clock may be off:" if only else "the other clocks agree with this host's; set this one:"
     for name, offset in off.items():
         yield _clock_finding(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:
@@ -220,11 +220,10 @@ def check_other_keys(seen: Observation) -> Iterator[Finding]:
         yield Finding("prefix", prefix, "warning", text, advice)
     if seen.ros2 and not any(each.source.startswith("px4-zenoh:") for each in seen.sources):
         topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
-        advice = "'nedbus serve --source px4-zenoh:' bridges them"
+        advice = "run 'nedbus serve --source px4-zenoh:' to bridge them"
         yield Finding("ros2", "", "warning", f"ROS 2 or PX4 publishes {topics}, but no service bridges it", advice)
 
 
 NETWORK_CHECKS: Final = (
     check_routers, check_permissions, check_services, check_vehicles, check_clocks, check_other_keys,
 )  # fmt: skip
-"""Checks of the network behind a router."""

@@ -1,4 +1,4 @@
-"""Observation of a network for a few seconds as input for the checks: services, tokens, messages and routers."""
+"""Observation of a network for a few seconds: services, tokens, messages and routers, which the checks evaluate."""
 
 import time
 from collections import Counter
@@ -44,9 +44,9 @@ class Observation:
     """The network as seen by this client, and the scope of the examination.
 
     `version`: version of this nedbus. `vehicle`: vehicle to check, None for all; `verdict`: its write permission.
-    `services`: status of each service; clocks were read at `asked` +- `error` by this host's clock [Unix, s].
+    `services`: status of each service; their clocks were read at `asked` +- `error` on this host's clock [Unix, s].
     `alive`: number of publishers by address, from liveliness tokens.
-    `ages`: age of the last message by address at the end of the observation [s]; None without timestamp.
+    `ages`: age of the last message by address at the end of the observation [s]; None without a timestamp.
     `delays`: minimum latency by address with messages, from the clocks of both hosts [s]; None without timestamps.
     `errors`: last decoding error by address. `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes. `ros2`: publishers of ROS 2 topics.
@@ -89,10 +89,10 @@ class Observation:
         self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
         tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
-        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # nedbus bridges
+        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges
         for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             if (address := self._address_of(str(sample.key_expr))) is not None:
-                # several publishers, or a storage, may answer
+                # several publishers, or a storage, may answer for one key
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
         others = {key for key in token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT) if not key.startswith("@")}
@@ -133,7 +133,7 @@ def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSamp
 
 
 def _age_of(sample: RawSample) -> float | None:
-    """Return the time since a sample's Zenoh timestamp [s]; None without timestamp."""
+    """Return the time since a sample's Zenoh timestamp [s]; None without a timestamp."""
     stamp = sample.timestamp
     return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 

@@ -21,16 +21,16 @@ _PEM_FILES: Final = {"tls_ca": "the CA is", "tls_certificate": "this client is",
 _ALERTS: Final = {  # by substring of OpenSSL's reason for a TLS alert
     "CERTIFICATE_REQUIRED": "it requires a client certificate, and none is given",
     "UNKNOWN_CA": "it does not trust the CA that issued the client certificate",
-    "CERTIFICATE_EXPIRED": "the client certificate has expired, by the router's clock",
+    "CERTIFICATE_EXPIRED": "the client certificate has expired according to the router's clock",
     "CERTIFICATE": "it rejects the client certificate",
     "": "it aborts the handshake",
 }
-_RENEW: Final = "renew it: 'nedbus pki renew', docs/security.md"
+_RENEW: Final = "renew it with 'nedbus pki renew' (docs/security.md)"
 _OTHER_HOST: Final = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
-    """Yield findings on one router; stop at the first wrong one."""
+    """Yield findings on one router; stop at the first one that is "wrong"."""
     if unreachable := reach_endpoint(endpoint):
         yield unreachable
         return
@@ -67,13 +67,13 @@ def reach_endpoint(endpoint: str) -> Finding | None:
     except (socket.gaierror, UnicodeError):  # UnicodeError: an empty label, such as in a..b
         seen, advice = f"cannot resolve host name {host}", "correct the name, or use the IP address"
     except ConnectionRefusedError:
-        seen = "connection refused: nothing listens on this port"
+        seen = "connection refused, probably because nothing listens on this port"
         advice = "start 'nedbus serve' or a Zenoh router there, or pass another endpoint with --connect"
     except TimeoutError:
         seen = f"no answer within {_CONNECT_TIMEOUT:g} s"
         advice = "check that the host is on, the address is correct, and no firewall drops the port"
     except OSError as exc:
-        seen, advice = f"cannot connect: {(exc.strerror or str(exc)).lower()}", "check cable, address and route"
+        seen, advice = f"cannot connect: {(exc.strerror or str(exc)).lower()}", "check the cable, address and route"
     else:
         return None
     return Finding("endpoint", endpoint, "wrong", seen, advice)

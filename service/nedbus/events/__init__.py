@@ -1,4 +1,4 @@
-"""Vehicle events and their explanations, derived from messages, live or from a file; no I/O."""
+"""Vehicle events and their possible causes, derived from live or recorded messages; no I/O."""
 
 from .contradictions import AIR_DATA
 from .detectors import EKF_SELECTOR

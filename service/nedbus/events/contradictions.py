@@ -39,7 +39,7 @@ class ReferenceDetector(ChangeDetector):
         self.pause = 0.0 if own else 1.05e-6 * _INTERVAL
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Return the findings in a message, None if there are none."""
+        """Return the topic's own findings and the contradictions that begin or end; None if nothing has changed."""
         found = super().add(message, missing)
         if 0 <= self.stamp - self._compared < _INTERVAL:
             return found
@@ -67,7 +67,7 @@ class Comparison:
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         self._height, self._position = _Contradiction("height", "z"), _Contradiction("position", "xy")
-        self._offsets: dict[str, tuple[object, float]] = {}  # of references with another height origin
+        self._offsets: dict[str, tuple[object, float]] = {}  # origin and first difference, by reference
 
     def add(self, name: str, stamp: int, values: tuple[float, ...]) -> list[Finding]:
         """Compare the estimate with a reference's fields; return contradictions that begin or end."""
@@ -107,7 +107,7 @@ class Comparison:
 
 @dataclass(slots=True)
 class _Contradiction:
-    """State of one quantity, contradicted while all references exceed their limits in the same direction.
+    """State of one quantity, contradicted while all errors exceed their limits in the same direction.
 
     `errors`: last time [us], error and limit [m] by reference. `since`: time when all exceeded their limits [us], or 0.
     """

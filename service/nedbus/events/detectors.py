@@ -32,7 +32,7 @@ class Finding:
     """A change detected in one message; Vehicle turns it into an event.
 
     `severity`: None for the default of its kind.
-    `initial`: True if it was active in the first message: its condition begins without an event.
+    `initial`: True if it was active in the first message, so its condition begins without an event.
     `age`: time since it began [s].
     `switch`: True to ignore it unless it begins an inactive condition or ends an active one.
     """
@@ -144,7 +144,7 @@ def detection_of(message: str) -> Detection | None:
 def detect_flags(kinds: Sequence[Kind], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield conditions that begin or end; a change from or to an unknown value is not an event."""
     for kind in kinds:
-        found: dict[tuple[bool, Change], list[str]] = {}  # by whether it is an event, and by change
+        found: dict[tuple[bool, Change], list[str]] = {}  # flags by (is an event, change)
         for name in kind.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == kind.bad and kind.initial:
@@ -256,14 +256,14 @@ def _detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def detect_selection(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the primary EKF from an EKF_SELECTOR message, whose fields the publisher defines."""
+    """Yield a change of the primary EKF; fields of EKF_SELECTOR, which is not built in, may have any type."""
     was, now = (each.get("primary_instance") for each in (before, after))
     if type(now) is int and now in range(_MAX_EKFS):
         yield selected(now, was if type(was) is int and was in range(_MAX_EKFS) else None)
 
 
 def selected(now: int, was: int | None) -> Finding:
-    """Return the finding that an EKF became primary; not an event if the previous one is unknown."""
+    """Return the finding that an EKF became primary; without an event if the previous one is unknown."""
     numbers = {"to": now} if was is None else {"from": was, "to": now}
     text = f"primary EKF changed from {was} to {now}"
     return Finding("ekf_changed", "once", text, numbers=numbers, initial=was is None)

@@ -13,7 +13,7 @@ from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import LARGE_CORRECTION
 
 WINDOW: Final = 10.0
-"""Seconds before an event in which others count as evidence; the start of an active condition always counts."""
+"""Seconds before an event in which other events are evidence; the start of an active condition always is evidence."""
 
 ALL: Final = "*"
 """Vehicle name in events that concern all vehicles: events of the router link and of the reader."""
@@ -27,11 +27,11 @@ class Event:
     """One event of a vehicle.
 
     `kind`: a key of KINDS. `change`: "begin" or "end" of a condition, or "once".
-    `time`: time [s] on the steady clock of this host (live), as Unix time (in a report), or since the start of a file.
+    `time` [s]: on this host's steady clock (live data), in Unix time (a report), or since the start of the file.
     `boot`: seconds since the vehicle's boot, None if unknown.
-    `numbers`: values by name, in SI units and NED. `names`: flags, sensors, or the values before and after.
+    `numbers`: values by name, in SI units and NED. `names`: flags, quantities, topics, or values before and after.
     `lasted`: duration of the condition that ends [s], None if it began before the first message.
-    `evidence`: possible causes: events at most WINDOW seconds earlier, and conditions still active.
+    `evidence`: possible causes, which occurred at most WINDOW seconds earlier or began a condition still active.
     """
 
     vehicle: str
@@ -90,7 +90,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """State of a vehicle: severity ("info" if healthy), text and start of its worst condition; all its conditions."""
+    """State of a vehicle: conditions, worst first; severity ("info" if healthy), text and start of the worst one."""
 
     severity: Severity
     text: str
@@ -101,7 +101,7 @@ class State:
 def rank(condition: Condition, until: float | None, *, is_now: bool = True) -> tuple[int, bool, bool, int, float]:
     """Return a sort key for conditions, worst first; `until`: the end, None while it is active.
 
-    Order: severity; with `is_now` active conditions before those that ended and single events; large corrections of the
+    Order: severity; with `is_now`, active conditions before ended ones and single events; large corrections of the
     estimate; importance of the kind; duration, or the largest number of a single event.
     """
     numbers = map(abs, condition.begin.numbers.values()) if condition.begin.change == "once" else ()
@@ -122,10 +122,10 @@ def state_of(conditions: Iterable[Condition]) -> State:
 
 
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
-    """Return the possible causes of an event: the latest of each kind within WINDOW seconds, or still active.
+    """Return the possible causes of an event: the latest of each kind in the last WINDOW seconds, or still active.
 
-    Other starts and PX4's log messages may cause a start; other ends since the condition began may cause its end.
-    All of these may cause a correction of the estimate. All log messages are returned, not just the latest.
+    Possible causes of a start are other starts and PX4's log messages; of an end, other ends since the condition
+    began; of a correction of the estimate, all of these. All log messages are returned, not just the latest.
     """
     kind, latest = KINDS[event.kind], dict[object, Event]()
     excluded = "begin" if event.change == "end" else "end" if not kind.correction else ""

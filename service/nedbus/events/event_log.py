@@ -21,13 +21,13 @@ from .vehicle import Vehicle
 _log = logging.getLogger(__name__)
 
 KEPT: Final = 2000
-"""Maximum number of events in an event log; beyond it, the vehicle with the most events loses its oldest one."""
+"""Maximum number of events in an event log; beyond it, the oldest event of the vehicle with the most is deleted."""
 
 MAX_VEHICLES: Final = 1000
-"""Maximum number of vehicles in an event log; beyond it, the one gone longest is forgotten."""
+"""Maximum number of vehicles in an event log; beyond it, the vehicle that has been gone longest is forgotten."""
 
 MAX_GONE: Final = 50
-"""Maximum number of gone vehicles remembered, unless more vehicles were ever present at once."""
+"""Maximum number of gone vehicles remembered, or the highest number ever present at once if that is larger."""
 
 _SHARE: Final = 20  # events guaranteed to each vehicle while others have more
 
@@ -35,9 +35,9 @@ _SHARE: Final = 20  # events guaranteed to each vehicle while others have more
 class EventLog:
     """Events of all vehicles. Thread-safe: one thread may add samples while others update and read.
 
-    All times come from one monotonic clock or one file: a clock step would end or hide conditions.
+    All times come from one monotonic clock or one file, because a clock step would end or hide conditions.
 
-    `reported`: total number of events. `counts`: number of events by vehicle and severity, until it is forgotten.
+    `reported`: total number of events. `counts`: number of events by vehicle (until forgotten) and severity.
     `refused`: number of messages from vehicles beyond MAX_VEHICLES.
     """
 
@@ -103,21 +103,21 @@ class EventLog:
     ) -> None:
         """Update the conditions of the link, of this reader, and of all vehicles.
 
-        `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
+        `states`: states of position streams by address ("stale", "gone", "duplicate", ...); None if not observed.
         `link`: fault of the router link, "" if it is up. `dropped`: messages dropped by this reader since it started.
         `is_behind`: the reader has a backlog. `present`: vehicles with a publisher. Others are forgotten after an hour
         of silence with the link up, or earlier beyond MAX_GONE. If None, no vehicle is forgotten.
-        An overloaded reader reports no silent vehicles: their messages may be in its backlog.
+        An overloaded reader reports no silent vehicles, because their messages may be in its backlog.
         """
         with self._lock:
             change: Change = "begin" if link else "end"
             self._common.emit(Finding("link_down", change, link or "link restored", switch=True), "", time)
             if dropped > self._dropped or is_behind:
                 self._last_overload = time
-                text = "reader overloaded: messages are dropped"
+                text = "reader overloaded: messages are delayed or dropped"
                 self._common.emit(Finding("overload", "begin", text, switch=True), "", time)
             elif time - self._last_overload > PAUSE:
-                text = f"{dropped} messages dropped, reader caught up"
+                text = f"messages dropped so far: {dropped}; reader caught up"
                 ended = Finding("overload", "end", text, numbers={"messages": dropped}, switch=True)
                 self._common.emit(ended, "", time, changed=self._last_overload)
             self._dropped = dropped
@@ -139,7 +139,7 @@ class EventLog:
                 vehicle.update(time, state, is_connected=not link)
 
     def settle(self, time: float) -> None:
-        """Report bursts of losses and rejections, and flapping, that have ended; also call it at the end of a file."""
+        """Report ended bursts of losses and rejections, and ended flapping; also call it at the end of a file."""
         with self._lock:
             for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)
@@ -159,14 +159,14 @@ class EventLog:
             return new[::-1], self.reported
 
     def label_first_events(self) -> None:
-        """For files: set the time since boot of the events before the first message that contained it."""
+        """For files: set the time since boot of events that were reported before a message contained it."""
         for number, event in self._events.items():
             known = self.vehicles.get(event.vehicle)
             if event.boot is None and known is not None and known.boot is not None:
                 self._events[number] = replace(event, boot=known.boot + event.time - known.time)
 
     def _vehicle(self, name: str, time: float) -> Vehicle | None:
-        """Return the vehicle of a message, creating it if there is room, else None."""
+        """Return the vehicle of this name, created if necessary; None if the event log is full."""
         known = self.vehicles.get(name)
         if known is None:
             if self.is_full and time >= self._full_until:
@@ -174,7 +174,7 @@ class EventLog:
                 self._forget(self._gone(time)[:1])
             if self.is_full:
                 if not self.refused:
-                    text = "more than %d vehicles: further ones have no events; select vehicles with --vehicle"
+                    text = "more than %d vehicles: the others have no events; select vehicles with --vehicle"
                     _log.warning(text, MAX_VEHICLES, extra=about("incomplete"))
                 self.refused += 1
                 return None
@@ -183,7 +183,7 @@ class EventLog:
         return known
 
     def _gone(self, time: float) -> list[tuple[float, str]]:
-        """Return the time last seen and the name of each vehicle gone for a minute, longest gone first."""
+        """Return the time last seen and the name of each vehicle not seen for a minute, longest gone first."""
         return sorted((each.last_seen, name) for name, each in self.vehicles.items() if time - each.last_seen > RECENT)
 
     def _forget(self, vehicles: Iterable[tuple[float, str]]) -> None:

@@ -1,4 +1,4 @@
-"""Vehicle health checks."""
+"""Health checks of vehicles: the criteria, and the faults that violate them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class Expectation:
 
 
 def faults_of(reports: Sequence[AccountReport], expected: Expectation, *, only: str | None = None) -> list[str]:
-    """Return the faults that fail a health check, one line each; `only`: the host to consider."""
+    """Return the faults that fail a health check, one line each; `only`: consider only reports of this host."""
     checked = [report for report in reports if only is None or report.host == only]
     vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
     missing = [name for name in expected.expect if name not in vehicles]
@@ -73,5 +73,5 @@ def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> I
                 at = f"{format_utc(event.time)} UTC, {format_duration(report.now - event.time)} ago"
                 lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_RECENT]
-    if len(lines) > _MAX_RECENT:
-        yield f"{len(lines) - _MAX_RECENT} more events in the last {expected.within:g} s"
+    if (more := len(lines) - _MAX_RECENT) > 0:
+        yield f"{more} more event{'s' * (more > 1)} in the last {expected.within:g} s"

@@ -16,20 +16,20 @@ SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
 class Kind:
     """A kind of event.
 
-    `severity`: severity of a start or a single event; `on_ground` replaces it while the vehicle is disarmed. An end is
+    `severity`: severity of a start or a single event; `on_ground` replaces it while the vehicle is disarmed. Ends are
     always info. `message`: the PX4 message in which it is detected, "" for other sources.
     `causes`: kinds that may explain it. `row`: its row in plots, by default its name.
 
     `fault`: `nedbus why` always reports it as a fault. `validity`: a quantity of the estimate is invalid.
     `correction`: the estimate is corrected; both starts and ends of conditions may explain it.
-    `phase`: a phase of a flight, shown although its severity is info.
-    `stateless`: it does not affect the vehicle's state. `kept_on_reboot`: it survives a reboot.
+    `phase`: a phase of a flight, shown even if its severity is info.
+    `stateless`: it does not affect the vehicle's state. `kept_on_reboot`: a reboot does not end it.
 
     A kind with `flags` is a condition, active while any of these fields of the message equals `bad`; the values of
     `flags` are labels. Flags that change in the same message become one event.
     `begin`, `end`: event texts, with `{}` for the labels. `first`: text of the end of an initial condition.
     `minor`: flags whose start is info. `initial`: a flag that is bad in the first message begins a condition.
-    `once_armed`: active in the first messages, it takes effect once the vehicle has been armed for PAUSE.
+    `once_armed`: if active in the first messages, it takes effect once the vehicle has been armed for PAUSE.
     """
 
     name: str

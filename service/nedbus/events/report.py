@@ -24,7 +24,7 @@ _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, all kinds.
+    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, and the kinds of all.
 
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
@@ -53,7 +53,7 @@ class VehicleReport:
 
 @dataclass(frozen=True, slots=True)
 class AccountReport:
-    """Report of one service; times are Unix times by its host's clock [s]."""
+    """Report of one service; times are Unix times on its host's clock [s]."""
 
     service: str
     host: str
@@ -62,7 +62,7 @@ class AccountReport:
     events: Annotated[tuple[Event, ...], Field(max_length=KEPT)] = ()
 
     def split(self, number: int) -> list[AccountReport]:
-        """Split the report into about `number` parts, at least two; [] if it has at most one vehicle and one event."""
+        """Split the report into `number` parts; [] if it has at most one vehicle and one event."""
         vehicles, events = list(self.vehicles.items()), self.events
         many, some = -(-len(vehicles) // number), -(-len(events) // number)
         return [

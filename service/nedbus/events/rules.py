@@ -65,10 +65,10 @@ JAMMING_BEGIN: Final = 80  # jamming_indicator; "too high" in PX4's guide to fli
 JAMMING_END: Final = 60
 JUMP_DISTANCE: Final = 1.0  # m of unexplained motion, plus JUMP_SHARE of the distance flown
 JUMP_SHARE: Final = 0.2
-LARGE_CORRECTION: Final = 10.0  # m or m/s; without a bad fault, a larger reset or jump heads the verdict
+LARGE_CORRECTION: Final = 10.0  # m or m/s; unless a fault is bad, a larger reset or jump comes first in the verdict
 SMALL_RESET: Final = 0.5  # m or m/s; a smaller reset is info
-# A reference contradicts a valid estimate beyond the limit plus HEIGHT_SHARE of the height, SIGMAS of the receiver's
-# accuracy, and the distance flown during GNSS_DELAY. Maxima in healthy logs: 2.9 m, and 2.2 m at 18 m/s.
+# A reference contradicts a valid estimate if they differ by more than the limit plus HEIGHT_SHARE of the height, SIGMAS
+# times the GNSS accuracy, and the distance flown in GNSS_DELAY. Healthy logs: up to 2.9 m in height, 2.2 m at 18 m/s.
 HEIGHT_LIMIT: Final = 8.0  # m; the whole limit is doubled if there is only one reference
 HEIGHT_SHARE: Final = 0.05
 POSITION_LIMIT: Final = 4.0  # m

@@ -1,4 +1,4 @@
-"""Stories for `nedbus why`: each fault with its period, evidence, and missing topics that may hold more of it."""
+"""Stories for `nedbus why`: each fault with its period, evidence, and missing topics that may hold more evidence."""
 
 import math
 from collections.abc import Collection, Iterable, Sequence
@@ -10,7 +10,7 @@ from .kinds import KINDS, importance
 from .rules import RECENT
 from .times import Times
 
-TOGETHER: Final = 1.0  # s between the starts of conditions of one story
+TOGETHER: Final = 1.0  # s; maximum time between the starts of conditions of one story
 _INVALID: Final = " not valid"
 _GPS: Final = "vehicle_gps_position"
 _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
@@ -54,7 +54,7 @@ class Story:
 
     @property
     def is_bad(self) -> bool:
-        """True if its severity is bad."""
+        """True if any of its conditions is bad."""
         return any(each.severity == "bad" for each in self.spans)
 
     def when(self, times: Times, now: float) -> str:
@@ -72,7 +72,7 @@ def stories_of(
     """Return the stories of one vehicle in chronological order; [] if it has no faults.
 
     `events`: all events of the vehicle, in order. `conditions`: conditions active after the last event.
-    `topics`: published topics. `at`: return only stories active at this time, else the last one before.
+    `topics`: published topics. `at`: return the stories active at this time, else the last one before, else the first.
     """
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
     chosen = [span for kind in KINDS.values() if kind.fault for span in spans if span.kind == kind.name]
@@ -134,7 +134,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
             spans.append(Span(step.kind, step.severity, step.text, step.time, step, until=step.time))
             if step.kind == "reboot":
                 end([key for key in active if not KINDS[key[0]].kept_on_reboot], step)
-        elif step.kind != "duplicate" or keys[0] not in active:  # every service of the vehicle reports a duplicate
+        elif step.kind != "duplicate" or keys[0] not in active:  # each service that publishes the vehicle reports it
             end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
             since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
             active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))

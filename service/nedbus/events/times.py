@@ -15,7 +15,7 @@ _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?
 
 CLOCKS: Final[Mapping[str, str]] = {
     "host": "UTC, from the clocks of the hosts", "vehicle": "UTC, from the vehicle's messages",
-    "boot": "seconds since boot, no message contains UTC", "start": "seconds since the start of the recording",
+    "boot": "seconds since boot, because no message contains UTC", "start": "seconds since the start of the recording",
 }  # fmt: skip
 """Descriptions of the clocks that times may refer to; UTC and time since boot may differ between vehicles."""
 
@@ -39,7 +39,7 @@ class Times:
         return None if event.boot is None else self.utc_of_boot(event.vehicle, event.boot)
 
     def utc_of_boot(self, vehicle: str, boot: float) -> float | None:
-        """Convert a time since a vehicle's boot to Unix time [s]; `boot` may be Unix time already. None if unknown."""
+        """Convert a time since a vehicle's boot, which may already be Unix time, to Unix time [s]; None if unknown."""
         utc = boot + (0.0 if is_unix_time(boot * 1e6) else self.offsets.get(vehicle, math.nan))
         return utc if is_unix_time(utc * 1e6) else None
 
@@ -57,7 +57,7 @@ class Times:
         return format_utc(utc)
 
     def period(self, begin: Event | None, end: Event | None, lasted: float) -> str:
-        """Format a period and its duration [s]; None: it began before the first message, or ends after the last one."""
+        """Format a period and its duration [s]; `begin` and `end` are None if they are outside the data."""
         still = f"until {'now' if self.is_live else 'the end'}"
         if begin is None:
             return f"from the first message {still} ({format_duration(lasted)})"
@@ -71,7 +71,7 @@ class Times:
 
         `near`: an event of the same vehicle; an ambiguous time resolves to the one closest to it.
 
-        Raises ValueError for other text, for UTC or time since boot if no message contains it, for +12.3 in live data.
+        Raises ValueError for other text, for UTC or time since boot if no message has it, and for +12.3 in live data.
         """
         text = text.strip()
         if found := _CLOCK.fullmatch(text):

@@ -39,7 +39,7 @@ class Vehicle:
     `conditions`: active conditions by kind and flag. `initial`: conditions active in the first messages.
     `topics`: published topics. `main`: address of the position estimate in use, vehicle_local_position if published.
     `last_seen`: time of the last message on the event log's clock [s], or of the last update with a live publisher.
-    `time`: time of the last message with a detector [s]. `boot`: its time since boot [s].
+    `time`: time of the last message with a detector [s]. `boot`: the time since boot in it [s].
     `recent`: recent events, searched for evidence.
     """
 
@@ -47,7 +47,7 @@ class Vehicle:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
-        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; effective once armed
+        self._on_ground: dict[tuple[str, str], Condition] = {}  # from the first messages; take effect once armed
         self._armed_at = math.inf
         self.topics: set[str] = set()
         self.main: Address | None = None
@@ -92,8 +92,8 @@ class Vehicle:
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", f"{address.stream} resumed"), address.topic, time)
-        # If the message before the previous one is close in time, the previous one was damaged: no reboot.
-        # PX4's log messages are queued, and a log may begin with old ones.
+        # If the message before the previous one is close in time, only the previous one was damaged.
+        # PX4's log messages are queued, and a log may begin with old ones, so their timestamps reveal no reboot.
         is_earlier = stamp < before - _REBOOT and type(detector) is not detectors.TextDetector
         if is_earlier and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
@@ -147,7 +147,7 @@ class Vehicle:
                 del self._changes[key]
 
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
-        """Update from the state of the position stream: "stale", "gone", "duplicate" or another, None if unknown."""
+        """Update from the state of the position stream ("stale", "gone", "duplicate", ...), None if not observed."""
         self.settle(time)
         if self.main is not None and state not in (None, "unknown"):
             stream = self.main.stream
@@ -179,7 +179,7 @@ class Vehicle:
             if event.change == "begin" and event.kind not in kinds and not keys.isdisjoint(self._suppressed):
                 kinds.add(event.kind)
                 found.append(Condition(event.kind, event.severity, f"{event.text} (flapping)", event.time, event))
-        return state_of(dict.fromkeys(found))  # a condition with several flags counts once
+        return state_of(dict.fromkeys(found))  # a condition with several flags appears once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
         """Begin or end the conditions of a finding; report its event unless it is initial or flapping.
@@ -223,7 +223,7 @@ class Vehicle:
 
     @property
     def held_from_start(self) -> str:
-        """Conditions, other than info, active since the first message, as text; "" if none."""
+        """Bad and watch conditions active since the first message, as text; "" if none."""
         held = [each.text for each in self.conditions.values() if each.initial and each.severity != "info"]
         return ", ".join(dict.fromkeys(held))
 
@@ -241,7 +241,7 @@ class Vehicle:
             unused = [each for each in self._detectors if each.topic == POSITIONS[-1] and each != self.main]
             self._detectors |= dict.fromkeys(unused)
             return ChangeDetector(["primary_instance"], (), detectors.detect_selection)
-        if instance and topic not in (*POSITIONS, _EKF):  # only the first sensor and battery
+        if instance and topic not in (*POSITIONS, _EKF):  # only the first instance of sensors and batteries
             return None
         group = next((each for each in _GROUPS if topic in each), ())
         if group:
@@ -269,7 +269,7 @@ class Vehicle:
         return detect(*both) if instance == self._ekf else detectors.detect_unused(instance, *both)
 
     def _detect_equal(self, instance: int, before: Fields, _: Fields) -> Iterator[Finding]:
-        """Without a selector: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
+        """Without EKF_SELECTOR: yield this EKF if its estimate equals the vehicle's and the primary's does not."""
         vehicle = _read_sample(None if self._position is None else self._position.last)
         if before and before["timestamp_sample"] == vehicle[0]:
             self._equal[instance] = vehicle == tuple(map(before.__getitem__, _SAMPLE))

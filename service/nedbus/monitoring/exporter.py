@@ -49,8 +49,7 @@ class Exporter(Observer):
             ),
         }
         self._routers: list[RouterState] = []
-        self.log_streams: Mapping[str, LogStreamStatus] = {}
-        """Status of ULog streams, by vehicle."""
+        self.log_streams: Mapping[str, LogStreamStatus] = {}  # by vehicle
         self._session: Session | None = None  # for queries
         self._sources: dict[Address, str] = {}
 

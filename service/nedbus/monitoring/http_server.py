@@ -94,7 +94,7 @@ class HttpServer(ThreadingHTTPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Handle a client in a thread; disconnect the client if none is free within 5 s."""
+        """Handle a client in a thread; disconnect the client if no thread is free within 5 s."""
         if self._free.acquire(timeout=TIMINGS.http_client):
             super().process_request(request, client_address)
         else:
@@ -153,7 +153,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             return pages[path]()
         except Exception:  # noqa: BLE001 - one page must not break the server
-            _log.exception("%s failed", path, extra=about("internal_error"))
+            _log.exception("unexpected error in page %s", path, extra=about("internal_error"))
             return Page.text("unexpected error: see the log", status=500)
 
     def _stop_receiving(self) -> None:
@@ -162,7 +162,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def is_local_host_header(host: str, *, local: bool) -> bool:
-    """Return whether a Host header has a name that a foreign web page cannot point to this host."""
+    """Return whether the name in a Host header is one that a foreign web page cannot point to this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")
     with suppress(ValueError):

@@ -42,7 +42,7 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
         _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, else 0",
     ),
     "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
-    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages ignored, or streams or keys dropped, because of a limit"),
+    "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages ignored, and streams or keys evicted, because of a limit"),
     # Exporters
     "nedbus_connected": (_GAUGE, (), "1 while connected to a router, else 0"),
     "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
@@ -170,7 +170,7 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
         "nedbus_time_gaps": count("gaps"),
         "nedbus_messages_out_of_order": count("out_of_order"),
         "nedbus_reboots": count("reboots"),
-        # Without a nominal rate a stream may be silent for long: an age would trigger alerts.
+        # A stream without a nominal rate may be silent for long, so its age would trigger alerts.
         "nedbus_stream_age_seconds": measure("age", [stream for stream in active if stream.health.nominal]),
         "nedbus_stream_rate_hertz": measure("rate"),
         "nedbus_stream_usual_rate_hertz": measure("usual_rate"),
@@ -209,7 +209,7 @@ def vehicle_metrics(event_log: EventLog, streams: Iterable[MeasuredStream]) -> I
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     """Yield all metrics of a service."""
     seen, sources = Counter[str](), dict[str, SourceMeasures]()
-    for measures in daemon.measures:  # numbered if equal: time series must be unique
+    for measures in daemon.measures:  # equal sources are numbered, because time series must be unique
         text = measures.status.source
         seen[text] += 1
         sources[text if seen[text] == 1 else f"{text} ({seen[text]})"] = measures

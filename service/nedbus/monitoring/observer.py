@@ -13,7 +13,7 @@ from nedbus.timings import TIMINGS
 from nedbus_msgs import Address, Selection
 
 _MAX_WAITING: Final = 200  # queued messages above which the reader is behind
-_MAX_LAG: Final = 1.0  # s of queued messages at the usual rate, if that is more
+_MAX_LAG: Final = 1.0  # s; if more, the limit is the usual number of messages in this time
 _MAX_PAUSE: Final = 2.5  # s between polls; after a longer pause, this process was stalled
 _SETTLING_TIME: Final = 3.0  # s after a reconnect; delayed messages have arrived by then
 
@@ -22,7 +22,7 @@ _SETTLING_TIME: Final = 3.0  # s after a reconnect; delayed messages have arrive
 class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
-    `time`: time on the steady clock [s], as in `rejected`.
+    `time`: time on the steady clock [s]; `rejected` uses the same clock.
     `healths`: health by stream, without streams of forgotten vehicles and those silent for an hour.
     `alive`: number of publishers by address, None if unknown.
     `link`, `behind`: fault of the router link and of this reader, "" if none.

@@ -11,7 +11,7 @@ from nedbus.extras import import_optional
 
 from .http_server import Page
 
-_MAX_BUSY: Final = 20.0  # s per message and source
+_MAX_BUSY: Final = 20.0  # s that a source may spend on one message
 
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
@@ -37,7 +37,8 @@ def vehicles_page(report: AccountReport) -> Page:
 def why_not_ready(daemon: Daemon) -> list[str]:
     """Return why a service is not ready: no router, a refused vehicle, or a silent source; [] if it is ready."""
     if not daemon.ready.is_set():
-        return [f"the service is starting: {' or '.join(daemon.endpoints)}"]
+        what = "waiting for a router at" if daemon.role == "client" else "starting a router on"
+        return [f"the service is {what} {' or '.join(daemon.endpoints)}"]
     reasons = []
     if daemon.role == "client" and not daemon.sessions:
         reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
@@ -63,7 +64,7 @@ def _health(daemon: Daemon) -> Page:
 
 def _refusals(daemon: Daemon) -> list[str]:
     refused = sorted(vehicle for vehicle, is_refused in daemon.refused.items() if is_refused)
-    return [f"the router refuses vehicle {', '.join(refused)}"] if refused else []
+    return [f"the router refuses messages of vehicle{'s' * (len(refused) > 1)} {', '.join(refused)}"] if refused else []
 
 
 def _metrics(daemon: Daemon) -> Page:

@@ -47,7 +47,7 @@ def read_access_rules(file: Path) -> list[str]:
 def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX) -> None:
     """Atomically replace the vehicle entries of a router's file; the rest of the file is unchanged.
 
-    Raises AddressError for an invalid vehicle; ConfigError without any vehicle, and for a file that cannot be read or
+    Raises AddressError for an invalid vehicle; ConfigError if no vehicle is given, or for a file that cannot be read or
     written, or lacks the marker lines of `config/router-secure.json5`.
     """
     check_prefix(prefix)
@@ -55,7 +55,7 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
     if not names:  # Zenoh rejects a subject without names
         raise ConfigError.in_file(file, "name at least one vehicle")
     text = _find_blocks(file)[0].string
-    # A certificate matches two subjects: "vehicles" for common permissions, and its own.
+    # A vehicle's certificate matches two subjects: "vehicles" for common permissions, and its own.
     subjects = [f'{{ id: "vehicles", cert_common_names: {json.dumps(list(map(certificate_name, names)))} }},']
     rules, policies = list[str](), list[str]()
     for vehicle, name in zip(names, map(certificate_name, names), strict=True):

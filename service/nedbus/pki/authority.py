@@ -196,7 +196,7 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as exc:
         hint = "run 'nedbus pki ca' first" if path.name == "ca.crt" else "check that this user may read it"
-        raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
+        raise PkiError(f"{path} cannot be read ({(exc.strerror or str(exc)).lower()}): {hint}") from exc
 
 
 def _sign(

@@ -65,7 +65,7 @@ class Certificate:
         return (self.ends - now) / dt.timedelta(days=1)
 
     def is_due(self, now: dt.datetime, within: float = RENEW_WITHIN) -> bool:
-        """Return whether renewal is due: it expires within `within` days, or has expired."""
+        """Return whether the certificate is due for renewal: it expires within `within` days, or has expired."""
         return self.days_left(now) <= within
 
     def __str__(self) -> str:

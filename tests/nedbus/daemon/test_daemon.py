@@ -263,7 +263,7 @@ def test_client_service_waits_for_its_router_and_reconnects(run_nedbus: Start) -
     """With --connect a service waits for its router, reconnects after a router crash, and stops on a signal."""
     endpoint = free_endpoint()
     interrupted, service = (run_nedbus("serve", "--connect", endpoint, "-s", "sim:") for _ in range(2))
-    wait_for(lambda: "client of" in interrupted.err, what="the service to wait")
+    wait_for(lambda: "connecting to" in interrupted.err, what="the service to wait")
     interrupted.signal(signal.SIGTERM)
     assert interrupted.wait() == 0
     wait_for(lambda: "still trying" in service.err, what="the warning")
@@ -293,9 +293,9 @@ def test_client_service_logs_the_origin_of_connect(run_nedbus: Start, endpoint: 
     services = {
         text: run_nedbus("serve", "-s", "ulog:/gone.ulg", *flags, **environment)
         for flags, environment, text in (
-            ((), variable, f"client of {endpoint}, set by NEDBUS_CONNECT; {hint}"),
-            (("--config", str(file)), {}, f"client of {endpoint}, set by {file}; {hint}"),
-            (("--connect", endpoint), {}, f"client of {endpoint}\n"),
+            ((), variable, f"connecting to a router at {endpoint}, set by NEDBUS_CONNECT; {hint}"),
+            (("--config", str(file)), {}, f"connecting to a router at {endpoint}, set by {file}; {hint}"),
+            (("--connect", endpoint), {}, f"connecting to a router at {endpoint}\n"),
             (("--listen", here), variable, f"router on {here}, joining {endpoint}"),
         )
     }

@@ -106,7 +106,7 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, *present, OTHER)
     assert OTHER not in fake.output.addresses
     assert fake.output.rejections == {"too many addresses": 2}
-    assert fake.output.warnings == (f"vehicles: more than 1000 addresses: {OTHER} is ignored",)
+    assert fake.output.warnings == (f"further addresses: the limit is 1000, and {OTHER} is the first one ignored",)
     fake.receive(4, *present[1:])
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses

@@ -248,9 +248,18 @@ class PanicException(BaseException):
         (PanicException("clock before 1970"), "unexpected PanicException: clock before 1970"),
     ],
 )
-def test_source_retries_or_fails_after_any_exception(failure: BaseException, reason: str, retry: bool) -> None:
-    """After any exception, even a BaseException, the state is "retrying" or "failed", never "running"."""
+def test_source_retries_or_fails_after_any_exception(
+    failure: BaseException, reason: str, retry: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After any exception, even a BaseException, the state is "retrying" or "failed", never "running".
+
+    Each failure is one log line that names the source, with a traceback only for an unexpected exception.
+    """
     harness = run(FakeReplay([at(0.0)], [failure] * 9), FakeClock(stop_at=100.0), retry=retry)
+    is_expected = isinstance(failure, SourceError)
+    text = (reason if is_expected else f"ulog:flight.ulg: {reason}") + "; trying again" * retry
+    errors = [(each.getMessage(), not each.exc_info) for each in caplog.records if each.levelname == "ERROR"]
+    assert errors == [(text, is_expected)] * (harness.status.retries if retry else 1)
     assert (harness.status.state, harness.status.ended) == (("retrying", False) if retry else ("failed", True))
     assert (harness.status.error, harness.ends) == (reason, 1)
 
@@ -372,7 +381,8 @@ def test_addresses_of_a_live_source_are_limited(monkeypatch: pytest.MonkeyPatch)
     script: Script = [at(0.0, Address(str(number), VLP)) for number in range(15)]
     status = run(FakeLive(clock, [*script, *script[:10]]), clock).status
     assert (status.published, status.rejected, len(status.addresses)) == (20, 5, 10)
-    assert status.warnings == ("vehicles: more than 10 addresses: 10/vehicle_local_position is ignored",)
+    ignored = "further addresses: the limit is 10, and 10/vehicle_local_position is the first one ignored"
+    assert status.warnings == (ignored,)
 
 
 def test_stop_interrupts_a_replay_between_messages() -> None:

@@ -269,7 +269,7 @@ def test_service_and_exporter_without_router_are_not_ready(serve: Serve, run_ned
     """/readyz returns 503 before the router starts, 200 while it runs, and 503 after it has stopped."""
     where, exported = free_endpoint(), HttpClient(free_port())
     serve("sim:", connect=where)
-    assert pages.request("/readyz") == (503, f"the service is starting: {where}\n")
+    assert pages.request("/readyz") == (503, f"the service is waiting for a router at {where}\n")
     assert pages.values("nedbus_sessions", role="client") == [0]
     router = run_nedbus("router", "-l", where)
     run_nedbus("export", "--wait", "-c", where, "--http", exported.where)

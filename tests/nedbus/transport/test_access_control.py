@@ -373,8 +373,8 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     router, pages = start_router(), HttpClient(free_port())
     options = (*tls_options(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
     service = start_with_timings(start, SHORT_TIMINGS, "serve", "-c", endpoint, *options)
-    refused = (503, "the router refuses vehicle 2\n")
-    wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
+    refused = (503, "the router refuses messages of vehicle 2\n")
+    wait_for(lambda: "messages of vehicle 2, so they reach no reader" in service.err, what="the refusal")
     assert (pages.request("/healthz"), pages.request("/readyz")) == (refused, refused)
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
     assert json.loads(pages.request("/status")[1])["refused"] == ["2"]
@@ -394,7 +394,7 @@ def test_denied_vehicle_is_reported_until_the_rules_are_fixed(
     file.write_text(file.read_text().replace(own, own.replace('vehicle-2"] }', f'{certificate}"] }}')))
     router.kill()
     start_router()
-    wait_for(lambda: "the router accepts vehicle 2 now" in service.err, what="the acceptance")
+    wait_for(lambda: "the router now accepts messages of vehicle 2" in service.err, what="the acceptance")
     assert (pages.request("/healthz"), pages.request("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [0.0]
     health = run_command("health", "--vehicle", "2", *reader)

@@ -46,7 +46,7 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
         (5, 1, "tcp/nowhere.invalid:1: cannot resolve host name nowhere.invalid"),
-        (5, 1, f"{closed}: connection refused: nothing listens on this port"),
+        (5, 1, f"{closed}: connection refused, probably because nothing listens on this port; start"),
         (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
         (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"),
         (7, 1, "until_done: "),
@@ -180,7 +180,7 @@ def test_expiring_certificates_are_reported(tmp_path: Path) -> None:
         f"{settings}, line 3, column 1: this client is",
         f"{router}, line 2, column 24: listen_certificate: it is",
     ]
-    assert all(re.search(r"\d+ days left\): renew it", line) for line in lines), lines
+    assert all(re.search(r"\d+ days left\); renew it", line) for line in lines), lines
     settings.write_text(settings.read_text().replace("soon", "late"))
     assert passes("check", settings)
 
@@ -193,5 +193,5 @@ def test_missing_cryptography_package_is_a_warning(start: Start, tmp_path: Path)
     program = "import sys; sys.modules['cryptography'] = None; from nedbus.cli import main; main()"
     checked = start("-c", program, "check", str(settings))
     assert (checked.wait(), checked.out) == (0, "no mistakes found\n"), checked.err
-    reason = "certificate expiry not checked: cryptography: not installed"
+    reason = "certificate expiry not checked; cryptography: not installed"
     assert f"{tmp_path}/pki/ca.crt: {reason}" in checked.err

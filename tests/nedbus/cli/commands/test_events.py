@@ -89,7 +89,7 @@ def lines_of(result: CommandResult) -> list[tuple[str, str, str]]:
 def test_each_event_of_a_file_is_one_line_with_evidence(log: Path) -> None:
     """Each event is one line with its evidence, and stderr names the clock of the event times."""
     result = run_command("events", str(log))
-    assert (result.exit_code, result.err) == (0, "times: seconds since boot, no message contains UTC\n")
+    assert (result.exit_code, result.err) == (0, "times: seconds since boot, because no message contains UTC\n")
     assert lines_of(result) == EXPECTED_EVENTS
     assert len(result.out.splitlines()) == len(EXPECTED_EVENTS)
 
