@@ -1,4 +1,4 @@
-"""Clocks of this host: monotonic time for all decisions, Unix time only for labels.
+"""Clocks of this host: monotonic time for all decisions, Unix time only for timestamps.
 
 NTP, a GNSS receiver or a user may step the Unix clock forward or back at any time.
 """

@@ -5,18 +5,18 @@
     │   ├── ArgumentError (ValueError)       an invalid argument, such as mode, max_rate or on
     │   │   └── AddressError                 ... a vehicle, topic, instance, key or prefix
     │   ├── LayoutError (ValueError)         an unknown layout
-    │   ├── InvalidMessageError (ValueError) a message to publish with an invalid field
-    │   ├── EncodeError (ValueError)         a message whose validation was bypassed
-    │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
+    │   ├── InvalidMessageError (ValueError) publishing a message with an invalid field
+    │   ├── EncodeError (ValueError)         a message that bypassed validation
+    │   ├── AddressInUseError (ValueError)   two publishers of one address on one bus or service
     │   ├── ConfigError (ValueError)         an invalid setting, flag or line of a file
     │   ├── PkiError                         a key or certificate that cannot be created
-    │   └── OutputError (OSError)            a recording or a picture that cannot be written
+    │   └── OutputError (OSError)            a recording, plot or other file that cannot be written
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            cannot listen on the endpoint: port in use, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
-    │   ├── ClosedError (RuntimeError)       the bus was closed
-    │   ├── ReceiveError (RuntimeError)      a subscription ended by its session or thread
+    │   ├── ClosedError (RuntimeError)       the bus, subscription or publisher is closed
+    │   ├── ReceiveError (RuntimeError)      a subscription whose session or thread failed
     │   └── ForkError (RuntimeError)         this process was forked from a connected one
     └── the data
         ├── DecodeError (ValueError)         a payload that is not a valid message
@@ -52,7 +52,7 @@ __all__ = [
 
 
 class AddressInUseError(NedbusError, ValueError):
-    """Raised for a second publisher of the same address in one process."""
+    """Raised for a second publisher of the same address on one bus, or in one service."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(f"this process already publishes {address}: use another vehicle for one of the publishers")
@@ -88,14 +88,14 @@ class ConnectError(NedbusError, ConnectionError):
         if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
             advice = reason or (
                 "check that tls_ca signed the router's certificate and tls_certificate, that none of them has expired,"
-                " and that the router's certificate names this host"
+                " and that the router's certificate names the host of the endpoint"
             )
-            super().__init__(f"no TLS connection to {where}: {advice}; 'nedbus doctor' finds the cause")
+            super().__init__(f"no TLS connection to {where}: {advice}; run 'nedbus doctor' to find the cause")
         else:
             super().__init__(
                 f"nothing answers at {where} ({tried}): start 'nedbus serve' or a Zenoh router there, or name another"
-                " endpoint with --connect or NEDBUS_CONNECT; a router at its session limit does not answer either:"
-                " 'nedbus doctor' finds the cause"
+                " endpoint with --connect or NEDBUS_CONNECT; a router at its session limit does not answer either;"
+                " run 'nedbus doctor' to find the cause"
             )
 
 
@@ -125,11 +125,11 @@ class PkiError(NedbusError):
 
 
 class OutputError(NedbusError, OSError):
-    """Raised when a file cannot be written; messages of a recording flushed before the error remain readable."""
+    """Raised when a file cannot be written; messages flushed to a recording before the error remain readable."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         hints = {
-            errno.EEXIST: "choose another name, or remove it",
+            errno.EEXIST: "choose another name, or remove the file",
             errno.ENOSPC: "free some space, or write to another disk",
             errno.ESTALE: "the written data is lost; write to a folder that is not cleaned up",
         }
@@ -142,14 +142,14 @@ class ClosedError(NedbusError, RuntimeError):
     """Raised when a bus, a subscription or a publisher is used after it was closed."""
 
     def __init__(self) -> None:
-        super().__init__("this object or its bus was closed: connect again")
+        super().__init__("the bus, subscription or publisher is closed: open a new one")
 
 
 class ReceiveError(NedbusError, RuntimeError):
     """Raised when a subscription ends although neither it nor its bus was closed."""
 
     def __init__(self, what: str, reason: str) -> None:
-        super().__init__(f"{what}: receiving has ended ({reason}): close the bus, and connect and subscribe again")
+        super().__init__(f"{what}: the subscription failed ({reason}); close the bus, then connect and subscribe again")
 
 
 class ForkError(NedbusError, RuntimeError):

@@ -11,7 +11,7 @@ EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pk
 
 
 def import_optional(extra: str, module: str) -> Any:
-    """Import and return a module that requires an extra, or a package that belongs to no extra.
+    """Import and return a module that requires `extra`: one of EXTRAS, or the name of a package.
 
     Raises ConfigError, with the package to install, if a dependency of the module is missing.
     """
@@ -19,9 +19,9 @@ def import_optional(extra: str, module: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
-        # Never suggest nedbus by its name alone: on PyPI it belongs to another project.
-        hint = f"in a clone of nedbus, pip install '.[{extra}]'" if extra in EXTRAS else f"pip install {extra}"
-        raise ConfigError(missing, f"not installed: {hint}") from exc
+        # Never suggest installing nedbus by its name alone: on PyPI, this name belongs to another project.
+        hint = f"in a clone of nedbus, run pip install '.[{extra}]'" if extra in EXTRAS else f"run pip install {extra}"
+        raise ConfigError(missing, f"not installed; {hint}") from exc
 
 
 def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:

@@ -1,4 +1,4 @@
-"""The closed list of log events, and the structured data of a log record."""
+"""The complete list of log events, and the structured data of a log record."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ class Event:
 
     `doc`: its meaning, for the manual.
     `limited`: rate-limited, because peers can trigger it at any rate. Lifecycle events of the process, and events that
-    its own backoff already limits, are always logged.
+    a backoff already limits, are always logged.
     """
 
     doc: str
@@ -23,7 +23,7 @@ class Event:
 EVENTS: Final[Mapping[str, Event]] = {
     # the process
     "router": Event("a router listens, or ignores part of its configuration file", limited=False),
-    "client": Event("the service is a client of a router", limited=False),
+    "client": Event("the service connects to a router as a client", limited=False),
     "http": Event("the HTTP server listens, is open to other hosts, or refuses a client", limited=False),
     "setting": Event("an environment variable looks like a misspelled setting", limited=False),
     "reload": Event("settings were reloaded (SIGHUP) or rejected, or a removed source stopped", limited=False),
@@ -33,7 +33,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "internal_error": Event("a bug in nedbus: an unexpected error; one message, reply or page is skipped"),
     "suppressed": Event("`count` lines of the event `of` were suppressed by the rate limit", limited=False),
     # a source
-    "listening": Event("a live source is open and receives", limited=False),
+    "listening": Event("a live source is open and waits for messages", limited=False),
     "replay_opened": Event("a replay is open; the text summarizes its content", limited=False),
     "replay_waiting": Event("a replay waits for its first subscriber", limited=False),
     "damaged": Event("a file or a definition is damaged, or part of it is skipped", limited=False),
@@ -49,7 +49,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "topic_silent": Event("a vehicle advertises a topic but sends no message on it, while other topics arrive"),
     "rejected": Event("a message from a source is not published, because it cannot be decoded or violates a rule"),
     "duplicate": Event("another process publishes the same vehicle, or two MAVLink senders share a system id"),
-    "rebooted": Event("a vehicle rebooted"),
+    "rebooted": Event("a vehicle rebooted, or its publisher restarted"),
     "log_stream": Event("the ULog stream of a vehicle starts, ends or is refused, or its file is opened or abandoned"),
     "unsupported": Event("a vehicle, a publisher or ROS 2 does not support a requested message or rate"),
     "bridge_loop": Event("a topic published by `nedbus ros2` is ignored, because it would loop back"),
@@ -59,13 +59,13 @@ EVENTS: Final[Mapping[str, Event]] = {
     "runtime_definition": Event("a message that is not built in is decoded with its publisher's definition"),
     "dropped": Event("a reader is too slow, and messages are dropped"),
     "incomplete": Event("a limit or a timeout was reached: vehicles, streams or replies are missing"),
-    "slow_reader": Event("a lossless publisher waits for a slow reader, or gives up on it"),
+    "slow_reader": Event("a lossless publisher waits for a slow reader, or stops waiting for it"),
     # a link
     "link_lost": Event("the link to a router is lost, or does not come up"),
     "link_up": Event("the link to a router is up, for the first time or again"),
-    "client_refused": Event("a router refuses a client, usually for its certificate"),
+    "client_refused": Event("a router refuses a client, usually because of its certificate"),
     "access_denied": Event("the router's access rules drop the messages of a vehicle"),
-    "access_granted": Event("the router accepts the messages of a vehicle that it dropped before"),
+    "access_granted": Event("the router now accepts the messages of a vehicle, which it dropped before"),
     # nedbus ros2
     "bridged": Event("a stream is published to ROS 2"),
     "conflict": Event("a stream is not published to ROS 2, because another stream or node publishes its topic"),

@@ -128,7 +128,7 @@ class Settings(BaseSettings):
         """TLS files for tls/ endpoints; raises ConfigError if some are missing."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
-                raise ConfigError("tls_ca", "a certificate is set, but not the CA to trust: set both")
+                raise ConfigError("tls_ca", "a certificate is set, but not the CA to trust; set both")
             return None
         return Tls(self.tls_ca, self.tls_certificate, self.tls_key)
 
@@ -251,7 +251,7 @@ def _warn_about_misspelled_variables() -> None:
     for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
         longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)
         if near := longer or difflib.get_close_matches(variable, known, 1, 0.85):
-            _log.warning("%s is not a setting: did you mean %s?", variable, " or ".join(near), extra=about("setting"))
+            _log.warning("ignored variable %s: did you mean %s?", variable, " or ".join(near), extra=about("setting"))
 
 
 def _setting_error(settings: Settings, detail: ErrorDetails) -> ConfigError:
@@ -271,7 +271,7 @@ def _read_text(path: Path) -> str:
     except UnicodeDecodeError as exc:
         raise ConfigError.in_file(path, "not UTF-8 text") from exc
     except OSError as exc:
-        raise ConfigError.in_file(path, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
+        raise ConfigError.in_file(path, f"cannot be read ({(exc.strerror or str(exc)).lower()})") from exc
 
 
 def _read_toml(path: Path) -> dict[str, object]:
@@ -281,7 +281,7 @@ def _read_toml(path: Path) -> dict[str, object]:
     except tomllib.TOMLDecodeError as exc:
         position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
         reason = re.sub(r" \(at .*\)", "", str(exc))
-        # Otherwise the error is "at end of document".
+        # An error without a position is at the end of the document.
         line, column = map(int, position.groups()) if position else position_at(text, len(text.rstrip("\n")))
         raise ConfigError.in_file(path, reason, line=line, column=column) from exc
 
@@ -293,7 +293,7 @@ def _find_key(text: str, name: str) -> _Position:
 
 
 def _find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> _Position:
-    """Return the line and column of a source, a table or a string in a list, or of one of its options."""
+    """Return the line and column of a source (a table, or a string in a list) or of one of its options."""
     source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
     if not isinstance(source, str) and index < len(headers):

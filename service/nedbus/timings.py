@@ -22,14 +22,14 @@ class Timings:
     source_tick: float = 0.25  # the longest wait of a live source for its next message
     backoff: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # before a failed source is restarted
     log_answer: float = 1.0  # for the first data, and for a COMMAND_ACK, where it doubles with each retry of START
-    log_timeout: float = 2.5  # until PX4 gives up an unacknowledged message; also between STOP and START
+    log_timeout: float = 2.5  # until PX4 gives up on an unacknowledged message; also between STOP and START
     log_silence: float = 1.0  # without data until START is sent again; at least three times the interval of the stream
     log_longest_silence: float = 15.0  # longest silence of a live stream: sync alone fills a LOGGING_DATA in 11.3 s
     log_link: float = 3.0  # without any message until the link is lost
     log_retry: float = 30.0  # after a temporary refusal
     log_slow_retry: float = 300.0  # after a refusal caused by the configuration or the link
     log_header: float = 10.0  # for the header, which blocks PX4's logger and so leaves a gap in its own log
-    probe_first: tuple[float, float] = (1.0, 5.0)  # random, because a fleet reconnects all at once after a restart
+    probe_first: tuple[float, float] = (1.0, 5.0)  # random: a fleet reconnects all at once after a router restart
     probe_confirm: float = 1.0  # before a denial is checked again
     probe_unsure: float = 60.0  # before the next check while a vehicle is refused or unknown
     probe_pause: float = 600.0  # before the next check if all vehicles are allowed
@@ -37,8 +37,8 @@ class Timings:
     probe_open: float = 5.0  # to open a session
     probe: float = 3.0  # for an allowed message to arrive
     bridge_poll: float = 1.0  # between queries for addresses and for publishers of other nodes
-    token_visible: float = 5.0  # for a liveliness token to become visible to other sessions; later counts as denied
-    lateness: float = 1.0  # minimum latency of a late sample: recovered, or queued behind recovered ones
+    token_visible: float = 5.0  # for a liveliness token to become visible to other sessions, or it counts as denied
+    lateness: float = 1.0  # minimum latency of a sample that counts as late: recovered, or queued behind recovered ones
     take_over: float = 5.0  # after another node's publisher has gone, before its topic is published
     http_client: float = 5.0  # to send a request, to read the response, and to wait for a free thread
     page_request: float = 10.0  # for a browser to send a request, and between two requests
@@ -52,7 +52,7 @@ class Timings:
     tls_alert: float = 0.5  # for the TLS alert of a router that rejects our certificate
     list_timeout: float = 10.0  # for a router to list all streams
     first_sample: float = 2.0  # without a sample until a notice is printed to stderr
-    old: float = 1.0  # minimum latency to display, for retained or recovered messages
+    old: float = 1.0  # minimum age to display, for retained or recovered messages
     reports: tuple[float, ...] = (*(10.0,) * 6, 60.0)  # between progress reports of `serve`; the last interval repeats
     systemd_patience: float = 30.0  # until a client without a router reports READY, to let the boot continue
     systemd_status: float = 1.0  # between status updates

@@ -12,13 +12,13 @@ from nedbus.extras import import_optional
 
 @pytest.mark.parametrize(
     ("extra", "command"),
-    [("mcap", "in a clone of nedbus, pip install '.[mcap]'"), ("polars", "pip install polars")],
+    [("mcap", "in a clone of nedbus, run pip install '.[mcap]'"), ("polars", "run pip install polars")],
 )
 def test_missing_package_raises_with_install_command(extra: str, command: str) -> None:
     """The error suggests installing from a clone, because another project owns the name nedbus on PyPI."""
     with pytest.raises(ConfigError) as caught:
         import_optional(extra, "gone")
-    assert str(caught.value) == f"gone: not installed: {command}"
+    assert str(caught.value) == f"gone: not installed; {command}"
 
 
 def test_import_does_not_change_garbage_collection(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from .discovery import (
     SourceStatus,
     StreamStatus,
     Vehicles,
-    find_accounts,
+    find_reports,
     find_services,
     reply_parts,
 )

@@ -86,7 +86,7 @@ class AsyncBus:
     def subscribe(self, message: str, **options: Unpack[Subscribe]) -> AsyncSubscription[Message]: ...
     def subscribe(self, *message: Any, **options: Any) -> Any:
         """Return a subscription for `async for`; see `Bus.subscribe`. It opens on first use."""
-        return Bus.subscribe(cast("Bus", self), *message, **options)  # uses no attribute of `self` but `subscribe_to`
+        return Bus.subscribe(cast("Bus", self), *message, **options)  # uses only `subscribe_to` of `self`
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None

@@ -15,7 +15,7 @@ from nedbus.transport import Session, Tls, open_client, query, require_unforked,
 from nedbus_msgs import ANY, Address, Definition, Message, Selection, VehicleLocalPosition, topic_of, vehicle_name
 
 from .closing import Finalizer
-from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_accounts, find_services
+from .discovery import Publishers, Rejections, ServiceStatus, VehicleDirectory, Vehicles, find_reports, find_services
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
@@ -27,8 +27,8 @@ from .subscription import Subscription
 class Bus(AbstractContextManager["Bus"]):
     """A connection to a router, from `connect`.
 
-    Topics are selected by message class or by name, vehicles by name, instances by number; "*" and None match any.
-    Vehicle 7 is vehicle "7". The default is VehicleLocalPosition on vehicle_local_position.
+    Topics are selected by message class or name, vehicles by name (7 means "7"), instances by number. "*" matches any
+    topic or vehicle, None any instance. The default is VehicleLocalPosition on vehicle_local_position.
     Thread-safe. Methods raise AddressError for an invalid name, and ClosedError once the bus is closed.
     """
 
@@ -86,12 +86,12 @@ class Bus(AbstractContextManager["Bus"]):
         `message`: a message class such as VehicleAttitude, for typed samples of its first topic or of `topic`, such as
         "estimator_attitude"; or the name of a topic; or "*" for all topics.
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
-        `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
-        about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
+        `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which caches
+        about 20 s of messages. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
         In both modes `counts` reports lost, dropped and invalid samples, and a slow reader never delays other readers.
         `max_rate`: maximum number of messages per second of each stream, downsampled by its publisher, for slow links.
-        The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`; rates below 1 are
-        downsampled further by the reader. Messages left out by downsampling count as neither lost nor dropped.
+        The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`. If that is
+        below 1, the reader downsamples further. Messages left out by downsampling count as neither lost nor dropped.
 
         Raises ArgumentError for an invalid `mode`, or if `max_rate` is not a finite number above 0.
         """
@@ -149,7 +149,7 @@ class Bus(AbstractContextManager["Bus"]):
         return vehicles
 
     def publishers(self, *, timeout: float = 2.0) -> Publishers:
-        """Return the number of publishers of each address: more than one is a conflict. Waits as `vehicles` does."""
+        """Return the number of publishers of each address: more than one is a conflict. Waits like `vehicles`."""
         publishers = self._directory.publishers(self._session, timeout=timeout)
         publishers.complete = publishers.complete and self.connected
         return publishers
@@ -160,7 +160,7 @@ class Bus(AbstractContextManager["Bus"]):
 
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
         """Query the event reports of all nedbus services: events of the last `within` seconds, and vehicle states."""
-        return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
+        return find_reports(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
         """Subscribe to reports of the messages that services on this network reject."""
@@ -178,11 +178,11 @@ class Bus(AbstractContextManager["Bus"]):
     ) -> Publisher:
         """Return a publisher for one address.
 
-        It returns once the router has processed its declarations: later subscribers receive the last message.
+        Returns once the router has processed the declarations, so later subscribers receive the last message.
         `lossless`: flow control for replays at the readers' pace. `publish` slows down to 10 messages per second
         while a reader in mode "every" has more than 2,000 unread messages; `close` waits until the readers have all
         messages.
-        `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
+        `source`: the origin of the messages, shown in `sample.source`; 1 to 32 of the characters a-z 0-9 _ -.
         `definition`: the definition of a custom message, from `define_msg`; readers query it from the publisher.
 
         Raises AddressInUseError if this bus already has a publisher for the address.
@@ -190,7 +190,7 @@ class Bus(AbstractContextManager["Bus"]):
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)
-        # Matches nothing: after a query for the session's own token, Zenoh 1.10 sometimes lists that token forever.
+        # This key matches nothing: if a session queries its own token, Zenoh 1.10 sometimes lists that token forever.
         token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=2.0)  # usually milliseconds
         return publisher
 

@@ -79,8 +79,8 @@ class VehicleDirectory:
             publishers = Publishers(self._addresses.values())
             publishers.complete = self._tokens.complete
             if self._tokens.is_listing and timeout and not self._logged:
-                text = "the router listed only %d streams within %g s, not all: it is slow, or forbids listing"
-                _log.warning(text, len(publishers), timeout, extra=about("incomplete"))
+                text = "the router listed only %d stream%s within %g s; it may be slow, or forbid listing others"
+                _log.warning(text, len(publishers), "s" * (len(publishers) != 1), timeout, extra=about("incomplete"))
             self._logged = self._tokens.is_listing and (self._logged or timeout > 0)
             return publishers
 
@@ -94,7 +94,7 @@ class StreamStatus:
 
 
 class _UntrustedReply:
-    """Base of untrusted replies: an invalid value becomes the default, and invalid rows of a list are dropped."""
+    """Base of untrusted replies: an invalid value becomes the default, and invalid items of a list are dropped."""
 
     __slots__ = ()
 
@@ -114,13 +114,13 @@ class _UntrustedReply:
 
 @dataclass(frozen=True, slots=True)
 class LogStreamStatus(_UntrustedReply):
-    """The ULog stream of one vehicle over MAVLink, of a source with `log=`.
+    """The ULog stream that a source with `log=` receives from one vehicle over MAVLink.
 
     `state`: "streaming" while messages are published from the stream; otherwise they are converted from MAVLink.
     `reason`: why there is no stream, and what to do about it.
     `received`: bytes so far. `rate`: bytes per second over the last second. `delay`: mean age of messages on arrival,
     by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
-    `header_time`: duration of the header [s]; the vehicle's own log has a gap of this length.
+    `header_time`: time that sending the header took [s]; the log on the SD card has a gap of this length.
     `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds on the number of
     ULog messages lost, which MAVLink does not report. `undecodable`: data messages without a usable definition.
     `saved`: the path of the saved log.
@@ -150,7 +150,7 @@ class LogStreamStatus(_UntrustedReply):
             f"{self.rate / 1000:.1f} KB/s" if self.received else "",
             "" if self.delay is None else f"delay {self.delay * 1000:.0f} ms",
             "" if self.header_time is None else f"header {self.header_time:.1f} s",
-            f"{self.gaps} gaps, {lost}" if self.gaps else "",
+            f"{self.gaps} gap{'s' * (self.gaps > 1)}, {lost}" if self.gaps else "",
             f"{self.undecodable} without a definition" if self.undecodable else "",
             f"saved to {self.saved}" if self.saved else "",
         )
@@ -220,7 +220,7 @@ class ServiceStatus(_UntrustedReply):
     sources: tuple[SourceStatus, ...] = ()
 
     def split(self, _: int) -> list[ServiceStatus]:
-        """Split into one status per source; omit the stream health of a single source; return [] without sources."""
+        """Split into one status per source, or omit the stream health of the only one; return [] if neither applies."""
         if len(self.sources) > 1:
             return [replace(self, sources=(each,)) for each in self.sources]
         return [replace(self, sources=(replace(each, streams=()),)) for each in self.sources if each.streams]
@@ -230,7 +230,7 @@ _STATUS: Final = TypeAdapter(ServiceStatus)
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
-    """Query the status of all nedbus services; oversized replies are ignored."""
+    """Query the status of all nedbus services; ignore oversized replies."""
     found: dict[str, ServiceStatus] = {}
     for key, content in parse_replies(query(session, status_key(ANY, prefix=prefix), timeout=timeout)):
         if isinstance(content, dict):
@@ -239,8 +239,8 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
     return list(found.values())
 
 
-def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
-    """Query the event reports of all services for the last `within` seconds; invalid or oversized ones are ignored."""
+def find_reports(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
+    """Query all services for their event reports of the last `within` seconds; ignore invalid or oversized replies."""
     selector = f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}"
     found: dict[str, list[AccountReport]] = {}
     for key, content in parse_replies(query(session, selector, timeout=timeout)):
@@ -258,7 +258,7 @@ def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
         for part in parts:
             yield from reply_parts(part)
     else:
-        text = "omitted %d bytes of a reply: readers accept at most %d per part; use fewer or shorter names"
+        text = "omitted %d bytes of a reply, because readers accept at most %d per part: use fewer or shorter names"
         _log.warning(text, len(content), MAX_REPLY_BYTES, extra=about("incomplete"))
 
 
@@ -266,7 +266,7 @@ def reply_parts(report: AccountReport | ServiceStatus) -> Iterator[bytes]:
 class RejectionReport:
     """A message that a service rejected.
 
-    `reason`: untrusted text of the service, at most 300 characters.
+    `reason`: untrusted text from the service, at most 300 characters.
     `received`: time at which the report arrived, ns since the epoch.
     """
 
@@ -324,11 +324,11 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
         try:
             content = json.loads(text)
         except (ValueError, RecursionError):
-            invalid = invalid or key
+            invalid = invalid or key[:_MAX_TEXT]
         else:
             yield key, content
     if oversized:
-        _log.warning("ignored %d oversized replies", oversized, extra=about("incomplete"))
+        text = "ignored replies over %d bytes or over the memory limit (%d in total): the result is incomplete"
+        _log.warning(text, MAX_REPLY_BYTES, oversized, extra=about("incomplete"))
     if invalid:
-        extra = about("invalid", reason="no JSON")
-        _log.warning("%r: ignored a reply that is not JSON", invalid[:_MAX_TEXT], extra=extra)
+        _log.warning("%r: ignored a reply that is not JSON", invalid, extra=about("invalid", reason="not JSON"))

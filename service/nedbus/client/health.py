@@ -25,8 +25,8 @@ StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"] 
 
 _log = logging.getLogger(__name__)
 
-_REBOOT_STEP: Final = 1_000_000  # us by which PX4's time steps back in a reboot; below it, a message is out of order
-_GAP_FACTOR: Final = 3.0  # multiple of the usual interval between PX4's timestamps
+_REBOOT_STEP: Final = 1_000_000  # us; PX4's time steps back by more in a reboot, by less if a message is out of order
+_GAP_FACTOR: Final = 3.0  # times the usual interval between PX4's timestamps; a longer interval is a gap
 _MIN_STEPS: Final = 5  # intervals before gaps are counted
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual interval and the usual rate
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
@@ -74,7 +74,7 @@ class Health:
 
     @property
     def stale_after(self) -> float:
-        """Seconds without a message until this stream is stale: at least 3, infinity if it may pause forever."""
+        """Seconds without a message until this stream is stale: at least 3, infinity if it may pause indefinitely."""
         if self.on_change:
             return max(TIMINGS.stale, 2 / self.nominal) if self.nominal else math.inf
         if not self.nominal and (self.usual_rate or 0) < _MIN_PERIODIC_RATE:
@@ -222,7 +222,7 @@ class StreamHealth:
         )
 
     def _add_time(self, timestamp: int) -> bool:
-        """Track PX4's time; return True for the first time, and for a step back in a reboot."""
+        """Track PX4's time; return True for the first timestamp, and for one so far back that it means a reboot."""
         step = None if self._time is None else timestamp - self._time
         if step is None or step < -_REBOOT_STEP:
             self._reboots += step is not None
@@ -252,7 +252,7 @@ class Monitor:
         self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample, received at `received` [ns] if another clock counts; return False for a retained one."""
+        """Add a sample and return True, unless it is retained. `received`: arrival time on another clock [ns]."""
         if sample.retained:
             return False
         if received is None:  # not the time of reading: a reader that starts or lags would show a higher rate
@@ -329,12 +329,12 @@ def describe_stream(health: Health, state: StreamState) -> str:
     """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
     doubts = "ok" if health.flags is None else describe_flags(health.flags)
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
-    events = [f"{count} {name}" for count, name in counts if count and state.name != "duplicate"]
+    events = [f"{n} {name.removesuffix('s' * (n == 1))}" for n, name in counts if n and state.name != "duplicate"]
     return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
 
 
 def health_of_last(sample: Sample[Message]) -> Health:
-    """Return the health of a stream from its last message alone; the age is by the wall clock."""
+    """Return the health of a stream from its last message alone; its age is measured by the wall clock."""
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
     return stream.snapshot(0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent))

@@ -75,7 +75,7 @@ class Job:
         except BaseException:  # noqa: BLE001 - includes Zenoh's panics; other jobs must continue
             pause = _RETRY_PAUSE
             if not self._failed:
-                _log.exception("unexpected error in a background job (logged once)", extra=about("internal_error"))
+                _log.exception("unexpected error in an I/O job, retrying (logged once)", extra=about("internal_error"))
             self._failed = True
         self._due = now + pause if pause < TICK or pause == math.inf else math.floor((now + pause) / TICK) * TICK
 

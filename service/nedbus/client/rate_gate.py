@@ -9,7 +9,7 @@ RATES: Final = (1, 2, 5, 10, 20, 50, 100)  # Hz to which publishers downsample a
 
 
 class RateGate:
-    """Rate limiter: passes at most rate x (T + 2.5 ms) + 2 messages in T seconds, two at once after a pause.
+    """Rate limiter: passes at most rate x (T + 2.5 ms) + 2 messages in any T seconds, and two at once after a pause.
 
     The caller provides the clock.
     """
@@ -40,5 +40,5 @@ def check_max_rate(max_rate: object) -> None:
 
 
 def rate_step(max_rate: float) -> int:
-    """Return the rate to request from publishers: the highest of RATES up to `max_rate`, or the lowest."""
+    """Return the rate to request from publishers: the highest of RATES up to `max_rate`, else the lowest."""
     return max((rate for rate in RATES if rate <= max_rate), default=RATES[0])

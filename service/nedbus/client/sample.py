@@ -38,11 +38,11 @@ class Sample(Generic[M_co]):
 
     `message`: the validated message; from `rows()`, a Row with the same fields.
     `address`: vehicle, topic and instance, also available as attributes.
-    `received`: time at which it left Zenoh's ring, ns since the epoch by this host's clock (not the time of reading).
+    `received`: time at which it left Zenoh's ring buffer, before it was read; ns since the epoch by this host's clock.
     `stamp`: Zenoh's timestamp with its clock id; None if the publisher sent none, and in copies.
     `lost`: messages of this key lost in transit just before this one.
     `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
-    `retained`: True for a publisher's last message before the subscription, and from `bus.latest()`.
+    `retained`: True for a publisher's last message before the subscription, and for samples from `bus.latest()`.
     `stored`: True if it came from a storage because no publisher of the address replied; `bus.latest()` only.
     """
 
@@ -63,7 +63,7 @@ class Sample(Generic[M_co]):
 
     @property
     def vehicle(self) -> str:
-        """The vehicle."""
+        """The vehicle id."""
         return self.address.vehicle
 
     @property
@@ -119,7 +119,7 @@ class Counts:
     `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
     `invalid`: invalid message or key; the log gives the reason once per key.
     `discarded`: duplicate or too late, for example because two processes publish under the same id.
-    `forgotten`: least recently active keys, evicted because of the limit of 10,000; `lost` omits their next gap.
+    `forgotten`: keys evicted beyond the limit of 10,000, least recently active first; `lost` omits their next gap.
     """
 
     received: int = 0

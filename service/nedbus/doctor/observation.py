@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 import zenoh
 
 from nedbus import clock
-from nedbus.client import ServiceStatus, SourceStatus, find_accounts, find_services
+from nedbus.client import ServiceStatus, SourceStatus, find_reports, find_services
 from nedbus.events import AccountReport
 from nedbus.timings import TIMINGS
 from nedbus.transport import (
@@ -84,7 +84,7 @@ class Observation:
         before = clock.utc()
         self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
-        self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
+        self.accounts = find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
         tokens = token_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
         self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
         tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)

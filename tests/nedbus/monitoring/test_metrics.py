@@ -290,7 +290,7 @@ def test_missing_prometheus_client_returns_501_with_install_hint(
     wait_for(lambda: pages.request("/readyz")[0] == 200, what="the service")
     status, text = pages.request("/metrics")
     assert status == 501
-    assert re.fullmatch(r"prometheus_client: not installed: .*pip install .*\[metrics\]'\n", text)
+    assert re.fullmatch(r"prometheus_client: not installed; .*pip install .*\[metrics\]'\n", text)
     exporter = start("-c", WITHOUT_CLIENT, "export", "-c", endpoint, "--http", f"127.0.0.1:{free_port()}")
     assert exporter.wait() == 2
     assert exporter.err == f"nedbus: {text}"

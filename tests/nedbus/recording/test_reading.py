@@ -142,12 +142,12 @@ def test_missing_package_error_contains_the_pip_command(flight: Path, monkeypatc
     with pytest.raises(ArgumentError, match="dataframe 'foo' is not valid: expected pandas or polars"):
         nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # invalid on purpose
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ConfigError, match=r"pandas: not installed: pip install pandas"):
+    with pytest.raises(ConfigError, match=r"pandas: not installed; run pip install pandas"):
         nedbus.read(flight, dataframe="pandas")
     for name in ("mcap_reader", "mcap_chunks"):
         monkeypatch.delitem(sys.modules, f"nedbus.recording.{name}")
     monkeypatch.setitem(sys.modules, "mcap.records", None)
-    with pytest.raises(ConfigError, match=r"^mcap: not installed: .*pip install .*\[mcap\]'$"):
+    with pytest.raises(ConfigError, match=r"^mcap: not installed; .*pip install .*\[mcap\]'$"):
         nedbus.read(flight)
 
 

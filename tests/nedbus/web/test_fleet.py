@@ -130,7 +130,7 @@ def test_since_is_the_start_of_the_state(sim: SimulatedFleet) -> None:
     silent = sim.vehicle(alive=[WING])
     assert (silent.grade, silent.brief) == ("bad", "silent")
     assert silent.state.since == pytest.approx(last, abs=0.01)
-    assert sim.view(alive=[WING]).description == "stale: nothing for 10.0 s, 1 gaps"
+    assert sim.view(alive=[WING]).description == "stale: nothing for 10.0 s, 1 gap"
 
 
 def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:

@@ -34,7 +34,7 @@ class MatchingListener:
         self._try_recv = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
-        """Return True if there are subscribers, by Zenoh's latest report."""
+        """Return True if there are subscribers, according to Zenoh's latest report."""
         with self._lock:
             try:
                 if (status := self._try_recv()) is not None:

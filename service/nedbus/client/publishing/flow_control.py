@@ -20,7 +20,7 @@ from .writer import Writer
 
 _log = logging.getLogger(__name__)
 
-WINDOW: Final = 2000  # unacknowledged messages of a session; this fits into the queues of a link and of a reader
+WINDOW: Final = 2000  # unacknowledged messages of a session; this many fit into the queues of a link and of a reader
 CACHE: Final = 8192  # messages in the history cache of a lossless publisher
 _MAX_UNACKNOWLEDGED: Final = CACHE - WINDOW  # messages; at this limit even the trickle stops
 _MIN_WINDOW: Final = 100  # messages per publisher, however many publishers share the window

@@ -89,7 +89,7 @@ class Publisher(AbstractContextManager["Publisher"]):
 
         A Message was validated when it was created, and is not validated again.
         A dict without `timestamp` gets the time since boot of this host, like PX4's time since boot.
-        Readers see the fields that were not provided in `sample.missing`.
+        Fields that were not provided are listed in the readers' `sample.missing`.
 
         Raises TypeError for another type of message, InvalidMessageError for invalid fields, EncodeError for a message
         that bypassed validation, ClosedError once the publisher or its bus is closed.
@@ -102,10 +102,10 @@ class Publisher(AbstractContextManager["Publisher"]):
             self._put(self._codec.encode_fields(message), message.keys())
         else:
             name, given = self.definition.name, type(message).__name__
-            raise TypeError(f"{self.address} carries {name}: publish one, or a dict of its fields, not {given}")
+            raise TypeError(f"{self.address} carries {name}: publish a {name} or a dict of its fields, not {given}")
 
     def publish_row(self, values: Sequence[object] | Message) -> None:
-        """Validate and publish the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples.
+        """Validate and publish the values of all fields in PX4's order, with arrays such as `delta_xy` as tuples.
 
         Equivalent to `publish` with these fields, but faster: no message object is created. Raises the same errors.
         """
@@ -114,7 +114,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def publish_many(self, messages: MessageArray) -> None:
         """Validate a structured array of shape (n,) and dtype DTYPE, then publish its messages in order.
 
-        Publishes nothing if a message is invalid. If the bus closes during the call, `published` counts messages sent.
+        Publishes nothing if a message is invalid. If the bus closes meanwhile, `published` counts the messages sent.
 
         Raises TypeError for another dtype, InvalidMessageError for the first invalid message, with its `index`,
         ClosedError once the publisher or its bus is closed.
@@ -133,7 +133,7 @@ class Publisher(AbstractContextManager["Publisher"]):
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers in mode "every" have received all messages; return False on timeout.
 
-        If the process ends without a flush, messages in transit to a slow reader are lost and not counted as lost.
+        If the process ends without a flush, messages in transit to a slow reader are lost, but not counted as lost.
         A disconnected reader detects the messages it missed, and recovers those still in the history cache.
 
         Raises ClosedError once the bus is closed.

@@ -131,7 +131,7 @@ class PublisherRegistry:
             address, logged = publisher.address, False
             while not publisher.flush(min(_FLUSH_POLL, max(0.0, end - time.monotonic()))):
                 if (stop and stop.is_set()) or time.monotonic() >= end:
-                    text = "%s: a reader has not received all messages"
+                    text = "%s: stopped waiting for a reader that has not received all messages"
                     _log.warning(text, address, extra=about("slow_reader", address))
                     return
                 if not logged:

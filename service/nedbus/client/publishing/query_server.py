@@ -23,7 +23,7 @@ JSON: Final = "application/json"
 
 _replies = CallThread("nedbus-replies")  # a report on many vehicles would block the I/O thread for too long
 
-# Replies to a query. It must not reference the owner of the server, which may be garbage-collected while it is open.
+# Replies to a query; must not reference the server's owner, which may be garbage-collected while the server is open.
 Reply = Callable[[zenoh.Query], object]
 
 
@@ -100,5 +100,5 @@ class _Queryable:
                 except zenoh.ZError as exc:
                     _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
                 except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
-                    _log.exception("%s: failed to reply to a query", key_expr, extra=about("internal_error"))
+                    _log.exception("%s: unexpected error in a query reply", key_expr, extra=about("internal_error"))
                 self._query = self._try_recv() if time.monotonic() < end else None

@@ -49,7 +49,7 @@ class Writer:
             heartbeats.writers.add(self)
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
-        """Put a payload without waiting for readers; `encoding` overrides that of the writer."""
+        """Put a payload without waiting for readers; `encoding` overrides the writer's."""
         if self._publisher is None:
             raise ClosedError
         self._publisher.put(payload, timestamp=stamp, encoding=encoding)

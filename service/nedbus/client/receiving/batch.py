@@ -67,7 +67,7 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
     codec = decoder.codec(*arrivals[0][:3:2])  # may wait for a layout lookup
     definition = codec.definition if codec else DEFAULT
-    blank = bytes(codec_of(definition).size)  # invalid stand-in for payloads of other layouts, decoded separately below
+    blank = bytes(codec_of(definition).size)  # invalid placeholder for payloads of other layouts, decoded below
     own = codec.size if codec else -1
     payloads = [payload if len(payload) == own else blank for _, payload, _, _, _ in arrivals]
     arrays = arrays_of(definition)

@@ -67,7 +67,7 @@ Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int, int]
 """An admitted message: key state, payload (empty if rejected), metadata, number of messages lost before it, and the
 time at which it left Zenoh's ring [ns].
 
-A plain tuple: a class with named fields costs 0.1 us more per message, where a batch takes 0.3 us.
+A plain tuple: a class with named fields would add 0.1 us to the 0.3 us that a message of a batch takes.
 """
 
 
@@ -133,7 +133,7 @@ class Decoder:
         codec = stream.codec or self.codec(stream, raw)
         encoding = encoding_of(stream, raw)
         if codec is None:
-            self.reject(stream.key, DecodeError(f"no publisher has the definition of {encoding[:_MAX_TEXT]!r}"), stream)
+            self.reject(stream.key, DecodeError(f"received no definition of {encoding[:_MAX_TEXT]!r}"), stream)
             return None
         decode = codec.decode_row if rows else codec.decode
         try:
@@ -166,12 +166,12 @@ class Decoder:
             last = "; further keys are only counted" if len(self._warned) == _MAX_LOGGED_KEYS else ""
         reason = str(error)[:_MAX_TEXT]
         extra = about("invalid", stream.address if stream else None, reason=reason)
-        _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
+        _log.warning("ignored an invalid message on %r (%s)%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
     def inspect(self, stream: KeyState, payload: bytes, raw: RawSample) -> None:
         """Check a sample without waiting for a lookup, which it may start; raise DecodeError if it is invalid."""
         if len(payload) > PAYLOAD_LIMIT:
-            raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
+            raise DecodeError(f"{len(payload)} bytes, more than the limit of {PAYLOAD_LIMIT}")
         if raw.kind == zenoh.SampleKind.DELETE:
             raise DecodeError("a delete sample, which nedbus publishers never send")
         codec = self.codec(stream, raw, wait=False)  # None: decoded on read; the lookup may be done by then

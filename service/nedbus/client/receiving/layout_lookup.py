@@ -61,7 +61,7 @@ class LayoutLookup:
         self._closed = False
         self._open: dict[SchemaId, object] = {}  # publisher of each open lookup, queried lookups first
         self._failed: dict[SchemaId, tuple[int, float, object]] = {}  # failures, time of the next query, publisher
-        self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last futile wait
+        self._wait_budget, self._budget_time = TIMINGS.definition_timeout, float("-inf")  # [s], at the last failed wait
 
     def newer(self, definition: Definition[Any]) -> Mapping[int, Sequence[str]]:
         """Return the newer layouts of a message found so far, in the form that `decode` expects."""
@@ -165,14 +165,14 @@ class LayoutLookup:
     def _define(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
         if not self._evict(len(fields) + _BASE):
             if not self._full:
-                text = "%s: not decoded: too many definitions from publishers in use"
+                text = "%s is not decoded, because too many definitions from publishers are in use"
                 _log.warning(text, name, extra=about("invalid"))
             self._full = True
             return False
         try:
             definition = define(name, ((field, field_type(kind)) for field, kind in fields.items()))
         except ValueError as exc:
-            _log.warning("%s: invalid definition from a peer: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
+            _log.warning("ignored a peer's definition of %s: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
         self._codecs[name, identity], self._used[name, identity] = codec_of(definition), self._now()
         text = "%s is not built in: using the publisher's definition"

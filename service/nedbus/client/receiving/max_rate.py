@@ -35,7 +35,7 @@ _MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake 
 class MaxRateQueue(PendingQueue):
     """Queue at most `max_rate` messages per second and stream; raise ArgumentError unless it is finite and above 0.
 
-    Messages omitted to keep the rate count neither as lost nor as dropped.
+    Messages omitted to limit the rate count neither as lost nor as dropped.
     """
 
     def __init__(self, mode: Mode, decoder: Decoder, selection: Selection, *, max_rate: float) -> None:
@@ -114,9 +114,9 @@ class MaxRateReceiver(Receiver):
         for address in due:
             del self._awaiting[address]
         if missing := [address for address in due if not self._rate_queue.has_downsampled(address)]:
-            key = missing[0].key(prefix=self._prefix)
-            text = "%d streams are not downsampled (by publisher or access rules) and not received, such as %s"
-            _log.warning(text, len(missing), key, extra=about("unsupported"))
+            key, more = missing[0].key(prefix=self._prefix), f" and {len(missing) - 1} more" if missing[1:] else ""
+            text = "no downsampled messages of %s%s arrive: subscribe without a maximum rate, or check the access rules"
+            _log.warning(text, key, more, extra=about("unsupported"))
 
 
 def _sent(arrival: Arrival) -> float:

@@ -1,7 +1,7 @@
 """Pending queue between receiving and reading: the streams of a subscription and their unread messages; no I/O.
 
 If the reader is slow, mode `latest` replaces unread samples, and mode `every` queues 65,536 and then drops the oldest.
-Either way drops are counted, and no publisher or other reader is delayed.
+Either way drops are counted, and neither the session nor other readers are delayed.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ KEPT_KEYS: Final = 1_000
 """Keys kept however long they are silent, to count the losses of a long outage."""
 
 MAX_HELD: Final = 131_072
-"""Messages held back behind gaps, about 90 MB; beyond that gaps are given up."""
+"""Maximum number of messages held back behind gaps, about 90 MB; beyond it, gaps count as lost."""
 
 MAX_ACK_REQUESTS: Final = 1000
 """Pending acknowledgement requests; a well-behaved publisher has one per key."""
@@ -57,7 +57,7 @@ _MAX_WRITERS_OF_KEY: Final = 8  # beyond that the oldest writer without a gap is
 _MIN_IN_ORDER: Final = 8  # smaller batches are checked message by message
 _SETTLING: Final = 10.0  # s after a link change; a new publisher may have sent messages during the outage
 _PAYLOAD: Final = itemgetter(1)
-_SLOW: Final = "the reader is slower than the data: messages are dropped"
+_SLOW: Final = "the reader is slower than the data, so messages are dropped"
 
 
 @dataclass(slots=True, eq=False)
@@ -76,7 +76,7 @@ class PendingQueue:
     """Order the messages of each publisher, count losses and drops, and decode messages when they are read.
 
     It owns the state of all streams: key states, writer proxies, counters and unread messages, guarded by one lock.
-    In mode `every`, messages behind a gap are held back until it is filled; in mode `latest` a gap is lost at once.
+    In mode `every`, a gap holds back later messages until it is filled; in mode `latest`, it counts as lost at once.
     `name`: the key expression. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
@@ -325,7 +325,7 @@ class PendingQueue:
             if since >= now - MAX_SILENCE:
                 self.counters.forgotten += 1
                 text = "the least recently active are evicted, and their next gap is not counted"
-                self._warn_once(f"more than {MAX_KEYS:,} keys: {text}")
+                self._warn_once(f"there are more than {MAX_KEYS:,} keys, so {text}")
 
     def _admit(self, batch: Sequence[RawSample]) -> list[Arrival]:
         """Return the arrivals of a batch, with 0 losses each; rejected ones keep their number but lose the payload.
@@ -411,7 +411,7 @@ class PendingQueue:
         return True
 
     def _add_writer(self, stream: KeyState, name: str, expected: int, *, history_end: int) -> WriterProxy | None:
-        """Add a writer proxy, evicting one without a gap if necessary; None if all of its key have gaps."""
+        """Add a writer proxy, evicting one without a gap if necessary; None if all writers of the key have gaps."""
         if len(stream.writers) >= _MAX_WRITERS_OF_KEY:
             writers = stream.writers.values()
             first = next((each for each in writers if each is not stream.writer and each.request is None), None)

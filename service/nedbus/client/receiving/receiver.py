@@ -29,7 +29,7 @@ from .retransmission import Retransmission
 _log = logging.getLogger(__name__)
 
 RING_CAPACITY: Final = 16_384
-"""Samples that fit between two polls; more than 0.2 s of traffic of the largest fleet."""
+"""Samples that the ring holds between two polls: more than 0.2 s of the traffic of the largest fleet."""
 
 _POLL: Final = 2 * TICK  # s between polls by the I/O thread
 _ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
@@ -173,7 +173,7 @@ class Receiver:
             self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
         except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
             extra = about("internal_error")
-            _log.exception("%s: unexpected error, %d samples discarded", self._queue.name, len(batch), extra=extra)
+            _log.exception("%s: unexpected error, discarded a batch of %d", self._queue.name, len(batch), extra=extra)
             self._queue.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:

@@ -46,7 +46,7 @@ class Request:
     deadline: float | None = None  # when the gap counts as lost; each delivery resets it
     attempts: int = 0
     requested: range | None = None  # numbers of the open query
-    first_available: int | None = None  # lowest number answered; the publisher caches everything from there on
+    first_available: int | None = None  # lowest number answered; the publisher caches everything from this one on
     last_answered: bool = False  # the highest requested number was answered
     probe: int | None = None  # number requested again; an answer proves that `candidate` is the lowest in the cache
     candidate: int | None = None
@@ -153,7 +153,7 @@ class WriterProxy:
         return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 
     def _confirm_lowest(self, request: Request, *, expired: bool) -> None:
-        """Give up numbers below the lowest answered one, once a probe has shown that no lower answer was lost."""
+        """Count numbers below the lowest answered one as lost, once a probe has shown that no lower answer was lost."""
         lowest = request.first_available
         if lowest is None or lowest <= self.expected:
             return

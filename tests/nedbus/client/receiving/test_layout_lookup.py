@@ -134,7 +134,7 @@ def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, capl
     known = [lookup.codec("Honest", str(number), wait=True) for number in range(20)]
     assert [codec is not None for codec in known] == [True] * 10 + [False] * 10
     assert lookup.codec("Honest", "0") is known[0]
-    assert caplog.text.count("too many definitions from publishers in use") == 1
+    assert caplog.text.count("too many definitions from publishers are in use") == 1
     now += 3600.0
     assert lookup.codec("Honest", "0") is known[0]
     assert lookup.codec("Honest", "new", wait=True)

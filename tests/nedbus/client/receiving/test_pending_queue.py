@@ -255,7 +255,7 @@ def test_oldest_samples_are_dropped_counted_and_logged_once(
     samples = drain(small_queue)
     assert [(sample.message.timestamp, sample.lost) for sample in samples] == [(each, 0) for each in range(31, 41)]
     assert small_queue.counts == Counts(received=10, dropped=30)
-    assert caplog.messages == ["queue: the reader is slower than the data: messages are dropped"]
+    assert caplog.messages == ["queue: the reader is slower than the data, so messages are dropped"]
 
 
 def test_losses_before_dropped_samples_are_reported_later(small_queue: PendingQueue) -> None:
