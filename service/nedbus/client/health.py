@@ -167,7 +167,6 @@ class StreamHealth:
         else:
             timestamp, *seen = (getattr(message, name) for name in names)
         window = self._window
-        received = max(received, self._received or received)  # a step of the wall clock must not turn time back
         if received - window.start >= _WINDOW:
             if window.messages:
                 self._last_window = window
@@ -249,6 +248,7 @@ class Monitor:
 
     def __init__(self) -> None:
         self.evicted = 0
+        self._latest = time.monotonic_ns()  # arrival time of the latest sample [ns]
         self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
@@ -256,7 +256,8 @@ class Monitor:
         if sample.retained:
             return False
         if received is None:  # not the time of reading: a reader that starts or lags would show a higher rate
-            received = time.monotonic_ns() - max(0, clock.utc_ns() - sample.received)
+            waited = max(0, clock.utc_ns() - sample.received)
+            received = self._latest = max(self._latest, time.monotonic_ns() - waited)  # whatever step the clock makes
         address = sample.address
         stream = self._streams.pop(address, None)
         if stream is None and len(self._streams) >= _MAX_STREAMS:

@@ -97,7 +97,9 @@ def _why(story: Story, cause: Sequence[Event], times: Times, room: int) -> list[
     for *_, each in sorted(said, key=lambda text: text[:2]):
         if not any(each.text in other.text or other.text in each.text for other in texts):
             texts.append(each)
-    ranked = [*texts[:1], *[each for each in cause if each.kind != "text"][-3:], *texts[1:2]]
+    others = [each for each in cause if each.kind != "text"][-3:]
+    others.sort(key=lambda each: KINDS[each.kind].message == "VehicleLocalPosition")  # effects after causes
+    ranked = [*texts[:1], *others, *texts[1:2]]
     while ranked:
         groups = groupby(sorted(ranked, key=cause.index), key=times.text)
         words = ((time, dict.fromkeys(_cut(each.words) for each in group)) for time, group in groups)

@@ -205,9 +205,10 @@ def sample(vehicle: str, timestamp: int = 0) -> Sample:
 @pytest.mark.parametrize("step", [3600, -3600])
 def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """Rate and age use the monotonic clock: setting the wall clock between arrival and reading changes nothing."""
-    monitor, now, utc, address = Monitor(), 10_000 * SECOND, 10_000 * SECOND, Address("1", VLP)
+    now, utc, address = 10_000 * SECOND, 10_000 * SECOND, Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
     monkeypatch.setattr("nedbus.clock.utc_ns", lambda: utc)
+    monitor = Monitor()
     for index in range(300):
         now, utc = now + SECOND // 100, utc + SECOND // 100
         arrived = dataclasses.replace(sample("1", index * 10_000), received=utc)
@@ -222,9 +223,10 @@ def test_health_ignores_wall_clock_steps(monkeypatch: pytest.MonkeyPatch, step: 
 
 def test_rate_is_measured_at_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples that queue up while a reader starts, and that it then reads together, do not raise the rate."""
-    monitor, now, start, address = Monitor(), SECOND, time.time_ns(), Address("1", VLP)
+    now, start, address = 0, time.time_ns(), Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
     monkeypatch.setattr("nedbus.clock.utc_ns", lambda: start + now)
+    monitor, now = Monitor(), SECOND
     for index in range(151):
         arrival = SECOND // 2 + index * SECOND // 100
         now = max(now, arrival)

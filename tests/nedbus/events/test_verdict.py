@@ -244,6 +244,22 @@ def test_verdict_counts_equal_faults() -> None:
     )
 
 
+def test_short_evidence_is_the_lost_fix_not_its_effect() -> None:
+    """Where there is room for only a part of the evidence, a sensor's event precedes those of the estimator."""
+    flight = Flight()
+    for _ in range(3):
+        flight.gps()
+        flight.fly(20.0)
+        flight.send(dead_reckoning=True)
+        flight.gps(fix_type=0, satellites_used=0)
+        flight.wait(5.0).send(dead_reckoning=True, xy_valid=False, v_xy_valid=False)
+        flight.wait(1.0).send()
+    text = verdict(flight).text
+    assert "(one of 3)" in text
+    assert "GPS fix lost" in text
+    assert "dead reckoning" not in text
+
+
 def test_verdict_fits_three_lines() -> None:
     """Long PX4 texts are truncated: a verdict has at most three lines of 100 columns."""
     flight = Flight()
