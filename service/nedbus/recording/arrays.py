@@ -125,7 +125,7 @@ class Flight(ExitStack):
         """Drop invalid messages, and store the names of missing fields in the dtype."""
         messages, valid, absent = decoded
         if not valid.all():
-            self._invalid.append(f"{address.stream}: skipped {np.sum(~valid)} of {len(valid)} messages as invalid")
+            self._invalid.append(f"skipped {np.sum(~valid)} of {len(valid)} messages of {address.stream} as invalid")
             messages, absent = messages[valid], absent[valid]
         masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
         if masks:

@@ -224,7 +224,7 @@ class _RecordedFile:
         if lacking := sorted({*wrong, *(known.always - types.keys())}):
             raise ValueError(f"its definition of {', '.join(lacking)} matches no PX4 release")
         if unknown := sorted(types.keys() - known.known_types.keys()):
-            self.chunks.warn(f"{topic}: left out {', '.join(unknown)}, unknown to nedbus in {known.name}")
+            self.chunks.warn(f"left out {', '.join(unknown)} of {topic}, unknown to nedbus in {known.name}")
         return Layout("of the file", "", types=types)
 
 

@@ -45,7 +45,7 @@ def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptio
         yield SourceMessage(due, stream.address, fields, definition=stream.definition, dropout=dropout)
     warnings = _warnings_of(reader)
     for address, count in clock.unordered.items():
-        warnings.append(f"{address}: timestamps out of order ({count}); the order of the log is kept")
+        warnings.append(f"timestamps of {address} are out of order ({count}); the order of the log is kept")
     warnings += options.absent_from({address.topic for address in reader.streams}, "this log")
     if clock.gaps:
         warnings.append(f"skipped gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps ({clock.gaps})")
@@ -109,7 +109,7 @@ def _warnings_of(reader: UlogReader) -> list[str]:
     for stream in reader.streams.values():
         unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
         if unknown and _is_newer(stream):
-            warnings.append(f"{stream.address}: left out unknown fields {', '.join(unknown)}; update nedbus")
+            warnings.append(f"left out unknown fields of {stream.address} ({', '.join(unknown)}); update nedbus")
     return warnings
 
 

@@ -80,7 +80,7 @@ def test_fields_unknown_to_px4_are_skipped_and_listed(tmp_path: Path, where: str
         rest, text = second.split("\n", 1)
         text = f"{first}uint64 timestamp_sample{rest}\n{own}{text}"
         path = write_bag(tmp_path / "a.mcap", definition=text, change=add_in_middle)
-    left_out = f"{TOPIC}: left out wind_east, wind_north, unknown to nedbus in VehicleLocalPosition"
+    left_out = f"left out wind_east, wind_north of {TOPIC}, unknown to nedbus in VehicleLocalPosition"
     assert_complete(path, warnings=(left_out,))
 
 

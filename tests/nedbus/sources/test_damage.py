@@ -450,4 +450,4 @@ def test_invalid_message_is_skipped(tmp_path: Path, layout: str, caplog: pytest.
     payloads = payload(1, layout=layout), bytes(bad), payload(3, layout=layout)
     path = write_payloads(tmp_path / "a.mcap", payloads, layout=layout)
     assert nedbus.read(path)["timestamp"].tolist() == [1, 3]
-    assert "vehicle_local_position: skipped 1 of 3 messages as invalid" in caplog.text
+    assert "skipped 1 of 3 messages of vehicle_local_position as invalid" in caplog.text
