@@ -1,4 +1,4 @@
-"""MCAP recordings and .ulg logs: write and read MCAP, read .ulg, load either as arrays, and plot them.
+"""MCAP recordings, .ulg and .tlog logs: write and read MCAP, read .ulg, load all of them as arrays, and plot them.
 
 Each name imports its module on first use: MCAP and plots need extras, and NumPy is slow to import.
 """

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
 _MAX_ROWS: Final = 10_000_000  # rows at a given rate; a damaged timestamp must not exhaust memory
-_STALE: Final = 1_000_000  # us; a first message older than this at the start of recording was sent before it
-_STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
+_STALE: Final = 1_000_000  # us; a first message that is older when recording starts was sent before the start
+_STRAY: Final = 0.01  # fraction of messages that may be out of order; a larger one indicates several boots
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
 _Floats = npt.NDArray[np.float64]
@@ -69,11 +69,11 @@ def align(
 
     `method`: "last" uses the last message at or before each row, so no value is from the future.
     "nearest" uses the message nearest in time; its age can be negative. "linear" interpolates floats between the
-    messages before and after, unit quaternions by slerp and angles the shorter way around. Other types, floats across
+    messages before and after, unit quaternions by slerp and angles along the shorter arc. Other types, floats across
     a change of a reset counter, and rows after the last message keep the last value.
     Several files are aligned in UTC: `timestamp` is Unix time, a stream is `<vehicle>/<stream>`, as in `read`, and the
     rows are by default the positions of the first vehicle.
-    `utc`: add a column `utc` with the UTC from `utc_of`, NaT if it has none.
+    `utc`: add a column `utc` with the UTC from `utc_of`, or NaT if it is unknown.
 
     Raises ArgumentError for an invalid `on`, `method` or `fields`, ConfigError if a stream spans several boots of a
     vehicle, which share no time base, and the errors of `read`.
@@ -177,7 +177,7 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
-    """Interpolate linearly, angles the shorter way, to a range from -period/2 if one is negative, else from 0."""
+    """Interpolate linearly, angles on the shorter arc, to a range from -period/2 if either is negative, else from 0."""
     with np.errstate(invalid="ignore"):  # for infinity minus infinity, and for an infinite period
         step = second - first
         turned = first + weight * (step - np.sign(step) * period)
@@ -201,7 +201,7 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
     late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
     early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])
     if min(late, early) > max(1, _STRAY * len(stamps)):
-        raise ConfigError(stream, "timestamps restart: align the messages of each boot separately, as slices of `read`")
+        raise ConfigError(stream, "timestamps restart; align the messages of each boot separately, as slices of `read`")
     return stamps
 
 
@@ -223,6 +223,6 @@ def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start
     if count > _MAX_ROWS:
         earliest, latest = min(firsts, key=firsts.__getitem__), max(lasts, key=lasts.__getitem__)
         ends = f"{earliest} begins at {first / 1e6:.0f} s, {latest} ends at {last / 1e6:.0f} s"
-        problem = f"Hz results in too many rows: {ends}"
+        problem = f"Hz results in too many rows ({ends})"
         raise ArgumentError("on", rate, "topics on one clock, a lower rate, or times", problem=problem)
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

@@ -125,7 +125,7 @@ class Flight(ExitStack):
         """Drop invalid messages, and store the names of missing fields in the dtype."""
         messages, valid, absent = decoded
         if not valid.all():
-            self._invalid.append(f"{address.stream}: skipped {np.sum(~valid)} of {len(valid)} messages as invalid")
+            self._invalid.append(f"skipped {np.sum(~valid)} of {len(valid)} messages of {address.stream} as invalid")
             messages, absent = messages[valid], absent[valid]
         masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
         if masks:
@@ -158,7 +158,7 @@ class _Decoded(NamedTuple):
 
 
 def _decode_ulog(stream: LoggedStream, payloads: bytearray) -> _Decoded:
-    """Decode messages of a log, vectorized; in streams with fields of another type, decode them one by one."""
+    """Decode messages of a log, vectorized; one by one in streams with fields whose type must be converted."""
     table: npt.NDArray[np.void] = np.frombuffer(payloads, np.dtype(stream.subscription.layout.dtype))
     definition, columns = stream.definition, {name: table[name] for name in stream.names}
     decoded, plan = _Decoded.empty(definition, len(table)), definition.plan(tuple(columns))

@@ -14,12 +14,12 @@ SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap", ".tlog": 
 
 _MAX_NAMED: Final = 10  # addresses listed in an error
 _UNREADABLE: Final = {
-    b"ULogKey": "an encrypted log: decrypt it with PX4's Tools/decrypt_ulog.py and the private key first",
-    b"PK\x03\x04": "a zip archive: unpack it first",
-    b"\x1f\x8b": "a gzip file: unpack it first",
-    b"version https://git-lfs": "a Git LFS pointer instead of the file: fetch the file with 'git lfs pull'",
-    b"SQLite format 3": "an SQLite bag: convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
-    b"": "an empty file: copy it again, or look for another log of this flight",
+    b"ULogKey": "an encrypted log; decrypt it with PX4's Tools/decrypt_ulog.py and the private key first",
+    b"PK\x03\x04": "a zip archive; unpack it first",
+    b"\x1f\x8b": "a gzip file; unpack it first",
+    b"version https://git-lfs": "a Git LFS pointer instead of the file; fetch the file with 'git lfs pull'",
+    b"SQLite format 3": "an SQLite bag; convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
+    b"": "an empty file; copy it again, or look for another log of this flight",
 }  # by first bytes
 
 
@@ -34,21 +34,21 @@ def format_of(path: str | PurePath) -> str:
     found = find_format(path)
     if found is None:
         reason = _why_unreadable(Path(path).expanduser())
-        raise ConfigError(str(path), reason or f"not a flight file: its name must end with {' or '.join(SUFFIXES)}")
+        raise ConfigError(str(path), reason or f"not a flight file; its name must end with {' or '.join(SUFFIXES)}")
     return found
 
 
 def check_recording(path: Path) -> None:
     """Raise ConfigError unless the name of a recording ends with .mcap."""
     if SUFFIXES.get(path.suffix.lower()) != "mcap":
-        raise ConfigError(str(path), "not a recording: its name must end with .mcap")
+        raise ConfigError(str(path), "not a recording; its name must end with .mcap")
 
 
 def open_flight(path: Path) -> BinaryIO:
     """Open a file for reading; raise SourceError if that fails, or for a pipe, which cannot be read twice."""
     try:
         if path.exists() and not path.is_file():
-            raise SourceError(str(path), "not a regular file: save the data to a file first")
+            raise SourceError(str(path), "not a regular file; save the data to a file first")
         if reason := _why_unreadable(path):
             raise SourceError(str(path), reason)
         return path.open("rb")
@@ -57,7 +57,7 @@ def open_flight(path: Path) -> BinaryIO:
 
 
 def recording_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return the MCAP files of a recording or bag folder in order, and the missing ones; raise SourceError if empty."""
+    """Return the MCAP files of a recording or bag in order, and the missing ones; raise SourceError if it has none."""
     if not path.is_dir():
         return [path], []
     found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
@@ -117,7 +117,7 @@ def single_match(path: Path, addresses: Sequence[Address], selection: Selection)
     found = plain if len(plain) == 1 and len({(each.vehicle, each.topic) for each in found}) == 1 else found
     lacking = [part for part in ("topic", "vehicle", "instance") if len({getattr(each, part) for each in found}) > 1]
     if lacking:
-        problem = f"one stream of {path}, but several match: set {' and '.join(lacking)} to one of {_list(found)}"
+        problem = f"one stream of {path}, but several match; set {' and '.join(lacking)} to one of {_list(found)}"
         raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
     return found
 

@@ -1,7 +1,7 @@
 """MCAP file reader that reads chunk by chunk, and skips and reports damaged parts.
 
-The summary, which has its own CRC, lists the chunks; without it the records are scanned one by one. Decompression is
-bounded in memory. The readers of the `mcap` package have no limit and stop at the first damage.
+The summary, which has its own CRC, lists the chunks; without it the records are scanned one by one. Decompression
+uses bounded memory. The readers of the `mcap` package have no limit and stop at the first damage.
 """
 
 import os
@@ -73,7 +73,7 @@ class ChunkFile:
         try:
             self._read_summary()
         except READ_ERRORS:
-            self.warn("the index is damaged: reading without it")
+            self.warn("the index is damaged; reading without it")
 
     def blocks(self, only: Collection[int] | None = None) -> Iterator[bytes]:
         """Yield each intact chunk, decompressed, and each record outside chunks, in file order.
@@ -91,7 +91,7 @@ class ChunkFile:
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
             except READ_ERRORS:
-                self.warn(f"the chunk {_describe(record, offset)} is damaged: its messages are skipped", lost=True)
+                self.warn(f"the chunk {_describe(record, offset)} is damaged; its messages are skipped", lost=True)
 
     def warn(self, warning: str, *, lost: bool = False) -> None:
         """Add a warning unless it is a duplicate; `lost`: the damage cost messages."""
@@ -111,7 +111,7 @@ class ChunkFile:
                     if unpacked.tell() > limit:
                         raise ZstdError(f"more than {limit} bytes")
             except ZstdError as exc:
-                self.warn(f"the compressed file is damaged: {exc}", lost=True)
+                self.warn(f"the compressed file is damaged ({exc})", lost=True)
             on_error.pop_all()
         return unpacked
 
@@ -150,7 +150,7 @@ class ChunkFile:
             end = offset + _RECORD_HEAD.size + length
             surplus = length - _expected_length(opcode, begin[_RECORD_HEAD.size :], length)
             if opcode == 0 or end > self._size or surplus not in _SURPLUS:
-                self.warn(f"truncated or damaged: skipped from byte {offset} of {self._size} to the end", lost=True)
+                self.warn(f"skipped truncated or damaged data from byte {offset} of {self._size} to the end", lost=True)
                 return
             if opcode in _LENGTHS:
                 return
@@ -159,7 +159,7 @@ class ChunkFile:
             if after_chunk and opcode == Opcode.MESSAGE and is_index:
                 opcode = Opcode.MESSAGE_INDEX
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
-                self.warn(f"damaged: skipped the chunk before byte {offset}", lost=True)
+                self.warn(f"skipped a damaged chunk before byte {offset}", lost=True)
             after_chunk = opcode == Opcode.CHUNK or (after_chunk and opcode == Opcode.MESSAGE_INDEX)
             if opcode in {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}:
                 yield opcode, offset, end

@@ -79,7 +79,7 @@ class RecordingReader(ExitStack):
             if not self.counts:
                 reasons = [*self.warnings[:3]] or ["no channel has a type of px4_msgs"]
                 problem = "no message can be read" if self.damaged else "this recording has no messages of PX4 topics"
-                raise SourceError(str(path), f"{problem}: {'; '.join(reasons)}")
+                raise SourceError(str(path), f"{problem}; {'; '.join(reasons)}")
         except BaseException:
             self.close()
             raise
@@ -97,7 +97,7 @@ class RecordingReader(ExitStack):
 
     @property
     def boot_utc(self) -> int:
-        """Unix time of the boot, from the log that was converted to this file [us]; 0 if unknown."""
+        """Unix time of the boot [us], from the metadata of a converted log; 0 if unknown, or if the files disagree."""
         known = {boot for file in self._files for boot in file.boot_times}
         return int(known.pop()) if len(known) == 1 else 0
 
@@ -156,12 +156,12 @@ class _RecordedFile:
                         continue
                     if (number := record.channel_id) not in self._streams:
                         self._streams[number] = None
-                        lost = f"skipped the messages of channel {number}: its channel record is lost"
+                        lost = f"skipped the messages of channel {number}, whose channel record is lost"
                         self.chunks.warn(lost, lost=True)
                     if (stream := self._streams[number]) and (only is None or stream.address in only):
                         yield RecordedMessage(stream, _unpack(record.data), record.log_time)
             except READ_ERRORS:
-                self.chunks.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
+                self.chunks.warn("skipped the rest of a chunk after an invalid record", lost=True)
 
     def _channels(self, only: Collection[Address] | None = None) -> list[int] | None:
         """Return the readable channels, by default of all addresses; None if the summary does not list all channels."""
@@ -183,9 +183,9 @@ class _RecordedFile:
         try:
             if schema.encoding and (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
                 encodings = f"{channel.message_encoding} with {schema.encoding}, not cdr with ros2msg"
-                raise ValueError(f"its encoding is {encodings}: record it where px4_msgs is installed")
+                raise ValueError(f"its encoding is {encodings}; record it where px4_msgs is installed")
             if not schema.data:
-                raise ValueError(f"the file has no definition of {schema.name}: record it where px4_msgs is installed")
+                raise ValueError(f"the file has no definition of {schema.name}; record it where px4_msgs is installed")
             definition, layout = self._layout(schema, channel.topic)
             metadata, number = channel.metadata, channel.metadata.get("instance")
             if {"vehicle", "topic"} <= metadata.keys():
@@ -197,7 +197,7 @@ class _RecordedFile:
             if expected is not definition:
                 raise ValueError(f"its messages are {definition.name}, but {address.topic} has {expected.name}")
         except (AddressError, ValueError) as exc:
-            self.chunks.warn(f"skipped {channel.topic}: {exc}")
+            self.chunks.warn(f"skipped {channel.topic} ({exc})")
             return None
         if (boot := metadata.get("boot_time_utc_us", "")).isdecimal():
             self.boot_times.add(boot)
@@ -219,12 +219,12 @@ class _RecordedFile:
         return self._layouts[schema.id]
 
     def _own_layout(self, known: Definition[Any], types: Mapping[str, FieldType], topic: str) -> Layout:
-        """Return a layout that is in no PX4 release; warn about fields unknown to nedbus, which are left out."""
+        """Return the layout of a definition in no PX4 release; warn about unknown fields, which are left out."""
         wrong = [name for name, kind in types.items() if kind not in known.known_types.get(name, {kind})]
         if lacking := sorted({*wrong, *(known.always - types.keys())}):
             raise ValueError(f"its definition of {', '.join(lacking)} matches no PX4 release")
         if unknown := sorted(types.keys() - known.known_types.keys()):
-            self.chunks.warn(f"{topic}: {', '.join(unknown)} left out: unknown to nedbus in {known.name}")
+            self.chunks.warn(f"left out {', '.join(unknown)} of {topic}, unknown to nedbus in {known.name}")
         return Layout("of the file", "", types=types)
 
 

@@ -91,7 +91,7 @@ def draw(
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
     if path.suffix.lower() not in _SUFFIXES:
-        raise ConfigError(str(path), f"not an image format: the name must end with {' or '.join(_SUFFIXES)}")
+        raise ConfigError(str(path), f"not an image format; the name must end with {' or '.join(_SUFFIXES)}")
     try:
         # A glyph that the font lacks is only a warning.
         with atomic_write(path, replace=True) as part, warnings.catch_warnings(action="ignore"):

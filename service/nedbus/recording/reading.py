@@ -56,7 +56,7 @@ def read(
     instance: int | None = None,
     dataframe: Library = None,
 ) -> Any:
-    """Return one topic of a .ulg log or an .mcap recording as a structured array with one element per message.
+    """Return one topic of a .ulg log, an .mcap recording or a .tlog as a structured array, one element per message.
 
     The columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
     Fields that a layout or source lacks are NaN, false or 0; `nedbus.missing_of` names them.
@@ -79,7 +79,7 @@ def read(
 def read_streams(
     path: _Files, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None
 ) -> tuple[Streams, int]:
-    """Return the messages of one vehicle's streams, or of several files, and when recording began [us].
+    """Return the streams of one vehicle, or of several files, and the start of recording [us].
 
     `topics`: None selects all streams, or in a log the streams of all topics known to nedbus.
     """
@@ -115,7 +115,7 @@ def _read_several(paths: Sequence[Path], topics: Sequence[str] | None, vehicle: 
         if vehicle not in (ANY, name) or wanted == []:
             continue
         if (utc := utc_of(path, vehicle=own)) is None:
-            raise SourceError(str(path), "no message provides UTC, which reading several files requires: read it alone")
+            raise SourceError(str(path), "no message provides UTC, which reading several files requires; read it alone")
         found, start = read_streams(path, wanted, vehicle=own)
         starts.append(int(utc.unix_us(start)) if start else 0)
         for stream, (messages, absent) in found.items():

@@ -37,8 +37,8 @@ class Recorder:
     def status(self) -> str:
         """The counts so far as text, such as "120 messages, 2 lost"."""
         names = ("lost", "dropped", "invalid", "discarded", "forgotten")
-        counts = ((getattr(self._subscription.counts, name), name) for name in names)
-        return ", ".join([f"{self.messages} messages", *(f"{count} {name}" for count, name in counts if count)])
+        counts = [f"{count} {name}" for name in names if (count := getattr(self._subscription.counts, name))]
+        return ", ".join([f"{self.messages} message{'s' * (self.messages != 1)}", *counts])
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
         """Record until `stop` is set, for `duration` seconds, or until the subscription is closed.

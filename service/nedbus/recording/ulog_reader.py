@@ -36,7 +36,7 @@ class UlogReader:
         self._warnings: list[str] = []
         self._by_id: dict[int, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
-        # PX4 can log a topic twice: checksums of the messages of such topics, and the first stream by its duplicate.
+        # PX4 can log a topic twice. `_checksums`: of the messages of such topics; `_firsts`: first stream by duplicate.
         self._checksums: dict[ulog.LoggedStream, int] = {}
         self._firsts: dict[ulog.LoggedStream, ulog.LoggedStream] = {}
         self.streams: dict[Address, ulog.LoggedStream] = {}
@@ -48,11 +48,11 @@ class UlogReader:
         """Damage found and parts skipped so far."""
         warnings = self._warnings + [reason for stream in self.streams.values() for reason in stream.omitted.values()]
         if self._damages > _MAX_NAMED:
-            warnings.append(f"damaged: {self._damages - _MAX_NAMED} more locations")
+            warnings.append(f"further damaged locations ({self._damages - _MAX_NAMED})")
         if self._parser.undecodable:
-            warnings.append(f"damaged: {self._parser.undecodable} messages without a definition")
+            warnings.append(f"skipped messages without a definition ({self._parser.undecodable})")
         if self._texts.limit.omitted:
-            warnings.append(f"left out: {self._texts.limit.omitted} log messages above 100 per second")
+            warnings.append(f"left out log messages above 100 per second ({self._texts.limit.omitted})")
         return [*warnings, *filter(None, [self._texts.problem])]
 
     def messages(self) -> Iterator[tuple[ulog.LoggedStream, bytes]]:
@@ -87,7 +87,7 @@ class UlogReader:
             reason = f"this log has no message of {what}"
             if topics is not None and self._subscribed:
                 names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
-                reason += f", but of {names}: choose them by name, or all with topics=* or read(path, ['*'])"
+                reason += f", but of {names}; choose them by name, or all with topics=* or read(path, ['*'])"
             raise SourceError(str(self._path), "; ".join([reason, *self.warnings[:3]]))
 
     def _records(self) -> Iterator[list[ulog.Record]]:
@@ -99,7 +99,7 @@ class UlogReader:
             yield self._parser.close()
             self.damaged |= self._parser.undecodable > 0 or bool(self._texts.problem)
         except ulog.UlogError as exc:
-            raise SourceError(str(self._path), f"not a readable ULog file: {exc}") from exc
+            raise SourceError(str(self._path), f"not a readable ULog file ({exc})") from exc
         except OSError as exc:
             raise SourceError(str(self._path), (exc.strerror or str(exc)).lower()) from exc
 
@@ -121,7 +121,7 @@ class UlogReader:
             self._damages += not record.is_end
             self.damaged |= not record.is_end
             if self._damages <= _MAX_NAMED:
-                self._warnings.append(f"{'truncated' if record.is_end else 'damaged'}: {record.reason}")
+                self._warnings.append(f"{'truncated' if record.is_end else 'damaged'} ({record.reason})")
 
     def _open(self, subscription: ulog.Subscription) -> ulog.LoggedStream | None:
         """Return the stream of a subscription at its first message, None if it is not selected or not usable."""
@@ -132,11 +132,11 @@ class UlogReader:
         try:
             stream = ulog.LoggedStream(self._vehicle, subscription)
         except ValueError as exc:
-            self._warnings.append(f"skipped {topic}: {exc}")
+            self._warnings.append(f"skipped {topic} ({exc})")
             self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
             return None
         if lacking := ", ".join(sorted(stream.definition.always.difference(stream.names))):
-            self._warnings.append(f"{topic} [{subscription.multi_id}]: the definition of {lacking} is damaged")
+            self._warnings.append(f"the definition of {lacking} in {topic} [{subscription.multi_id}] is damaged")
             self.damaged = True
         if "timestamp" not in stream.names:
             return None

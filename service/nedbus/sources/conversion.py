@@ -63,4 +63,4 @@ def _write(run: ReplayRun, path: Path, *, source: str, on_progress: Callable[[in
                 pending.clear()
                 on_progress(done)
         writer.write_messages(pending)
-    return f"{writer.messages} messages" + (f", {rejected} rejected" if rejected else "")
+    return f"{writer.messages} message{'s' * (writer.messages != 1)}" + (f", {rejected} rejected" if rejected else "")

@@ -49,7 +49,7 @@ class _EventOptions(RecordedOptions):
 class Flights:
     """The messages of one file, or of several files merged by UTC.
 
-    In each file, a vehicle that is in several files is named after the file. `ended`: vehicles whose file has ended.
+    Vehicles with the same name in several files are named after their files. `ended`: vehicles whose file has ended.
 
     Raises ConfigError or SourceError if a file cannot be read.
     """
@@ -73,14 +73,14 @@ class Flights:
         return tuple(found)
 
     @cached_property
-    def times(self) -> Times:  # lazy, since it loads NumPy
-        """The UTC offset of each vehicle whose messages contain UTC."""
+    def times(self) -> Times:  # lazy, because it loads NumPy
+        """The UTC offset of each vehicle for which `utc_of` finds one."""
         names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
         found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
         return Times(offsets={name: utc.offset_us / 1e6 for name, utc in found if utc is not None})
 
     def messages(self) -> Iterator[SourceMessage]:
-        """Yield the messages in chronological order; raise SourceError for several files if one has no UTC."""
+        """Yield the messages in chronological order; raise SourceError if one of several files has no UTC."""
         if len(self._files) == 1:
             return self._files[0][1].messages
         starts = [self._start(*file) for file in self._files]
@@ -96,7 +96,7 @@ class Flights:
         times = ((self.times.utc_of_boot(names[each.address.vehicle], boot), each.due) for each, boot in known)
         found = [utc - due for utc, due in times if utc is not None]
         if not found:
-            raise SourceError(str(path), "no message provides UTC, which merging several files requires: read it alone")
+            raise SourceError(str(path), "no message provides UTC, which merging several files requires; read it alone")
         return median(found)
 
     def _shift(self, run: ReplayRun, names: Mapping[str, str], offset: float) -> Iterator[SourceMessage]:
@@ -107,7 +107,7 @@ class Flights:
 
 
 def read_file_events(*paths: Path) -> FileEvents:
-    """Detect the events in files; raises like `Flights`."""
+    """Detect the events in files; raise the errors of `Flights` and its `messages`."""
     flights, event_log, due = Flights(paths), EventLog(MAX_FILE_EVENTS), 0.0
     for message, _, _ in follow(flights.messages(), event_log, ended=flights.ended):
         due = message.due

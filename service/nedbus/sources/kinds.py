@@ -58,11 +58,11 @@ class SourceSpec:
     options: Options
 
     def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
-        """Create the source for a service; raise ConfigError for a bad target or file, or a missing extra."""
+        """Create the source for a service; raise ConfigError for an invalid target or file, or a missing extra."""
         kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
         # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
-            raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one first")
+            raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file; save the data to a file first")
         make = getattr(import_optional(kind.extra, kind.module), kind.name)
         if isinstance(self.options, RecordedOptions | SimulatorOptions):
             return ReplaySource(self.options, partial(make, self.target, self.options, vehicle))
@@ -84,11 +84,11 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         path = rest if rest and "/" not in kind_name else text
         kind_of_file = find_format(path.partition("?")[0])
         hint = f"write {kind_of_file}:{path}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
-        raise ConfigError(f"source {text!r}", f"unknown kind {kind_name!r}: {hint}")
+        raise ConfigError(f"source {text!r}", f"unknown kind {kind_name!r}; {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     if not kind.accepts(target):
         form = f"{kind_name}:{kind.target}" if kind.target else f"{kind_name}:?OPTION=VALUE"
-        raise ConfigError(f"source {text!r}", f"write it as {form}")
+        raise ConfigError(f"source {text!r}", f"the target is missing or not allowed; write {form}")
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
         options = kind.options.model_validate(dict(pairs))
@@ -96,17 +96,17 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         detail = exc.errors()[0]
         name = str(detail["loc"][0])
         if (field := kind.options.model_fields.get(name)) is None:
-            reason = f"unknown option {name!r}: choose from {', '.join(kind.options.model_fields)}"
+            reason = f"unknown option {name!r}; choose from {', '.join(kind.options.model_fields)}"
         elif isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
             reason = str(cause)
         else:
-            reason = f"{name}={detail['input']} is invalid: expected {field.description}"
+            reason = f"{name}={detail['input']} is invalid; expected {field.description}"
         raise ConfigError(f"source {text!r}", reason, key=name) from exc
     except ValueError:
         hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
         raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}") from None
     if len(dict(pairs)) < len(pairs):
-        raise ConfigError(f"source {text!r}", "an option occurs twice: remove one")
+        raise ConfigError(f"source {text!r}", "an option occurs twice; remove one")
     if kind.target == "FILE":
         target = re.sub("%(3F|25)", lambda found: unquote(found[0]), target, flags=re.IGNORECASE)
     return SourceSpec(text, kind_name, target, options)
@@ -124,7 +124,7 @@ def _text_of_table(table: Mapping[str, object]) -> str:
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
         problem, key = ("kind is missing", "") if name is None else (f"unknown kind {name!r}", "kind")
-        raise ConfigError("source", f"{problem}: choose from {', '.join(SOURCE_KINDS)}", key=key)
+        raise ConfigError("source", f"{problem}; choose from {', '.join(SOURCE_KINDS)}", key=key)
     target_name = (kind.target or "").strip("[]").lower()
     target = options.pop(target_name, "")
     if not isinstance(target, str) or not kind.accepts(target):

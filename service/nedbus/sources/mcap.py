@@ -17,7 +17,7 @@ _INPUT: Final = "mcap-input"  # `sample.source` of messages to a vehicle
 
 
 def open_mcap(path: str, options: RecordedOptions, default_vehicle: str) -> ReplayRun:
-    """Check a recording; raise SourceError if it is not an MCAP file or has none of the requested topics."""
+    """Check a recording for damage; raise SourceError if it is not an MCAP file or has none of the requested topics."""
     topics = options.chosen_topics
     with RecordingReader(path, vehicle=default_vehicle) as reader:
         reader.check()
@@ -29,16 +29,16 @@ def open_mcap(path: str, options: RecordedOptions, default_vehicle: str) -> Repl
         found = ", ".join(sorted({stream.address.topic for stream in reader.counts}))
         raise SourceError(path, f"this recording has none of the requested topics; it has {found}")
     if options.vehicle is not None and len(vehicles) > 1:
-        raise ConfigError("vehicle", f"{path} has several vehicles ({', '.join(vehicles)}): remove this option")
-    total = sum(counts.values())
+        raise ConfigError("vehicle", f"{path} has several vehicles ({', '.join(vehicles)}); remove this option")
+    total, plural = sum(counts.values()), "s" * (len(addresses) > 1)
     absent = options.absent_from({each.topic for each in addresses}, "this recording")
     return ReplayRun(
         messages=_messages(path, options, default_vehicle),
         addresses={_rename(address, options): definitions[address] for address in addresses},
         total=total,
-        summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
+        summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} stream{plural}",
         warnings=(*reader.warnings, *absent),
-        damage=f"{path}: messages lost to damage: {'; '.join(reader.warnings)}" if reader.damaged else None,
+        damage=f"{path}: some messages are lost to damage; {'; '.join(reader.warnings)}" if reader.damaged else None,
     )
 
 
@@ -65,7 +65,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
     try:
         fields = decode_with(definition, recorded.payload, recorded.stream.layout)
     except DecodeError as exc:
-        error = f"message {number} of the recording: {exc}"
+        error = f"{exc} (message {number} of the recording)"
         return SourceMessage(due, address, {}, error=error, definition=definition)
     for name in recorded.stream.missing & definition.all_fields:
         fields.pop(name, None)
@@ -74,7 +74,7 @@ def _decode(recorded: RecordedMessage, number: int, due: float, options: Recorde
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
-    """Sort messages by log time, because writers batch them by stream; flush if it steps back by over _MAX_GAP."""
+    """Sort messages by log time, because writers batch them by stream; flush if the time goes back by over _MAX_GAP."""
     waiting: list[tuple[int, int, RecordedMessage]] = []
     newest = 0
     for number, recorded in messages:

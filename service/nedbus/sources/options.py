@@ -69,7 +69,7 @@ class Options(BaseModel):
         return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS
 
     def absent_from(self, topics: Collection[str], where: str) -> list[str]:
-        """Return a warning that names the requested topics and messages missing from `topics`."""
+        """Return a list of at most one warning: the requested topics and messages missing from `topics`."""
         absent = [name for name in self.topics if name != ANY and _topics_of(name).isdisjoint(topics)]
         return [f"{where} has no messages of {', '.join(absent)}"] if absent else []
 
@@ -77,7 +77,7 @@ class Options(BaseModel):
 class ReplayOptions(Options):
     """Options shared by all replays."""
 
-    vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
+    vehicle: Vehicle | None = Field(None, description="1 to 64 characters of A-Z a-z 0-9 _ -")
     speed: Annotated[
         Annotated[float, Field(ge=0.001, le=1000)] | None, BeforeValidator(lambda text: None if text == "max" else text)
     ] = Field(1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive")
@@ -108,7 +108,9 @@ class Px4ZenohOptions(Options):
     domain: Annotated[int, Field(ge=0, le=232)] | None = Field(
         None, description="a ROS domain, 0 to 232 (default: all)"
     )
-    vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for topics without a namespace")
+    vehicle: Vehicle | None = Field(
+        None, description="1 to 64 characters of A-Z a-z 0-9 _ -, for topics without a namespace"
+    )
     vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
     layout: Annotated[str, Field(pattern=_LAYOUTS)] | None = Field(
         None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(RELEASES)}"
@@ -148,5 +150,5 @@ class MavlinkOptions(Options):
 
     @property
     def chosen_topics(self) -> Collection[str] | None:
-        """The topics to deliver; all topics of the ULog stream by default."""
+        """The topics to deliver; all of them if `log` is set and `topics` is not."""
         return None if self.log and not self.topics else super().chosen_topics

@@ -33,7 +33,7 @@ _HEADING_RESET: Final = 15.0  # s into a lap
 _MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
 _Z_RESET: Final = 90.0  # s into a lap
 _HEADING_DISTURBED: Final = _LAP - 5.0  # s into a lap: start of the heading error that the next heading reset corrects
-_Z_STEP: Final = 1.0  # m, up and down in turn
+_Z_STEP: Final = 1.0  # m, alternately up and down
 _DRIFT: Final = 0.02  # m/s^2, half the acceleration of the position error in dead reckoning
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
 _SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
@@ -42,21 +42,21 @@ _GRAVITY: Final = 9.80665  # m/s^2
 _ALTITUDE: Final = 20.0  # m
 _CLIMB: Final = 10.0  # s to this altitude
 _SIZE: Final = 40.0  # m, from the centre of a figure to each end
-_STEP: Final = 1e-3  # s, for the derivatives
+_STEP: Final = 1e-3  # s, step of the numerical derivatives
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
 _ARMED: Final = _BOOT - 1_000_000  # us since boot
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
-_ENDURANCE: Final = 1200.0  # s until the battery, a fifth full, is replaced by a full one
+_ENDURANCE: Final = 1200.0  # s until the battery, then at 20 %, is replaced by a full one
 _BOOT_UTC: Final = 1_767_225_600_000_000  # us of Unix time at boot: start of 2026
 
 Vector = tuple[float, ...]  # north, east, down
 
 
 class Truth(NamedTuple):
-    """The truth at a time since the start [s]: timestamp [us], motion in local NED [SI units], origin [deg, m]."""
+    """Ground truth at a time since the start [s]: timestamp [us], motion in local NED [SI units], origin [deg, m]."""
 
     time: float
     timestamp: int
@@ -68,7 +68,7 @@ class Truth(NamedTuple):
 
 
 def truth_at(time: float, direction: float, origin: tuple[float, float, float]) -> Truth:
-    """Return the truth at a time [s] since the start; `direction` [rad] rotates the figures."""
+    """Return the ground truth at a time since the start [s]; `direction` rotates the figures [rad]."""
     positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
     axes = list(zip(*positions, strict=True))
     velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
@@ -81,7 +81,7 @@ def truth_at(time: float, direction: float, origin: tuple[float, float, float]) 
 def _position(time: float, direction: float) -> Vector:
     progress = min(1.0, max(0.0, time / _CLIMB))
     climb = progress**3 * (10 - 15 * progress + 6 * progress**2)  # from 0 to 1 with continuous acceleration
-    # The phase starts slowly after the climb and then advances evenly, one figure a minute.
+    # The phase starts slowly near the end of the climb, and then advances by one figure per minute.
     late = max(0.0, time - 8.0)
     phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
     along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
@@ -91,7 +91,7 @@ def _position(time: float, direction: float) -> Vector:
 
 
 class _State(NamedTuple):
-    """State of an estimate: errors [SI units], dead reckoning [s], validity, counts and deltas of resets."""
+    """State of an estimate: errors [SI units], time in dead reckoning [s], validity, counts and deltas of resets."""
 
     position: tuple[float, float, float]
     velocity: tuple[float, float, float]
@@ -105,7 +105,7 @@ class _State(NamedTuple):
 class Estimator:
     """Estimator whose error wanders, drifts without GPS, and is reset.
 
-    `noise`: size of the position error [m]; `aided`: position aiding never fails, and there are no resets.
+    `noise`: amplitude of the position error [m]; `aided`: position aiding never fails, and there are no resets.
     """
 
     def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
@@ -148,7 +148,7 @@ class Estimator:
         }  # fmt: skip
 
     def global_fields(self, truth: Truth) -> dict[str, object]:
-        """Return the global position, which exists once the origin is known."""
+        """Return the global position, which the vehicle publishes only after the origin is known."""
         state = self._at(truth.time)
         x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
         (latitude, longitude), altitude = MapProjection(*truth.origin[:2]).reproject(x, y), truth.origin[2]
@@ -162,7 +162,7 @@ class Estimator:
         }  # fmt: skip
 
     def status(self, truth: Truth) -> dict[str, object]:
-        """Return the status: take-off, then a mission; without a valid position, a failsafe that holds altitude."""
+        """Return the status: take-off, then a mission; while the position is invalid, a failsafe in altitude mode."""
         failsafe, is_mission = not self._at(truth.time).xy_valid, truth.time >= _CLIMB
         flown = _Status.NAVIGATION_STATE_AUTO_MISSION if is_mission else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
         mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
@@ -271,7 +271,7 @@ def battery(truth: Truth) -> dict[str, object]:
 
 
 def gps(truth: Truth) -> dict[str, object]:
-    """Return a noisy GNSS fix, or no fix before the origin is set and during the outage."""
+    """Return a noisy GNSS fix, or no fix before the origin is set and during a GPS outage."""
     time, is_started = truth.time, truth.time >= _ORIGIN_SET
     fix = is_started and not _OUTAGE[0] <= time % _LAP < _OUTAGE[1]
     north, east, down = (
@@ -296,7 +296,7 @@ Fields = Callable[[Truth], dict[str, object]]  # the fields of a message except 
 
 
 def open_simulator(_: str, options: SimulatorOptions, default_vehicle: str) -> ReplayRun:
-    """Start a flight, endless unless its options set a duration; raise SourceError if it has no requested topic."""
+    """Start a flight, endless without `duration`; raise SourceError if no requested topic is simulated."""
     vehicle, topics = options.vehicle or default_vehicle, options.chosen_topics
     ticks = None if options.duration is None else round(options.duration / _TICK)
     streams = _streams(vehicle, options.seed, sys.maxsize if ticks is None else ticks)

@@ -19,10 +19,10 @@ class SourceMessage:
     `fields`: by name, in any PX4 layout.
     `lost`: number of messages lost between the vehicle and the source, just before this one.
     `rebooted`: True for the first message after the vehicle rebooted.
-    `error`: the reason if it cannot be decoded; `fields` is empty then.
+    `error`: why the message was rejected (`fields` is then empty); None if it was decoded.
     `definition`: message definition; None for the default of the topic.
     `source`: value of `sample.source`, if it differs from the kind of the source.
-    `dropout`: seconds for which the vehicle's logger recorded nothing, just before this one.
+    `dropout`: seconds for which the vehicle's logger recorded nothing, just before this message.
     """
 
     due: float
@@ -64,11 +64,11 @@ class ReplayRun:
 
     `messages`: in order of `due`; can be iterated once.
     `addresses`: addresses of the messages so far, each with its definition, or None for the topic's default.
-    `total`: number of messages, or of bytes if there is a `position`; None if endless.
+    `total`: number of messages, or of bytes if `position` is set; None if endless.
     `summary`: description for the log; `warnings`: damage and skipped parts.
-    `damage`: description of messages lost to damage, which make the run fail; None without damage.
+    `damage`: description of damage that cost messages, and makes the run fail; None if no message was lost.
     `position`: bytes read so far; None if progress is counted in messages.
-    `boot_utc`: Unix time of the vehicle's boot from the metadata of the file [us]; 0 if unknown.
+    `boot_utc`: Unix time of the vehicle's boot [us], from the metadata of the file; 0 if unknown.
     """
 
     messages: Iterator[SourceMessage]
@@ -87,7 +87,7 @@ class ReplayRun:
 
 @dataclass(frozen=True, slots=True)
 class ReplaySource:
-    """A source that can be replayed repeatedly; `open` raises SourceError if it has no readable message."""
+    """A source that can be replayed repeatedly; `open` raises SourceError if there is no readable message."""
 
     options: RecordedOptions | SimulatorOptions
     open: Callable[[], ReplayRun]
@@ -108,7 +108,7 @@ class LiveSource(Protocol):
     ) -> Iterator[SourceMessage | Rejection | UnavailableTopics | LogStreamStatus | None]:
         """Yield events until the iterator is closed; yield None at least twice a second while idle.
 
-        `router`: the service's own session if it is a router; borrowed, so do not close it.
+        `router`: the service's Zenoh session if the service is a router; borrowed, so do not close it.
 
         Raises SourceError if the source cannot be opened or the connection breaks.
         """

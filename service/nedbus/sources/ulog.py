@@ -37,7 +37,7 @@ def open_ulog(file: str, options: RecordedOptions, default_vehicle: str) -> Repl
 
 
 def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptions) -> Iterator[SourceMessage]:
-    """Yield the messages of a log, chunk by chunk, and update its run."""
+    """Yield the messages of a log, and update its run."""
     clock = _Clock()
     for due, stream, fields in clock.pace(reader):
         run.addresses[stream.address], run.position = stream.definition, reader.position
@@ -45,13 +45,13 @@ def _read(reader: UlogReader, run: ReplayRun, path: Path, options: RecordedOptio
         yield SourceMessage(due, stream.address, fields, definition=stream.definition, dropout=dropout)
     warnings = _warnings_of(reader)
     for address, count in clock.unordered.items():
-        warnings.append(f"{address}: {count} timestamps out of order; the log's own order is kept")
+        warnings.append(f"timestamps of {address} are out of order ({count}); the order of the log is kept")
     warnings += options.absent_from({address.topic for address in reader.streams}, "this log")
     if clock.gaps:
-        warnings.append(f"skipped {clock.gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps")
+        warnings.append(f"skipped gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps ({clock.gaps})")
     run.warnings = tuple(warnings)
     if reader.damaged:
-        run.damage = f"{path}: messages lost to damage: {'; '.join(reader.warnings)}"
+        run.damage = f"{path}: some messages are lost to damage; {'; '.join(reader.warnings)}"
 
 
 class _Clock:
@@ -64,7 +64,7 @@ class _Clock:
         self._is_running = False
 
     def pace(self, reader: UlogReader) -> Iterator[tuple[float, LoggedStream, dict[str, object]]]:
-        """Yield due time [s since the start], stream and fields of each message; due times do not decrease."""
+        """Yield due time [s since the start], stream and fields of each message; due times never decrease."""
         newest: dict[LoggedStream, int] = {}
         held: tuple[int, LoggedStream, dict[str, object]] | None = None
         for stream, payload in reader.messages():
@@ -92,7 +92,7 @@ class _Clock:
             yield self._due / 1e6, *held[1:]
 
     def _follow(self, time: int) -> None:
-        """Advance to a timestamp; go back only if the clock is far ahead of many messages."""
+        """Advance to a timestamp; go back only if the clock is far ahead of many consecutive messages."""
         step = time - self._now
         self._behind = self._behind + 1 if step < -_MAX_GAP else 0
         if step < 0 and self._behind < _MAX_BEHIND:
@@ -109,7 +109,7 @@ def _warnings_of(reader: UlogReader) -> list[str]:
     for stream in reader.streams.values():
         unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
         if unknown and _is_newer(stream):
-            warnings.append(f"{stream.address}: {', '.join(unknown)} left out: the log is newer than nedbus")
+            warnings.append(f"left out unknown fields of {stream.address} ({', '.join(unknown)}); update nedbus")
     return warnings
 
 

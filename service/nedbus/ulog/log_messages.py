@@ -1,6 +1,6 @@
 """PX4's logged strings and events as `log_message` messages, without duplicates.
 
-The untrusted event metadata of a log turns the id and the arguments of an event into a sentence.
+The event metadata of a log, which is untrusted, defines the sentence for an event's id and arguments.
 Its format: https://github.com/mavlink/libevents
 """
 
@@ -29,7 +29,7 @@ _TOPICS: Final = ("", "event", "vehicle_status")
 _INFO: Final = 6
 _PROTOCOL: Final = 8  # lowest log level of events meant for ground stations, not for display
 _ALL_MODES: Final = 2**32 - 1
-_WINDOW: Final = 50_000  # us between an event and its logged string; 4 ms was observed
+_WINDOW: Final = 50_000  # us between an event and its logged string; up to 4 ms were observed
 _MAX_PER_SECOND: Final = 100  # messages; PX4 logs 20 at boot
 _MAX_BYTES: Final = 127
 _MAX_CHARACTERS: Final = 1000  # characters read, including colour codes
@@ -85,7 +85,7 @@ class _EventMetadata:
             if max(map(len, parts)) > _MAX_PARTS:
                 raise ValueError(f"more than {_MAX_PARTS} components or event groups")
         except _DAMAGED as exc:
-            raise ValueError(f"the event metadata cannot be read: {str(exc) or type(exc).__name__}") from exc
+            raise ValueError(f"the event metadata cannot be read ({str(exc) or type(exc).__name__})") from exc
 
     def decode(self, number: int, arguments: bytes) -> _Event | None:
         """Return the event with this id; None if the id is unknown, or the arguments do not match."""
@@ -130,7 +130,7 @@ def _describe(enum: Mapping[str, Any], value: int) -> str:
 
 
 def _fill(template: str, values: Sequence[Any]) -> str:
-    """Fill the arguments into a template, and remove its markup."""
+    """Insert the arguments into a template, and remove its markup."""
 
     def replaced(found: re.Match[str]) -> str:
         if found["escaped"] or found["tag"]:
@@ -163,7 +163,7 @@ class RateLimit:
 class LogMessageBuilder:
     """Adds `log_message` messages to the records of a log or a stream.
 
-    A logged string with a trailing tab duplicates an event, logged before it in more detail, and is dropped.
+    A logged string with a trailing tab repeats an event that was logged before it in more detail, and is dropped.
     PX4 reports all failed checks when one changes: only new ones become messages, with severity info if they do not
     affect the current mode.
 
@@ -194,7 +194,7 @@ class LogMessageBuilder:
                     yield Data(LOG_MESSAGE, _STRUCT.pack(text.timestamp, text.level, to_log_text(text.text).encode()))
 
     def _read(self, record: Record) -> LoggedText | None:
-        """Return the text that a record completes; None without one, or for a duplicate."""
+        """Return the text that a record completes; None if it completes none, or repeats an event."""
         if isinstance(record, LoggedText):
             return None if self._is_duplicate(record) else record
         if isinstance(record, Information) and record.key == "metadata_events" and isinstance(record.value, bytes):

@@ -50,8 +50,8 @@ class _Inspection(NamedTuple):
 class UlogParser:
     """Parses a ULog in chunks of any size; memory is limited to one chunk, the definitions, and 256 KiB.
 
-    `verify`: for files, which have no checksums: return a message only if a valid record follows it, and resynchronise
-    after damage. Otherwise trust the lengths, as for a transport with checksums.
+    `verify`: return a message only if a valid record follows it, and resynchronise after damage; for files, which have
+    no checksums. Without it, the lengths are trusted; for transports with checksums.
     `subscriptions`: those with a decodable format, by message id.
     `undecodable`: number of data messages without a matching subscription.
     """
@@ -274,14 +274,14 @@ class UlogParser:
             old = self.subscriptions.get(record.message_id)
             if old is not None:
                 if (old.multi_id, old.name) != (record.multi_id, record.name):
-                    raise ValueError(f"{record.name} is ignored: its message id belongs to {old.name}")
+                    raise ValueError(f"{record.name} is ignored, because its message id belongs to {old.name}")
                 return []
             try:
                 if len(self.subscriptions) == _MAX_SUBSCRIPTIONS:
                     raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
                 record = record._replace(layout=self._formats.layout(record.name))
             except ValueError as exc:
-                raise ValueError(f"{record.name} cannot be decoded: {exc}") from exc
+                raise ValueError(f"{record.name} cannot be decoded, because {exc}") from exc
             self.subscriptions[record.message_id] = record
             used = record.layout.size
             for size in range(used, used + min(record.layout.padding, _MAX_PADDING) + 1):

@@ -117,7 +117,7 @@ def read_flags(content: bytes) -> tuple[int, ...]:
     """Return the offsets of appended data; raise UlogError for an unknown incompatible flag, as the format requires."""
     incompatible, *offsets = struct.unpack_from("<8xQ3Q", content.ljust(40, b"\0"))
     if incompatible & ~1:
-        raise UlogError(f"it has unknown incompatible flags ({incompatible:#x}): update nedbus")
+        raise UlogError(f"it has the unknown incompatible flags {incompatible:#x}; update nedbus")
     return tuple(offsets) if incompatible else ()
 
 
@@ -217,9 +217,9 @@ class LoggedStream:
             if fitted is not None:
                 fields[name] = fitted
             elif name not in self.omitted:
-                topic = self.subscription.name
-                self.omitted[name] = f"{topic}: {name} left out where its value is not a {kind}, such as {value!r:.60}"
+                where = f"{self.subscription.name}.{name} is left out where its value does not fit {kind}"
+                self.omitted[name] = f"{where}, such as {value!r:.60}"
         return fields
 
 
-_define = lru_cache(256)(define)  # shared by all instances and logs, since codecs are cached per definition
+_define = lru_cache(256)(define)  # shared by all instances and logs, because codecs are cached per definition

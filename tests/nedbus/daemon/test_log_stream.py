@@ -82,10 +82,10 @@ def test_refused_log_stream_is_reported(run_nedbus: Start) -> None:
     ):
         wait_for(lambda: (log := log_stream(bus)) and log.state == "refused", what=f"the refusal: {service.err}")
         info = run_command("info", "--connect", endpoint)
-        assert "another client has it" in " ".join(info.out.split()), info.out
+        assert "another client already receives it" in " ".join(info.out.split()), info.out
         doctor = run_command("doctor", "--connect", endpoint, "--json")
         findings = [each for each in json.loads(doctor.out)["findings"] if "no ULog stream" in each["seen"]]
         assert findings, doctor.out
         assert findings[0]["state"] == "warning"
         assert next(iter(positions)).source == "mavlink"
-    assert "no ULog stream: PX4 rejected" in service.err
+    assert "no ULog stream; PX4 rejected" in service.err

@@ -176,7 +176,7 @@ def test_streams_on_different_clocks_raise() -> None:
     """Aligning a stream in Unix time with one in time since boot raises; the error names both and the remedy."""
     unix = array_of(VLP, {"timestamp": BOOT}, {"timestamp": BOOT + 1_000_000})
     with pytest.raises(
-        ArgumentError, match=f"home_position begins at 1 s, {VLP} ends at 1700000001 s: expected topics on one"
+        ArgumentError, match=rf"home_position begins at 1 s, {VLP} ends at 1700000001 s\): expected topics on one"
     ):
         nedbus.align({VLP: unix, "home_position": HOME}, on=50)
 
@@ -194,7 +194,7 @@ def test_empty_and_unordered_streams_are_aligned(tmp_path: Path) -> None:
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4, 5]
     assert nedbus.align({VLP: twice}, on=[1_000_000, 1_300_000])[f"{VLP}.x"].tolist() == [1, 3]
     again = np.concatenate([POSITIONS, POSITIONS])
-    with pytest.raises(ConfigError, match=f"^{VLP}: timestamps restart: align the messages of each boot"):
+    with pytest.raises(ConfigError, match=f"^{VLP}: timestamps restart; align the messages of each boot"):
         nedbus.align({VLP: again})
     with pytest.raises(ArgumentError, match="method 'spline' is not valid: expected one of last, nearest, linear"):
         nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # invalid on purpose

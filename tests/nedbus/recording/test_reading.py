@@ -78,7 +78,7 @@ def test_data_frames_have_all_columns(flight: Path) -> None:
 
 def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
     """A selection that matches no stream or several raises; the error lists the available streams."""
-    with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match: set instance to one of 1/"):
+    with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match; set instance to one of 1/"):
         nedbus.read(flight, "estimator_local_position")
     has = f"expected one of 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
     with pytest.raises(AddressError, match=f"^vehicle '2' is not in {flight}: {has}"):
@@ -378,8 +378,8 @@ def test_ground_truth_recipe_measures_the_error(
             2,
             "vehicle '9' is not in flight.mcap: expected one of 1/battery_status/0, 1/est",
         ),
-        ("flight.mcap -o a.foo", 2, "a.foo: not an image format: the name must end with .png or .svg or .pdf"),
-        ("flight.mcap -o /dev/full", 2, "/dev/full: not an image format: the name must end with .png or .svg or .pdf"),
+        ("flight.mcap -o a.foo", 2, "a.foo: not an image format; the name must end with .png or .svg or .pdf"),
+        ("flight.mcap -o /dev/full", 2, "/dev/full: not an image format; the name must end with .png or .svg or .pdf"),
         ("flight.mcap -o /nowhere/a.png", 1, "cannot be written"),
         ("invalid.mcap", 1, "the selected streams have no valid message"),
     ],

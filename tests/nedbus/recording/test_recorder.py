@@ -190,7 +190,7 @@ def empty_recording() -> bytes:
         (b"not mcap", "not a readable MCAP file"),
         (b"\x89MCAP0\r\n" + bytes(100), "no message can be read"),
         (bytes(10_000), "not a readable MCAP file"),
-        (empty_recording(), "no messages of PX4 topics: no channel has a type of px4_msgs"),
+        (empty_recording(), "no messages of PX4 topics; no channel has a type of px4_msgs"),
         (None, "no such file"),
     ],
 )
@@ -227,7 +227,7 @@ def test_ros2_bag_is_replayed(tmp_path: Path, layout: str) -> None:
         writer.finish()
     run = open_replay(f"mcap:{path}")
     assert list(map(str, run.addresses)) == ["1/vehicle_local_position", "px4_1/estimator_local_position/1"]
-    assert f"skipped /{ADDRESS}: its encoding is cdr with ros2idl, not cdr with ros2msg" in run.warnings[0]
+    assert f"skipped /{ADDRESS} (its encoding is cdr with ros2idl, not cdr with ros2msg" in run.warnings[0]
     for each in run.messages:
         assert upgrade(each.fields) == upgrade(downgrade(sent, layout))
 
@@ -401,7 +401,7 @@ def test_recording_without_messages_warns_and_removes_the_file(
     assert not path.exists()
 
 
-WRONG_SUFFIX = "not a recording: its name must end with .mcap"
+WRONG_SUFFIX = "not a recording; its name must end with .mcap"
 
 
 @pytest.mark.parametrize(

@@ -280,7 +280,7 @@ def test_invalid_index_is_ignored(tmp_path: Path, field: str, value: int) -> Non
     rewrite_index(path, field, value)
     read, reader = payloads_of(path)
     assert read == original
-    assert reader.warnings == ["the index is damaged: reading without it"]
+    assert reader.warnings == ["the index is damaged; reading without it"]
 
 
 def add_chunk(path: Path, records: bytes, *, size: int, compression: str, in_index: bool) -> None:
@@ -323,7 +323,7 @@ def test_oversized_chunk_is_skipped(
     assert peak < 2**26
     assert reader.damaged != in_index
     if size == 2**20:
-        assert reader.warnings == ["damaged: a chunk has an invalid record; skipped the rest of that chunk"]
+        assert reader.warnings == ["skipped the rest of a chunk after an invalid record"]
 
 
 def test_number_of_damage_warnings_is_limited(tmp_path: Path) -> None:
@@ -336,7 +336,7 @@ def test_number_of_damage_warnings_is_limited(tmp_path: Path) -> None:
     assert reader.warnings[-1] == "further damage is not listed"
 
 
-CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged: its messages are skipped"
+CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged; its messages are skipped"
 
 
 def test_commands_read_undamaged_part_and_exit_1(tmp_path: Path) -> None:
@@ -380,7 +380,7 @@ def test_truncated_log_is_converted_with_warning(tmp_path: Path) -> None:
     convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert convert.exit_code == 0
     assert "179 messages" in convert.err
-    assert "truncated: the file ends inside a message" in convert.err
+    assert "truncated (the file ends inside a message)" in convert.err
 
 
 def write_payloads(path: Path, payloads: Iterable[bytes], *, layout: str = "1.16") -> Path:
@@ -417,10 +417,10 @@ def test_undecodable_message_is_skipped(tmp_path: Path, invalid: bytes, caplog: 
     run = open_replay(f"mcap:{path}")
     messages = list(run.messages)
     assert [each.error is None for each in messages] == [True, True, False, True]
-    assert str(messages[2].error).startswith("message 3 of the recording: ")
+    assert str(messages[2].error).endswith(" (message 3 of the recording)")
     assert run.damage is None
     assert convert_replay(f"mcap:{path}", tmp_path / "b.mcap") == "3 messages, 1 rejected"
-    assert "rejected: message 3 of the recording: " in caplog.text
+    assert " (message 3 of the recording)" in caplog.text
     assert nedbus.read(path)["timestamp"].tolist() == [1, 2, 3]
     assert "1 of 4 messages" in caplog.text
 
@@ -430,8 +430,7 @@ def test_service_continues_after_undecodable_message(tmp_path: Path) -> None:
     path = write_payloads(tmp_path / "a.mcap", [payload(1), BAD_BOOL, payload(2)])
     service = run_command("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
     assert service.exit_code == 0, service.err
-    assert "rejected: message 2 of the recording: " in service.err
-    assert "xy_valid is 2, not a bool (0 or 1)" in service.err
+    assert "xy_valid is 2, not a bool (0 or 1) (message 2 of the recording)" in service.err
     assert "done, 2 published, 1 rejected" in service.err
 
 
@@ -450,4 +449,4 @@ def test_invalid_message_is_skipped(tmp_path: Path, layout: str, caplog: pytest.
     payloads = payload(1, layout=layout), bytes(bad), payload(3, layout=layout)
     path = write_payloads(tmp_path / "a.mcap", payloads, layout=layout)
     assert nedbus.read(path)["timestamp"].tolist() == [1, 3]
-    assert "vehicle_local_position: skipped 1 of 3 messages as invalid" in caplog.text
+    assert "skipped 1 of 3 messages of vehicle_local_position as invalid" in caplog.text

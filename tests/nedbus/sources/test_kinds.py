@@ -36,12 +36,12 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
 @pytest.mark.parametrize(
     ("source", "reason"),
     [
-        ({}, "kind is missing: choose from sim, ulog"),
-        ({"kind": "ulg"}, "unknown kind 'ulg': choose from sim, ulog"),
+        ({}, "kind is missing; choose from sim, ulog"),
+        ({"kind": "ulg"}, "unknown kind 'ulg'; choose from sim, ulog"),
         ({"kind": 5}, "unknown kind 5"),
         ({"kind": "ulog"}, 'it needs file = "..."'),
         ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
-        ({"kind": "sim", "speed": 0}, "speed=0 is invalid: expected a factor from 0.001"),
+        ({"kind": "sim", "speed": 0}, "speed=0 is invalid; expected a factor from 0.001"),
         ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
     ],
 )

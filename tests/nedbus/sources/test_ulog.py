@@ -191,7 +191,7 @@ def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> 
         (lambda path: path.write_bytes(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + bytes(8)), NOTHING),
         (
             lambda path: write_log(path, [1], topic="something_else"),
-            f"{NOTHING}, but of something_else: choose .* topics=\\*",
+            f"{NOTHING}, but of something_else; choose .* topics=\\*",
         ),
     ],
 )
@@ -269,8 +269,8 @@ def test_value_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
     assert [fields.get("cell_count") for fields in batteries] == [6, None, None, 7]
     assert run.damage is None
     assert sorted(run.warnings) == [
-        "battery_status: cell_count left out where its value is not a uint8, such as -1",
-        "battery_status: temperature left out where its value is not a float32, such as 0.1",
+        "battery_status.cell_count is left out where its value does not fit uint8, such as -1",
+        "battery_status.temperature is left out where its value does not fit float32, such as 0.1",
     ]
     table = nedbus.read(path, "battery_status", dataframe="pandas")
     assert table["cell_count"].isna().tolist() == [False, True, True, False]

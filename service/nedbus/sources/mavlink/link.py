@@ -14,7 +14,7 @@ from nedbus.errors import ConfigError, SourceError
 AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 Peer = Any  # remote address, as returned by the socket
 
-_CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect is one, a reordered packet two more
+_CHANGES: Final = 5  # address changes per window that mean two senders; a reconnect causes 1, a reordered packet 2 more
 _WINDOW: Final = 5.0  # s
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
@@ -53,7 +53,7 @@ class _UdpLink:
 
     def send(self, data: bytes, peer: Peer) -> None:
         """Send without blocking; drop the data if that fails."""
-        with suppress(OSError):  # a temporary failure, or the vehicle times out
+        with suppress(OSError):  # a temporary failure; if it lasts, the vehicle times out
             self._socket.sendto(data, peer)
 
 
@@ -76,7 +76,7 @@ class _StreamLink:
             yield data, self.peer
 
     def send(self, data: bytes, _: Peer) -> None:
-        """Send now, or raise OSError."""
+        """Send the data; raise OSError if that fails."""
         self._file.write(data)
 
 
@@ -88,7 +88,7 @@ def parse_link(text: str) -> tuple[str, str, int]:
     """Split a link into kind, host or device, and port; raise ConfigError if it is invalid."""
     found = _LINK.fullmatch(text)
     if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
-        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link: write {_FORMS}")
+        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link; write {_FORMS}")
     return (found[1], found[2].strip("[]"), int(found[3])) if found[1] else (found[4], found[5], 0)
 
 
@@ -125,14 +125,14 @@ def ignore_reason(system: int, component: int) -> str:
 
 
 class DuplicateIds:
-    """Detects system ids with two senders, whose messages arrive from two addresses in turn."""
+    """Detects system ids with two senders, whose messages arrive alternately from two addresses."""
 
     def __init__(self) -> None:
         self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(lambda: deque(maxlen=_CHANGES))
         self._found: set[int] = set()
 
     def add(self, system: int, peer: Peer, now: float) -> str:
-        """Add a message at monotonic time `now` [s]; return a description of two senders, once per system."""
+        """Add a message at monotonic time `now` [s]; return a warning about two senders, once per system, or ""."""
         changes = self._changes[system]
         if changes and changes[-1][0] == peer:
             return ""
@@ -141,4 +141,4 @@ class DuplicateIds:
             return ""
         self._found.add(system)
         both = " and ".join(":".join(map(str, each[:2])) for each in (changes[-2][0], peer))  # only UDP has several
-        return f"{both} both send as system {system}, and their messages are mixed: give each its own MAV_SYS_ID"
+        return f"{both} both send as system {system}, and their messages are mixed; give each its own MAV_SYS_ID"

@@ -10,13 +10,12 @@ from nedbus.timings import TIMINGS
 
 COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
 
-_TRIES: Final = 3  # per unanswered command
+_TRIES: Final = 3  # transmissions of an unanswered command
 _RESTARTS: Final = 2  # after START was accepted, but no data arrived
 _MIN_COUNT: Final = 32  # messages of a header before its duration is estimated
 _EXPECTED_COUNT: Final = 400  # messages of a header; 274 to 410 were measured
 _STOP_TAIL: Final = 10  # consecutive LOGGING_DATA_ACKED before silence that mean STOP: PX4 then sends 44, else up to 2
 _DECAY: Final = 0.98  # decay of the longest interval between messages, per message
-
 
 LogReason = Literal[
     "not_px4", "armed", "taken", "bandwidth", "unsupported", "failed", "no_answer", "no_data", "slow_link", "stalled",
@@ -24,23 +23,23 @@ LogReason = Literal[
 ]  # fmt: skip
 _TEXTS: Final[Mapping[LogReason, str]] = {
     "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
-    "armed": "the vehicle is armed: the ULog stream starts after disarming, or in flight with log=armed",
-    "taken": "PX4 rejected the ULog stream: {} has it (log=take ends that client's stream), or PX4 logs to"
-    " files only (set SDLOG_BACKEND to 3 and reboot the vehicle)",
-    "bandwidth": "PX4 denied the ULog stream: the rate of this MAVLink instance is below 5000 B/s; raise MAV_x_RATE, or"
-    " option -r of `mavlink start`",
+    "armed": "the vehicle is armed; the ULog stream starts after disarming, or in flight with log=armed",
+    "taken": "PX4 rejected the ULog stream, because {} already receives it (log=take ends that client's stream)"
+    " or PX4 logs to files only (set SDLOG_BACKEND to 3 and reboot the vehicle)",
+    "bandwidth": "PX4 denied the ULog stream, because the rate of this MAVLink instance is below 5000 B/s; raise"
+    " MAV_x_RATE, or option -r of `mavlink start`",
     "unsupported": "PX4 does not support the ULog stream on this link; update its firmware",
-    "failed": "PX4 answered MAV_CMD_LOGGING_START with {}",
-    "no_answer": "PX4 does not answer MAV_CMD_LOGGING_START: its logger is not running; set SDLOG_BACKEND to 3 and"
-    " reboot the vehicle",
-    "no_data": "PX4 accepted MAV_CMD_LOGGING_START, but sends no data: another link may have the stream; stop it there,"
-    " or reboot the vehicle",
+    "failed": "PX4 did not start the ULog stream, and answered MAV_CMD_LOGGING_START with {}",
+    "no_answer": "PX4 does not answer MAV_CMD_LOGGING_START; if its logger is not running, set SDLOG_BACKEND to 3"
+    " and reboot the vehicle",
+    "no_data": "PX4 accepted MAV_CMD_LOGGING_START, but sends no data; if another link receives the stream, stop it"
+    " there, or reboot the vehicle",
     "slow_link": "the header of the ULog stream would take {:.0f} s, at {:.0f} ms for each acknowledged message, and"
-    " block PX4's logger; use a link with a shorter round trip",
-    "stalled": "the header of the ULog stream stalled for {:.1f} s: PX4 does not receive the acknowledgements",
-    "silent": "the ULog stream ended: no data for {:.1f} s",
-    "stopped_elsewhere": "another client stopped the ULog stream",
-    "link_lost": "the link was lost: no message from the vehicle for {:.1f} s",
+    " block PX4's logger meanwhile; use a link with a shorter round trip",
+    "stalled": "the header of the ULog stream stalled for {:.1f} s; PX4 may not receive the acknowledgements",
+    "silent": "the ULog stream seems to have ended; no data arrived for {:.1f} s",
+    "stopped_elsewhere": "PX4 stopped the ULog stream, probably because another client requested it",
+    "link_lost": "no message arrived from the vehicle for {:.1f} s; the link seems to be lost",
 }
 _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_TEMPORARILY_REJECTED: "taken",
@@ -98,8 +97,8 @@ class LogStreamClient:
         self._has_sent_command = self._took_over = False
         self._has_header = False  # definitions of the current stream have arrived, at least in part
         self._header_messages = self._acked_in_row = 0
-        self._header_start = self._interval = 0.0  # `_interval`: longest recent one between messages
-        self._header_pause = 0.0  # longest pause in the header; not in the round trip: it may be a burst of losses
+        self._header_start = self._interval = 0.0  # `_interval`: longest recent time between messages
+        self._header_pause = 0.0  # longest pause in the header, not part of the round trip: it may be a burst of losses
         self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 
@@ -223,7 +222,7 @@ class LogStreamClient:
         self._due = max(self._due, now + TIMINGS.log_timeout)
 
     def _restart(self, now: float) -> list[Command]:
-        """Send STOP; START follows."""
+        """Restart the stream: send STOP now, and START after its acknowledgement or timeout."""
         self._has_header = False
         self._enter("starting", None, now)
         return self._send("stop", now)

@@ -15,7 +15,7 @@ Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_d
 
 `delivered`: its bytes are part of the stream; after a gap, only the bytes from its first record on.
 `duplicate`: retransmitted or late; a late message was counted as lost, and its bytes are discarded.
-`malformed`: `length` is above 249, or first_message_offset beyond the data; the gap that it leaves is counted as lost.
+`malformed`: `length` is above 249, or first_message_offset is beyond the data; it is counted as lost.
 `unsynchronised`: no record begins in it, after a gap.
 `no_definitions`: the stream was joined midway, so it cannot be decoded; its losses are not counted.
 """

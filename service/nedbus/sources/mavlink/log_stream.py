@@ -66,7 +66,7 @@ class LogStream:
         return self._client.status.state == "streaming"
 
     def delivers(self, address: Address) -> bool:
-        """Return whether the stream has messages of an address, which replace the converted messages."""
+        """Return whether the stream has messages of an address, which replace those converted from MAVLink."""
         return self.is_streaming and (address in self._streamed or address.topic == ulog.LOG_MESSAGE.name)
 
     def add(self, chunk: Chunk, now: float) -> Iterator[SourceMessage | Rejection]:
@@ -111,7 +111,7 @@ class LogStream:
         yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
-        """Use the answer to a TIMESYNC request sent at `sent`, if its round trip is the shortest so far."""
+        """Use the answer to a TIMESYNC request if its round trip is the shortest so far, or the last offset is old."""
         is_old = self._clock is None or now - self._clock[1] > _MAX_OFFSET_AGE
         if 0 <= now - sent <= self._round_trip or is_old:
             self._round_trip = now - sent
@@ -127,11 +127,11 @@ class LogStream:
         self._logged = status
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
-            text = f"streaming; the header took {header:.1f} s, which is a gap in the vehicle's own log"
-            _log.info("%s: ULog stream: %s", address, text, extra=about("log_stream", address))
+            text = f"the log on the SD card lacks the {header:.1f} s in which the header was sent"
+            _log.info("%s: receiving the ULog stream; %s", address, text, extra=about("log_stream", address))
         elif status.reason is not None:
             extra = about("log_stream", address, reason=status.text)
-            _log.warning("%s: no ULog stream: %s", address, status.text, extra=extra)
+            _log.warning("%s: no ULog stream; %s", address, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
         """Return the status, with rate and delay measured since the last call."""
@@ -196,7 +196,7 @@ class LogStream:
         try:
             if chunk.begins and self._folder is not None:
                 self._file = LogFile(self._folder, self._name)
-                _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log_stream"))
+                _log.info("%s: saving the ULog stream to %s", self._name, self._file.path, extra=about("log_stream"))
             if self._file is not None:
                 if chunk.lost:
                     self._file.mark_gap(now - (self._last_chunk or now))
@@ -204,7 +204,7 @@ class LogStream:
         except OSError as exc:
             error = OutputError(self._file.path if self._file else Path(exc.filename), exc)
             self.close()
-            _log.error("%s: the ULog stream is no longer saved: %s", self._name, error, extra=about("log_stream"))
+            _log.error("%s: stopped saving the ULog stream; %s", self._name, error, extra=about("log_stream"))
 
 
 class LogFile:

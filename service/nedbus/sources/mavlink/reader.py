@@ -1,4 +1,4 @@
-"""Readers of a link: messages of autopilots and their senders; with `log=`, on a thread that requests ULog streams."""
+"""Readers of a link: LinkReader yields the messages of autopilots, LogReceiver also requests their ULog streams."""
 
 import threading
 import time
@@ -30,7 +30,7 @@ _STOP_TIMEOUT: Final = 0.8  # s for vehicles to confirm the end of their streams
 
 
 class Received(NamedTuple):
-    """A message of an autopilot. `time`: arrival, monotonic [s]; `sequence`: MAVLink's; `chunk`: its ULog data."""
+    """A message of an autopilot. `time`: arrival, monotonic [s]; `sequence`: MAVLink's; `chunk`: ULog data in it."""
 
     message: Any
     system: int
@@ -52,11 +52,11 @@ class LinkReader:
         for data, peer in self._link.read(timeout):
             now = time.monotonic()
             if not self._link.stream or len(self._parser.buf) > _MAX_BUFFER:
-                # A truncated message must not consume the next datagram, which may have another sender.
+                # A truncated message must not consume the next datagram, which may be from another sender.
                 self._parser = new_parser()
             yield from parse(self._parser, data, self.name, peer, now)
             if not self._link.stream and self._parser.buf_len():
-                yield Rejection(self.name, f"{self._parser.buf_len()} bytes of a truncated message")
+                yield Rejection(self.name, f"truncated message ({self._parser.buf_len()} B)")
 
 
 def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterator[Received | Rejection]:
@@ -64,7 +64,7 @@ def parse(parser: Any, data: bytes, name: str, peer: Peer, now: float) -> Iterat
     for message in parser.parse_buffer(data) or []:
         raw = bytes(message.get_msgbuf())
         if message.get_type() == "BAD_DATA":
-            yield Rejection(name, f"{len(raw)} bytes that are not MAVLink")
+            yield Rejection(name, f"data that is not MAVLink ({len(raw)} B)")
             continue
         # Only the header of a message can be parsed if the dialect lacks its definition.
         sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
@@ -143,7 +143,7 @@ class LogReceiver:
             self._execute(vehicle, vehicle.client.tick(time.monotonic()))
 
     def _process(self, received: Received, *, is_full: bool) -> Received | Rejection:
-        """Acknowledge a message and reassemble its data; if the queue is full, drop the message like a lost one."""
+        """Handle a message for the ULog stream, and reassemble its data; if the queue is full, treat it as lost."""
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self.vehicles.get(received.system)
         if kind.startswith("LOGGING_DATA"):

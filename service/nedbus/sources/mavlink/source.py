@@ -49,7 +49,7 @@ class MavlinkSource:
         self._options = options
 
     def listen(self, _: Session | None) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
-        """Receive; raise SourceError if the link cannot be opened or breaks."""
+        """Receive messages; raise SourceError if the link cannot be opened or fails."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
                 with closing(_LinkSession(link, self._options, name=self._link)) as session:
@@ -60,7 +60,7 @@ class MavlinkSource:
 
 
 class _LinkSession:
-    """One open link: convert messages, request them, send heartbeats; with `log=`, decode the ULog streams."""
+    """One open link: request and convert messages, send heartbeats; with `log=`, decode the ULog streams."""
 
     def __init__(self, link: Link, options: MavlinkOptions, *, name: str) -> None:
         self._link, self._options, self._name = link, options, name
@@ -107,7 +107,7 @@ class _LinkSession:
                     self._send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()), self._peers[system])
 
     def close(self) -> None:
-        """End the ULog streams."""
+        """Stop the ULog streams, and close their files."""
         if self._receiver is not None:
             self._receiver.close()
         for log in self._logs.values():
@@ -153,6 +153,6 @@ class _LinkSession:
                 self._send(message, self._peers[system])
 
     def _send(self, message: Any, peer: Peer) -> None:
-        with self._sending:  # the thread of LogReceiver sends acknowledgements
+        with self._sending:  # the thread of LogReceiver also sends
             self._link.send(message.pack(self._sender), peer)
             self._sender.seq = (self._sender.seq + 1) % 256

@@ -43,7 +43,7 @@ class TlogReader:
     @property
     def warnings(self) -> list[str]:
         """Damage so far."""
-        return [f"damaged: {self.damaged} bytes that are not MAVLink"] if self.damaged else []
+        return [f"damaged ({self.damaged} B are not MAVLink)"] if self.damaged else []
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the messages, once; raise SourceError if there are none."""
@@ -69,7 +69,7 @@ class TlogReader:
                 self.definitions.setdefault(found.address, BY_TOPIC[found.address.topic])
                 yield replace(found, due=item.time)
         if not self.definitions:
-            reason = "no message of an autopilot for these topics"
+            reason = "this file has no autopilot messages for these topics"
             raise SourceError(str(self._path), "; ".join([reason, *self.warnings]))
 
     def _frames(self) -> Iterator[tuple[int, bytes]]:
@@ -108,7 +108,7 @@ def _read(reader: TlogReader, run: ReplayRun, path: Path, options: RecordedOptio
     absent = options.absent_from({address.topic for address in reader.definitions}, "this file")
     run.warnings = (*reader.warnings, *absent)
     if reader.damaged:
-        run.damage = f"{path}: messages lost to damage: {'; '.join(reader.warnings)}"
+        run.damage = f"{path}: some messages are lost to damage; {'; '.join(reader.warnings)}"
 
 
 def _record_length(data: bytes) -> int:

@@ -47,7 +47,7 @@ STREAMS: Final = {
     242: (72, 1.0, "home_position"),
     245: (14, 1.0, "vehicle_land_detected"),
 }
-"""Messages to request, in order: bytes per message (MAVLink 2, from PX4), Hz (0 for `rate`), topics that need it."""
+"""Messages to request, in order: size in MAVLink 2 [bytes], rate [Hz] (0: option `rate`), topics that need them."""
 
 _MIN_RATE: Final = 2.0  # Hz, on a saturated link
 _USABLE_SHARE: Final = 0.9  # share of a link's bandwidth; the rest is for heartbeats and answers
@@ -135,7 +135,7 @@ class Vehicle:
         return number, self._rates[number]
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
-        """Convert a message; return None if no chosen topic needs it, a Rejection if it is out of order."""
+        """Convert a message; return None if no chosen topic needs it, or a Rejection (out of order, too many texts)."""
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
@@ -158,7 +158,7 @@ class Vehicle:
         instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
         address = Address(self._name, topic, instance)
         if timestamp < (last := self._last.get(address, 0)):
-            reason = f"out of order: {timestamp // 1000} ms since boot, after {last // 1000} ms"
+            reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
@@ -228,7 +228,7 @@ class Vehicle:
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 
     def _track_time(self, message: Any, now: float) -> int | None:
-        """Return the time of a message [us since boot]; that of the newest message if it has none."""
+        """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
         microseconds: int = getattr(message, "time_usec", 0)
         if 0 < microseconds < YEAR_2000:
             return microseconds

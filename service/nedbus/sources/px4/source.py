@@ -77,7 +77,7 @@ class Px4ZenohSource:
                 try:
                     session = open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
                 except ConnectError as exc:
-                    reason = "no Zenoh router answers: start one, or set another one with px4-zenoh:tcp/HOST:7447"
+                    reason = "no Zenoh router answers; start one, or set another one with px4-zenoh:tcp/HOST:7447"
                     raise SourceError(f"px4-zenoh:{' or '.join(self._endpoints)}", reason) from exc
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, supplied=self._supplied)
@@ -150,20 +150,20 @@ class Px4ZenohNode:
             stream = self._streams.on_message(key, now)
             if stream.unsupported is not None:
                 is_unannounced = stream.unsupported and not stream.tokens  # announced streams are in the report
-                reason = f"{stream.unsupported}: not selected by topics= or msg="
+                reason = f"{stream.unsupported} is not selected by topics= or msg="
                 return Rejection(key, reason) if is_unannounced and not is_bridged else None
             if (form := stream.wire_format) is None:
                 form = self._streams.wire_format_of(stream)
                 if form.unknown:
-                    extra = about("newer_layout", stream.address, source="px4-zenoh")
-                    _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
+                    names, extra = ", ".join(form.unknown), about("newer_layout", stream.address, source="px4-zenoh")
+                    _log.warning("%s: left out unknown fields %s; update nedbus", stream.key, names, extra=extra)
             definition, layout, unknown = form
             address = stream.address
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
                 if not stream.is_bridged:
                     extra = about("bridge_loop", source="px4-zenoh")
-                    _log.info("%s comes from nedbus ros2: ignored to avoid a loop", key, extra=extra)
+                    _log.info("%s is published by nedbus ros2; ignored to avoid a loop", key, extra=extra)
                 stream.is_bridged = True
                 return None
             fields = decode_with(definition, sample.payload.to_bytes(), layout)
@@ -174,7 +174,7 @@ class Px4ZenohNode:
             del fields[name]
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
-            _log.warning("%s: the publisher restarted: the vehicle rebooted", key, extra=extra)
+            _log.warning("%s: the publisher restarted; counted as a reboot of the vehicle", key, extra=extra)
         source = _INPUT if stream.is_input else None
         return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
 
@@ -226,7 +226,7 @@ def _read_definitions(paths: str) -> Definitions:
     for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
         files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
         if not files and path.is_dir():
-            reason = "no .msg file in this folder or its subfolders: use PX4's msg folder"
+            reason = "no .msg file in this folder or its subfolders; use PX4's msg folder"
             raise ConfigError(str(path), reason, key="msg")
         for file in files or [path]:
             try:
@@ -242,7 +242,7 @@ def _read_definitions(paths: str) -> Definitions:
             found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
     if skipped:
         extra = about("damaged", source="px4-zenoh")
-        _log.info("px4-zenoh: unsupported messages in %s: %.2000s", paths, ", ".join(skipped), extra=extra)
+        _log.info("px4-zenoh: skipped unsupported messages in %s: %.2000s", paths, ", ".join(skipped), extra=extra)
     return found
 
 

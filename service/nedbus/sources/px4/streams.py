@@ -30,8 +30,7 @@ _EXPIRY: Final = 60.0  # s without messages after which a key without a publishe
 _SETTLE_TIME: Final = 1.0  # s during which messages may still arrive after a publisher's token is gone
 _SILENCE: Final = 5.0  # s, or periods of the nominal rate if longer, after which a topic without messages is silent
 _MAX_NAMES: Final = 100  # per report
-_HINT: Final = "give each its own namespace or domain"
-
+_HINT: Final = "give each vehicle its own namespace or domain"
 
 Definitions = Mapping[str, Mapping[str, Definition[Any]]]
 """Definitions supplied by the user, by DDS type and ROS 2 type hash."""
@@ -58,7 +57,7 @@ class Px4Stream:
     `tokens`: announced publishers by token text; `since`: time of the first one.
     `ambiguous_until`: time until which messages of two publishers may be indistinguishable.
     `last_message`, `last_accepted`: arrival times of the last message, and of the last accepted one.
-    `restarted`: another publisher took over, and its first message is still to come.
+    `restarted`: another publisher took over, and its first message has not arrived yet.
     `reboots`: number of its vehicle's reboots seen on this key.
     `is_bridged`: messages from `nedbus ros2` have arrived.
     `is_input`: its messages go to the vehicle, from a node that does not reboot with it.
@@ -110,7 +109,7 @@ class StreamRegistry:
         self._reboots: dict[str, int] = {}  # by vehicle
 
     def add_publisher(self, token: PublisherToken, now: float) -> None:
-        """Add the publisher of a new liveliness token; raises like `on_message` for a key without an address."""
+        """Add the publisher of a new liveliness token; raise the errors of `on_message` if its key has no address."""
         stream = self._find(token.key)
         if _TIMEOUT <= now - stream.last_accepted < math.inf:
             # The previous publisher is silent: it lost its connection, which a router takes longer to notice.
@@ -165,7 +164,7 @@ class StreamRegistry:
             if step < 0:
                 is_repeated, stream.rebooted, restarted = now - stream.rebooted < _TIMEOUT, now, True
                 if is_repeated:
-                    reason = f"sequence numbers go back and forth, as if two vehicles shared this key: {_HINT}"
+                    reason = f"sequence numbers go back and forth, as if two vehicles shared this key; {_HINT}"
                     raise NotAcceptedError(reason)
             elif step <= _MAX_LOSS:
                 lost = step - 1
@@ -201,7 +200,7 @@ class StreamRegistry:
         stream = self._streams.get(str(key))
         if stream is None:
             if len(self._streams) >= _MAX_STREAMS:
-                raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: choose a domain, as in px4-zenoh:?domain=0")
+                raise NotAcceptedError(f"more than {_MAX_STREAMS} keys; choose a domain, as in px4-zenoh:?domain=0")
             namespace, topic, instance = split_ros2_topic(key.topic)
             address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
             stream = Px4Stream(key, address, self._unsupported_name(key, topic), is_input=is_vehicle_input(key.topic))
@@ -212,17 +211,17 @@ class StreamRegistry:
         if now < stream.ambiguous_until:
             stream.publisher = stream.gid = stream.sequence = None
             stream.last_accepted = now
-            raise NotAcceptedError(f"two vehicles publish on this key with the same gid: {_HINT}")
+            raise NotAcceptedError(f"two publishers on this key have the same gid; {_HINT}")
         owner = self._owners.setdefault(stream.address, stream)
         if owner is not stream:
             if now - owner.last_accepted < _TIMEOUT:
-                reason = f"{owner.key} already has the address {stream.address}: rename one of them with vehicles="
+                reason = f"{owner.key} already has the address {stream.address}; rename one of them with vehicles="
                 raise NotAcceptedError(reason)
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
             stream.restarted = stream.publisher is not None and stream.publisher.text not in stream.tokens
             if stream.gid is not None and not stream.restarted and now - stream.last_accepted < _TIMEOUT:
-                raise NotAcceptedError(f"two publishers share this key: {_HINT}")
+                raise NotAcceptedError(f"two publishers share this key; {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
             stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
 
@@ -262,15 +261,15 @@ class StreamRegistry:
         hint = f"supply its definition with px4-zenoh:?msg={name}.msg"
         if supplied:
             hashes = " or ".join(supplied)
-            reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}: use the file of this PX4"
+            reason = f"{name}.msg has the type hash {hashes}, but the key has {key.type_hash}; use the file of this PX4"
         elif known is None:
-            reason = f"{name} with the type hash {key.type_hash} is unknown: {hint}"
+            reason = f"{name} with the type hash {key.type_hash} is unknown; {hint}"
         elif key.type_hash != NO_HASH:
-            reason = f"no known layout of {name} has the type hash {key.type_hash}: update nedbus, or {hint}"
+            reason = f"no known layout of {name} has the type hash {key.type_hash}; update nedbus, or {hint}"
         elif layout := known.layout_of_release(self._options.layout or ""):
             return known, layout
         else:
-            reason = f"the key has no type hash ({NO_HASH}): choose a layout, as in px4-zenoh:?layout=1.14, or {hint}"
+            reason = f"the key has no type hash ({NO_HASH}); choose a layout, as in px4-zenoh:?layout=1.14, or {hint}"
         raise NotAcceptedError(reason)
 
 

@@ -253,7 +253,7 @@ def test_events_of_a_file_are_limited(tmp_path: Path, monkeypatch: pytest.Monkey
         (("events", "LOG", "--within", "60"), 2, "nedbus: --within: needs live vehicles, not a file\n"),
         (("events", "LOG", "--duration", "60"), 2, "nedbus: --duration: needs live vehicles, not a file\n"),
         (("events", "LOG", "--json", "--csv"), 2, "nedbus: --csv: cannot be combined with --json: remove"),
-        (("events", "note.txt"), 2, "nedbus: note.txt: not a flight file: its name must end with .ulg or"),
+        (("events", "note.txt"), 2, "nedbus: note.txt: not a flight file; its name must end with .ulg or"),
         (("why", "gone.ulg"), 1, "nedbus: gone.ulg: no such file or directory\n"),
         (("why", "a/b", "--vehicle", "a b"), 2, "nedbus: "),
         (("why", "not.ulg"), 1, "nedbus: "),

@@ -237,9 +237,9 @@ class TestOwnership:
         """Data on the same link reveals the ids of the client that owns the stream."""
         session.wait(0.1)
         session.answer(START, REJECTED)
-        assert "another client has it" in session.client.status.text
+        assert "another client already receives it" in session.client.status.text
         assert not session.client.accepts(255, 190)
-        assert "system 255 component 190 has it" in session.client.status.text
+        assert "system 255 component 190 already receives it" in session.client.status.text
         assert session.client.status[:2] == ("refused", "taken")
 
     def test_log_take_takes_over_stream(self) -> None:

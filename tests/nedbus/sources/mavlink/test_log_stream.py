@@ -143,7 +143,7 @@ def test_conversion_resumes_when_stream_ends() -> None:
     received = Received("log=1&topics=vehicle_attitude", FLIGHT, events={40.0: "foreign_stop"})
     sources = [each.source for each in received.messages if each.address.topic == "vehicle_attitude"]
     assert [source for source, _ in groupby(sources)] == [None, "mavlink-ulog", None]
-    assert any("another client stopped" in each for each in received.reasons), received.reasons
+    assert any("PX4 stopped the ULog stream" in each for each in received.reasons), received.reasons
 
 
 @recorded_flight
@@ -215,7 +215,7 @@ def test_losses_are_within_bounds(name: str, messages: int, lost: int, gaps: int
 
 
 @pytest.mark.parametrize(("peer", "reason"), [
-    ({"refusal": 1}, "another client has it"), ({"refusal": 2}, "5000 B/s"),
+    ({"refusal": 1}, "another client already receives it"), ({"refusal": 2}, "5000 B/s"),
 ])  # fmt: skip
 def test_rejected_stream_reports_reason(peer: dict[str, Any], reason: str) -> None:
     """The status names the cause of a rejection, and messages are converted from MAVLink as without `log=`."""
@@ -297,5 +297,5 @@ def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:
     assert [each.fields.get("cell_count") for each in messages] == [6, None, None, 7, 8]
     assert [each.dropout for each in messages] == [0.0, 0.0, 0.0, 0.0, 1.5]
     [rejection] = [each for each in found if isinstance(each, Rejection)]
-    assert rejection.reason == "battery_status: cell_count left out where its value is not a uint8, such as 300"
+    assert rejection.reason == "battery_status.cell_count is left out where its value does not fit uint8, such as 300"
     assert rejection.count == 0

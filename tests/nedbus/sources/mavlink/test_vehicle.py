@@ -131,7 +131,7 @@ def test_order_is_checked_per_topic() -> None:
     assert vehicle.handle(dialect.MAVLink_odometry_message(1_900_000, *odometry), 100.0)
     late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
     assert isinstance(late, Rejection)
-    assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order: 1800 ms since boot, after 1900 ms")
+    assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order (1800 ms since boot, after 1900 ms)")
     assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
 
 

@@ -72,7 +72,7 @@ def test_vehicles_with_same_gid_are_rejected_until_one_is_gone(streams: StreamRe
     assert send(streams, stream, 7, 100.1) == (0, False)
     streams.add_publisher(px4("b"), 100.2)
     for number in range(100):
-        with pytest.raises(NotAcceptedError, match="two vehicles publish on this key with the same gid: give each"):
+        with pytest.raises(NotAcceptedError, match="two publishers on this key have the same gid; give each"):
             send(streams, stream, number, 100.2 + number)
     streams.remove_publisher(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="the same gid"):
@@ -169,7 +169,7 @@ def test_number_of_keys_is_limited(monkeypatch: pytest.MonkeyPatch, streams: Str
     streams.add_publisher(px4("a"), 0.0)
     for domain in (1, 2):
         streams.on_message(str(key(domain=domain)), 0.0)
-    with pytest.raises(NotAcceptedError, match="more than 3 keys: choose a domain"):
+    with pytest.raises(NotAcceptedError, match="more than 3 keys; choose a domain"):
         streams.on_message(str(key(domain=3)), 0.0)
     streams.report(0.0)
     streams.on_message(str(key(domain=3)), 0.0)

@@ -380,7 +380,7 @@ def test_two_px4s_with_same_gid_are_not_mixed(where: str) -> None:
         assert (now.published, now.rejected) == (len(alone), played - len(alone))
         assert (now.lost, now.reboots, every.counts.lost) == (0, 0, 0)
         assert len(now.warnings) == 4
-        assert all("with the same gid" in warning for warning in now.warnings)
+        assert all("have the same gid" in warning for warning in now.warnings)
 
 
 def test_restarted_px4_counts_as_one_reboot(where: str) -> None:
