@@ -328,7 +328,7 @@ def parse_replies(replies: Iterable[RawSample]) -> Iterator[tuple[str, object]]:
         else:
             yield key, content
     if oversized:
-        text = "ignored replies over %d bytes or over the memory limit (%d in total): the result is incomplete"
-        _log.warning(text, MAX_REPLY_BYTES, oversized, extra=about("incomplete"))
+        warning = "ignored replies over %d bytes or over the memory limit (%d in total): the result is incomplete"
+        _log.warning(warning, MAX_REPLY_BYTES, oversized, extra=about("incomplete"))
     if invalid:
         _log.warning("%r: ignored a reply that is not JSON", invalid, extra=about("invalid", reason="not JSON"))

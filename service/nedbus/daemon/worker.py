@@ -272,8 +272,9 @@ class Worker:
         self._state, self._error = "retrying", reason
         self._retries += 1
         text = reason if isinstance(error, SourceError) else f"{self._name}: {reason}"
-        event, again = ("retrying", "; trying again") if self._retry else ("failed", "")
-        _log.error("%s%s", text, again, exc_info=bug, extra=about(event, source=self._name, reason=reason))
+        event = "retrying" if self._retry else "failed"
+        text += "; trying again" * self._retry
+        _log.error("%s", text, exc_info=bug, extra=about(event, source=self._name, reason=reason))
         self._output.release()
 
 

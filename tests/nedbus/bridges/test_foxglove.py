@@ -94,7 +94,7 @@ def test_channels_follow_vehicles_and_carry_every_field(run_nedbus: Start, endpo
     """Channels appear and disappear with their vehicles; their data is the message in CDR, with its definition."""
     url = f"ws://127.0.0.1:{free_port()}"
     process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
-    wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
+    wait_for(lambda: f"enter {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/estimator_local_position/1"
     sent = message(5, x=0.25, vxy_max=float("inf"))
     with connected(url) as client, bus.publisher("estimator_local_position", vehicle="7", instance=1) as publisher:
@@ -121,7 +121,7 @@ def test_message_without_nominal_rate_reaches_the_first_subscriber(
     """A home position is sent only once, before its channel can have subscribers, so it is kept for the first one."""
     url = f"ws://127.0.0.1:{free_port()}"
     process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), coverage=False)
-    wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
+    wait_for(lambda: f"enter {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/home_position"
     with connected(url) as client, bus.publisher("home_position", vehicle="7") as publisher:
         publisher.publish({"timestamp": 2_000_000, "alt": 488.0})

@@ -241,7 +241,7 @@ def test_existing_file_is_not_replaced(endpoint: str, arguments: list[str]) -> N
     path.write_text("precious")
     ended = run_command(*arguments, NEDBUS_CONNECT=endpoint)
     assert ended.exit_code == 1
-    assert "file exists): choose another name, or remove it" in ended.err
+    assert "file exists): choose another name, or remove the file" in ended.err
     assert path.read_text() == "precious"
     assert list(path.parent.iterdir()) == [path]
 
