@@ -128,10 +128,10 @@ class LogStream:
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
             text = f"the log on the SD card lacks the {header:.1f} s in which the header was sent"
-            _log.info("%s: receiving the ULog stream; %s", address, text, extra=about("log_stream", address))
+            _log.info("vehicle %s: receiving the ULog stream; %s", self._name, text, extra=about("log_stream", address))
         elif status.reason is not None:
             extra = about("log_stream", address, reason=status.text)
-            _log.warning("%s: no ULog stream; %s", address, status.text, extra=extra)
+            _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
         """Return the status, with rate and delay measured since the last call."""

@@ -128,7 +128,7 @@ class _LinkSession:
         converted = vehicle.handle(message, now)
         if isinstance(converted, SourceMessage) and converted.rebooted:
             address = Address(converted.address.vehicle, DEFAULT_TOPIC)
-            _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
+            _log.warning("vehicle %s rebooted", address.vehicle, extra=about("rebooted", address, source=self._name))
         is_streamed = log and converted and converted.address and log.delivers(converted.address)
         return None if is_streamed else converted
 

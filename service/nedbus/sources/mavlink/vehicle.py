@@ -128,7 +128,7 @@ class Vehicle:
                 self._reported.add(number)
                 name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
                 extra = about("unsupported", address)
-                _log.info("%s: the vehicle does not send %s on request", address, name, extra=extra)
+                _log.info("vehicle %s does not send %s on request", self._name, name, extra=extra)
         if not self._pending:
             return None
         number = self._pending.pop(0)

@@ -153,7 +153,7 @@ def test_unanswered_requests_are_repeated(vehicle: Vehicle, caplog: pytest.LogCa
     for number in (*NEEDED, ORIGIN):
         assert 10 < requested.count(number) < 30
     assert caplog.text.count("does not send") == len(NEEDED)
-    assert "9/vehicle_local_position: the vehicle does not send ODOMETRY on request" in caplog.text
+    assert "vehicle 9 does not send ODOMETRY on request" in caplog.text
 
 
 def test_arriving_messages_are_requested_three_times(vehicle: Vehicle) -> None:
