@@ -6,7 +6,7 @@ from functools import lru_cache
 from itertools import islice
 from typing import Final, NamedTuple
 
-from nedbus_msgs.definitions import define
+from nedbus_msgs.definitions import check_field_name, define
 from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
@@ -47,6 +47,8 @@ class MsgField(NamedTuple):
     name: str
     type: FieldType
     comment: str
+    line: int
+    column: int
 
 
 def read_msg(text: str) -> list[MsgField]:
@@ -65,11 +67,16 @@ def read_msg(text: str) -> list[MsgField]:
 def define_msg(name: str, text: str) -> Definition[Message]:
     """Define a message from a .msg file, with its `@range` annotations as rules; raise MsgError if it is invalid."""
     fields = read_msg(text)
+    for field in fields:
+        try:
+            check_field_name(field.name)
+        except ValueError as exc:
+            raise MsgError(field.line, field.column, str(exc)) from None
     try:
         return define(
             name,
-            ((name, kind) for name, kind, _ in fields),
-            meanings={name: comment for name, _, comment in fields if comment},
+            ((field.name, field.type) for field in fields),
+            meanings={field.name: field.comment for field in fields if field.comment},
             rules=list(filter(None, map(_range_of, fields))),
         )
     except ValueError as exc:
@@ -137,7 +144,7 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
                     parts, line.base, f"{prefix}{line.name}_" + f"{index}_" * (index is not None), level + 1
                 )
             continue
-        yield MsgField(prefix + line.name, _type_of(line), line.comment)
+        yield MsgField(prefix + line.name, _type_of(line), line.comment, line.number, line.column)
 
 
 def _describe(line: _Line, parts: Mapping[str, object]) -> Mapping[str, object]:

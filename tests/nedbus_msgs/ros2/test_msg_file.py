@@ -81,8 +81,10 @@ def test_annotations_become_rules() -> None:
         ("uint64 timestamp\nOther other\n", r"line 2, column 1: 'Other' is not a type"),
         (f"uint64 timestamp\nSelf a{NESTED}Self\nSelf a\n", r"line 5, column 1: 'Self' is not a type"),
         ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: unsupported constant type 'Other'"),
-        ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: invalid field name 'Upper'"),
-        ("uint64 timestamp\nfloat32 copy\n", r"invalid field name 'copy', which is a member of"),
+        ("uint64 timestamp\nuint8 Upper\n", r"line 2, column 1: invalid field name 'Upper'"),
+        ("uint64 timestamp\n  float32 range; # [m]\n", r"line 2, column 3: invalid field name 'range;'"),
+        (f"uint64 timestamp\nPart a{NESTED}Part\nbool B\n", r"line 5, column 1: invalid field name 'a_B'"),
+        ("uint64 timestamp\nfloat32 copy\n", r"line 2, column 1: invalid field name 'copy', which is a member of"),
         (f"uint64 timestamp\nfloat32 a_b\nBar a{NESTED}Bar\nfloat32 b\n", r"duplicate field 'a_b'"),
         (
             f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nC[999] c{NESTED}C\n",
