@@ -1,5 +1,6 @@
 """Links to MAVLink vehicles over UDP, TCP or a serial port, and checks of sender ids."""
 
+import errno
 import os
 import re
 import select
@@ -107,7 +108,8 @@ def open_link(text: str, *, baud: int) -> Link:
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
         reason = os.strerror(number).lower() if number and number > 0 else str(exc)
-        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason})") from exc
+        remedy = ": close the other program or use another port" * (number == errno.EADDRINUSE)
+        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason}){remedy}") from exc
 
 
 def _is_ready(file: Any, timeout: float) -> bool:

@@ -355,7 +355,7 @@ def test_serial_port_is_read_until_it_disappears() -> None:
 
 
 def test_port_in_use_raises(listener: Listener, port: int) -> None:
-    with pytest.raises(SourceError, match=r"cannot be opened \(address already in use\)"):
+    with pytest.raises(SourceError, match=r"\(address already in use\): close the other program or use another"):
         Listener(f"mavlink:udpin:127.0.0.1:{port}")
     assert not listener.rejections
 
