@@ -177,7 +177,7 @@ def doctor(
         str | None, typer.Option("--vehicle", "-v", help="Examine only this vehicle; also test the write permission")
     ] = None,
     mavlink: Annotated[
-        str | None, typer.Option(metavar="LINK", help="Also listen on a MAVLink link, such as udpin:0.0.0.0:14550")
+        str | None, typer.Option(metavar="LINK", help="Also listen on a MAVLink link, such as udpin:0.0.0.0:14540")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:

@@ -364,8 +364,8 @@ def test_port_in_use_raises(listener: Listener, port: int) -> None:
     ("text", "reason"),
     [
         ("mavlink:", "write it as mavlink:LINK"),
-        ("mavlink:14550", "write udpin:0.0.0.0:14550"),
-        ("mavlink:udpin:0.0.0.0:99999", "write udpin:0.0.0.0:14550"),
+        ("mavlink:14540", "write udpin:0.0.0.0:14540"),
+        ("mavlink:udpin:0.0.0.0:99999", "write udpin:0.0.0.0:14540"),
         ("mavlink:udpin:0.0.0.0:14550?rate=0", "positions per second"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=1:a b", "SYSTEM_ID:VEHICLE"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=wing:1", "SYSTEM_ID:VEHICLE"),
