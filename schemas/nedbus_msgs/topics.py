@@ -175,6 +175,8 @@ def get_topic(name: object) -> Topic:
 def _other_topic(name: str) -> Topic:
     if not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
         topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
+        if re.search(r"(^|/)(in|out)/", name):
+            raise AddressError("topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix")
         base, _, instance = name.partition("/")
         expected = f"one of {', '.join(topics)}" + ", or another PX4 topic in lower_snake_case" * (topics is TOPICS)
         raise AddressError("topic", name, f"{base} with instance {instance}" if base in TOPICS else expected)

@@ -144,6 +144,8 @@ def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, 
     ("topic", "vehicle", "instance", "what"),
     [
         ("vehicle_local_positon", "*", None, "topic"),
+        ("/fmu/out/vehicle_status_v1", "*", None, "expected vehicle_status, without the ROS 2 prefix"),
+        ("in/wheel_encoders", "*", None, "expected wheel_encoders, without the ROS 2 prefix"),
         ("vehicle_local_position", "*", 0, "instance"),
         ("*", "*", 1, "instance"),
         ("vehicle_local_position", "a b", None, "vehicle"),
