@@ -149,7 +149,10 @@ def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, 
         ("vehicle_local_position", "*", 0, "instance"),
         ("*", "*", 1, "instance"),
         ("vehicle_local_position", "a b", None, "vehicle"),
-        *(("estimator_local_position", "*", instance, "instance") for instance in (-1, 256, True, "0")),
+        *(
+            ("estimator_local_position", "*", instance, "instance .* an integer from 0 to 255 for")
+            for instance in (-1, 256, True, "0")
+        ),
     ],
 )
 def test_invalid_selection_raises(topic: str, vehicle: str, instance: int | None, what: str) -> None:
