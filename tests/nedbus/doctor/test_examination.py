@@ -169,7 +169,10 @@ def test_silent_and_missing_vehicles_are_reported(bus: nedbus.Bus, endpoint: str
     findings = diagnose(endpoint)
     find(findings, "vehicle", "warning", r"mute/.*silent for \d+ s: no message yet")
     find(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ m?s old")
-    find(diagnose(endpoint, vehicle="7"), "vehicle", "wrong", "7: not found under nedbus/")
+    missing = [each for each in diagnose(endpoint, vehicle="7") if each.seen == "not found under nedbus/"]
+    assert [each.advice for each in missing] == [
+        "start its source: 'nedbus serve --source ...'; published: asleep, mute"
+    ]
 
 
 def test_two_publishers_of_one_address_are_reported(bus: nedbus.Bus, endpoint: str) -> None:
