@@ -49,10 +49,7 @@ def define(
         raise ValueError(f"{name!r:.100} is not a message name; expected CamelCase of at most 64 characters")
     types: dict[str, FieldType] = {}
     for field, kind in fields:
-        if not _FIELD.fullmatch(field):
-            raise ValueError(f"invalid field name {field!r:.100}; expected lower_snake_case")
-        if hasattr(Message, field):
-            raise ValueError(f"invalid field name {field!r}, which is a member of the Python class Message")
+        check_field_name(field)
         if field in types:
             raise ValueError(f"duplicate field {field!r}, after flattening nested messages")
         types[field] = kind
@@ -71,3 +68,11 @@ def define(
     model.LAYOUTS, model.RULES = (Layout("PX4", " ".join(types)),), rules  # the model has timestamp first
     model.DEFINITION = Definition(model)
     return model.DEFINITION
+
+
+def check_field_name(name: str) -> None:
+    """Raise ValueError for a name that no field can have."""
+    if not _FIELD.fullmatch(name):
+        raise ValueError(f"invalid field name {name!r:.100}; expected lower_snake_case")
+    if hasattr(Message, name):
+        raise ValueError(f"invalid field name {name!r}, which is a member of the Python class Message")

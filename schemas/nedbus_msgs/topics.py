@@ -48,9 +48,7 @@ class Address:
 
     def __post_init__(self) -> None:
         check_vehicle(self.vehicle)
-        if get_topic(self.topic).instances and self.instance is None:
-            raise AddressError("instance", None, f"0 to {_INSTANCES - 1} for {self.topic}")
-        _check_instance(self.topic, self.instance)
+        _check_instance(self.topic, self.instance, required=get_topic(self.topic).instances is True)
 
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -175,6 +173,8 @@ def get_topic(name: object) -> Topic:
 def _other_topic(name: str) -> Topic:
     if not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
         topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
+        if re.search(r"(^|/)(in|out)/", name):
+            raise AddressError("topic", name, f"{split_ros2_topic(name)[1]}, without the ROS 2 prefix")
         base, _, instance = name.partition("/")
         expected = f"one of {', '.join(topics)}" + ", or another PX4 topic in lower_snake_case" * (topics is TOPICS)
         raise AddressError("topic", name, f"{base} with instance {instance}" if base in TOPICS else expected)
@@ -235,20 +235,17 @@ def topic_of(message: type[Message] | str, topic: str | None = None) -> str:
 def check_vehicle(vehicle: object) -> str:
     """Return a valid vehicle name; raise AddressError for any other."""
     if not isinstance(vehicle, str):
-        expected = 'one name, such as "7" (call once per vehicle), or "*" for all'
-        raise AddressError("vehicle", vehicle, expected)
+        raise AddressError("vehicle", vehicle, 'one name, such as "7" (call once per vehicle), or "*" for all')
     if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
     return vehicle
 
 
-def _check_instance(topic: str, instance: int | None) -> None:
-    if instance is None:
-        return
-    if get_topic(topic).instances is False:
+def _check_instance(topic: str, instance: int | None, *, required: bool = False) -> None:
+    if instance is not None and get_topic(topic).instances is False:
         raise AddressError("instance", instance, f"none ({topic} has no instances)")
-    if type(instance) is not int or not 0 <= instance < _INSTANCES:
-        raise AddressError("instance", instance, f"0 to {_INSTANCES - 1} for {topic}")
+    if (required or instance is not None) and (type(instance) is not int or not 0 <= instance < _INSTANCES):
+        raise AddressError("instance", instance, f"an integer from 0 to {_INSTANCES - 1} for {topic}")
 
 
 def check_prefix(prefix: str) -> None:

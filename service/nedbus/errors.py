@@ -94,8 +94,8 @@ class ConnectError(NedbusError, ConnectionError):
         else:
             super().__init__(
                 f"nothing answers at {where} ({tried}): start 'nedbus serve' or a Zenoh router there, or name another"
-                " endpoint with --connect or NEDBUS_CONNECT; a router at its session limit does not answer either;"
-                " run 'nedbus doctor' to find the cause"
+                ' endpoint with --connect, connect("tcp/HOST:PORT") or NEDBUS_CONNECT; a router at its session'
+                " limit does not answer either; run 'nedbus doctor' to find the cause"
             )
 
 

@@ -144,10 +144,15 @@ def test_invalid_address_raises(vehicle: str, topic: str, instance: int | None, 
     ("topic", "vehicle", "instance", "what"),
     [
         ("vehicle_local_positon", "*", None, "topic"),
+        ("/fmu/out/vehicle_status_v1", "*", None, "expected vehicle_status, without the ROS 2 prefix"),
+        ("in/wheel_encoders", "*", None, "expected wheel_encoders, without the ROS 2 prefix"),
         ("vehicle_local_position", "*", 0, "instance"),
         ("*", "*", 1, "instance"),
         ("vehicle_local_position", "a b", None, "vehicle"),
-        *(("estimator_local_position", "*", instance, "instance") for instance in (-1, 256, True, "0")),
+        *(
+            ("estimator_local_position", "*", instance, "instance .* an integer from 0 to 255 for")
+            for instance in (-1, 256, True, "0")
+        ),
     ],
 )
 def test_invalid_selection_raises(topic: str, vehicle: str, instance: int | None, what: str) -> None:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from itertools import islice
 from typing import Final, NamedTuple
 
-from nedbus_msgs.definitions import define
+from nedbus_msgs.definitions import check_field_name, define
 from nedbus_msgs.model.definition import Definition
 from nedbus_msgs.model.message import Message
 from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
@@ -14,17 +14,18 @@ from nedbus_msgs.model.rules import InRange
 
 from .types import NESTED, PACKAGE, describe_field, type_hash
 
+# Possessive quantifiers: a comment may have 200,000 spaces or digits.
+_NUMBER: Final = r"[-+]?(?:(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?|inf)"
+_VALUE: Final = rf"(?:{_NUMBER}|[-+]?0[xXbBoO][\da-fA-F]++|nan|[Tt]rue|[Ff]alse|\"[^\"]*+\"|'[^']*+')"
 _FIELD = re.compile(
-    r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})\s*"
-    r"(?:=\s*(?P<value>[^#]*)|(?:[-+.\d\[\"']|true\b|True\b|false\b|False\b)[^#]*)?(?P<comment>#.*)?"
+    r"(?P<type>(?P<text>w?string(?=\s))|[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})(?:(?:\s*(?P<equals>=)\s*|\s+)"
+    rf"(?:{_VALUE}|\[(?:\s*+{_VALUE}\s*+(?:,|(?=\])))*+\s*+\]|(?(text)[^#]*|(?!))))?\s*(?P<comment>#.*)?"
 )
-"""A field, with or without a default value, or a constant."""
+"""A field, with or without a default value, or a constant; a string may have no quotes."""
 _LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or form feed, which may occur in a comment
 _LENGTH = re.compile(r"\[([1-9]\d{0,2})\]")  # length of an array of nested messages
-_STRINGS: Final = ("string", "wstring")  # only constants have these types
-# Possessive quantifiers: a comment may have 200,000 spaces or digits.
-_NUMBER: Final = r"[-+]?(?:\d++\.?\d*+(?:[eE][-+]?\d++)?|inf)"
-_RANGE = re.compile(rf"@range\s++({_NUMBER})?\s*+,\s*+({_NUMBER})?")
+_LIMIT: Final = rf"\s*+(?:({_NUMBER})|[-+]?[A-Za-z]\w*+)?\s*+(?:\([^()]*+\)\s*+)?"  # such as 1, pi, -1 (Left)
+_RANGE = re.compile(rf"(\[)?@range(?![A-Za-z_])(?:\s{_LIMIT}(?P<comma>,){_LIMIT}(?(1)\]))?")
 _INVALID = re.compile(rf"@invalid\s++({_NUMBER})")
 _MAX_FIELDS: Final = 1000  # including nested ones; the limit of a message is lower
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
@@ -47,6 +48,8 @@ class MsgField(NamedTuple):
     name: str
     type: FieldType
     comment: str
+    line: int
+    column: int
 
 
 def read_msg(text: str) -> list[MsgField]:
@@ -64,13 +67,19 @@ def read_msg(text: str) -> list[MsgField]:
 @lru_cache(256)  # a cached definition keeps its codecs
 def define_msg(name: str, text: str) -> Definition[Message]:
     """Define a message from a .msg file, with its `@range` annotations as rules; raise MsgError if it is invalid."""
-    fields = read_msg(text)
+    fields, rules = read_msg(text), []
+    for field in fields:
+        try:
+            check_field_name(field.name)
+            rules.append(_range_of(field))
+        except ValueError as exc:
+            raise MsgError(field.line, field.column, str(exc)) from None
     try:
         return define(
             name,
-            ((name, kind) for name, kind, _ in fields),
-            meanings={name: comment for name, _, comment in fields if comment},
-            rules=list(filter(None, map(_range_of, fields))),
+            ((field.name, field.type) for field in fields),
+            meanings={field.name: field.comment for field in fields if field.comment},
+            rules=list(filter(None, rules)),
         )
     except ValueError as exc:
         raise MsgError(1, 1, str(exc)) from None
@@ -116,14 +125,14 @@ def _parts(text: str) -> _Parts:
         elif line.strip() and line[start] != "#" and not line.startswith("==="):
             found = _FIELD.fullmatch(line.strip())
             if found is None:
-                raise MsgError(number, start + 1, "expected a field, such as 'float32[4] q', or a constant")
+                raise MsgError(number, start + 1, "expected a field, such as 'float32[4] q  # comment', or a constant")
             base, bracket, length = found["type"].rpartition("/")[2].partition("[")
             name, comment = found["name"], (found["comment"] or "").lstrip("# ")[:_MAX_COMMENT].strip()
             if name in current:
                 raise MsgError(number, start + 1 + found.start("name"), f"duplicate field {name!r}")
-            if found["value"] is None:
+            if not found["equals"]:
                 current[name] = _Line(number, start + 1, base, bracket + length, name, comment)
-            elif base not in BASES and base not in ALIASES and base not in _STRINGS:
+            elif base not in BASES and base not in ALIASES and not found["text"]:
                 raise MsgError(number, start + 1, f"unsupported constant type {base!r}")
     return parts
 
@@ -133,11 +142,10 @@ def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[M
         count = _LENGTH.fullmatch(line.length)
         if parts.get(line.base) and level < _MAX_NESTING and (count or not line.length):
             for index in range(int(count[1])) if count else [None]:
-                yield from _flatten(
-                    parts, line.base, f"{prefix}{line.name}_" + f"{index}_" * (index is not None), level + 1
-                )
+                inner = f"{prefix}{line.name}_" + f"{index}_" * (index is not None)
+                yield from _flatten(parts, line.base, inner, level + 1)
             continue
-        yield MsgField(prefix + line.name, _type_of(line), line.comment)
+        yield MsgField(prefix + line.name, _type_of(line), line.comment, line.number, line.column)
 
 
 def _describe(line: _Line, parts: Mapping[str, object]) -> Mapping[str, object]:
@@ -157,9 +165,9 @@ def _type_of(line: _Line) -> FieldType:
 
 def _range_of(field: MsgField) -> InRange | None:
     found, invalid = _RANGE.search(field.comment), _INVALID.search(field.comment)
+    if found and not found["comma"]:
+        raise ValueError(f"malformed @range of {field.name}; expected limits, such as [@range 0, 100]")
     if found is None or field.type.base == "bool" or field.type.is_text:
         return None
-    least, greatest = float(found[1] or "-inf"), float(found[2] or "inf")
-    return InRange(
-        field.name, least, greatest, or_=float(invalid[1]) if invalid else None, is_array=field.type.is_array
-    )
+    least, greatest, or_ = float(found[2] or "-inf"), float(found[4] or "inf"), float(invalid[1]) if invalid else None
+    return InRange(field.name, least, greatest, or_=or_, is_array=field.type.is_array)

@@ -161,7 +161,7 @@ def _select(
     if topic_option is not None:
         raise ConfigError("--topic", f"the argument already names the topic {topic!r}: remove one of the two")
     chunks = topic.strip("/").split("/")
-    if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:
+    if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1 and chunks[1] not in ("in", "out"):
         vehicle = chunks.pop(0)
     if len(chunks) == 2 and chunks[1].isdecimal():
         instance = int(chunks.pop())

@@ -36,7 +36,7 @@ def examine(
     """Run all checks and return their findings, the worst last; takes up to 10 s if no router answers.
 
     `version`: version of this nedbus. `vehicle`: check only this vehicle, and test the permission to publish it.
-    `mavlink`: link to check, such as `udpin:0.0.0.0:14550`.
+    `mavlink`: link to check, such as `udpin:0.0.0.0:14540`.
 
     Raises ConfigError for an invalid link.
     """

@@ -34,7 +34,7 @@ def check_mavlink(link: str) -> Iterator[Finding]:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check the address and port, or the device and its permissions"
         if is_taken:
-            advice = "fine if 'nedbus serve' uses it; else stop the process that 'ss -ulpn' shows, or use another port"
+            advice = "fine if 'nedbus serve' is the other program; 'ss -ulpn' shows it"
         yield Finding("mavlink", link, "warning" if is_taken else "wrong", exc.reason, advice)
         return
     if not senders:

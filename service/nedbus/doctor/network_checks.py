@@ -150,9 +150,9 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
         vehicles = {address.vehicle for address in flowing}
         yield Finding("vehicle", "", "ok", f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}")
     if not known and not hidden:
-        advice = "start its source: 'nedbus serve --source ...'"
-        if seen.services:
-            advice = "a service answers: see the findings on its sources; it may publish other vehicles"
+        advice = "see the findings on sources" if seen.services else "start its source: 'nedbus serve --source ...'"
+        if others := sorted({each.vehicle for each in {*seen.alive, *arrived}}):
+            advice += f"; published: {', '.join(others[:20])}"
         text = f"{'no vehicle' if vehicle is None else 'not'} found under {seen.prefix}/"
         yield Finding("vehicle", vehicle or "", "warning" if vehicle is None else "wrong", text, advice)
 

@@ -34,10 +34,10 @@ def faults_of(reports: Sequence[AccountReport], expected: Expectation, *, only: 
     checked = [report for report in reports if only is None or report.host == only]
     vehicles = {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(checked).items()}
     missing = [name for name in expected.expect if name not in vehicles]
-    faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
     active = [name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent]
+    names = f": {', '.join(active[:20])}" if active else ""
+    faults = [f"vehicle {name} is missing: it has no publisher{names and f'; published{names}'}" for name in missing]
     if len(active) < (expected.vehicles or 0):
-        names = f": {', '.join(active[:20])}" if active else ""
         faults.append(f"messages arrive from {len(active)} of {expected.vehicles} vehicles{names}")
     for name, (now, vehicle) in vehicles.items():
         if not expected.expect or name in expected.expect:

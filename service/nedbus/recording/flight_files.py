@@ -41,7 +41,7 @@ def format_of(path: str | PurePath) -> str:
 def check_recording(path: Path) -> None:
     """Raise ConfigError unless the name of a recording ends with .mcap."""
     if SUFFIXES.get(path.suffix.lower()) != "mcap":
-        raise ConfigError(str(path), "not a recording; its name must end with .mcap")
+        raise ConfigError(str(path), "its name must end with .mcap; for CSV, see nedbus.read in docs/recordings.md")
 
 
 def open_flight(path: Path) -> BinaryIO:
@@ -53,7 +53,7 @@ def open_flight(path: Path) -> BinaryIO:
             raise SourceError(str(path), reason)
         return path.open("rb")
     except OSError as exc:
-        raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
+        raise SourceError(str(path.absolute()), (exc.strerror or str(exc)).lower()) from exc
 
 
 def recording_files(path: Path) -> tuple[list[Path], list[str]]:

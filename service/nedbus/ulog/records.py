@@ -109,7 +109,7 @@ Record = Header | _Definition | _Logged | Damage
 def read_header(data: bytes) -> Header:
     """Parse the 16-byte file header; raise UlogError for other data."""
     if len(data) < 16 or not data.startswith(b"ULog\x01\x12\x35"):
-        raise UlogError("it does not begin with ULog's magic bytes")
+        raise UlogError("it does not begin with ULog's magic bytes; check that it is a complete PX4 log")
     return Header(data[7], int.from_bytes(data[8:16], "little"))
 
 

@@ -37,7 +37,10 @@ def test_connect_without_a_router_raises() -> None:
     """Without a router, `connect` raises a ConnectionError with the endpoint and a remedy."""
     where = free_endpoint()
     assert issubclass(nedbus.ConnectError, ConnectionError)
-    with pytest.raises(nedbus.ConnectError, match=rf"nothing answers at {where} .*nedbus serve.*NEDBUS_CONNECT"):
+    with pytest.raises(
+        nedbus.ConnectError,
+        match=rf'nothing answers at {where} .*nedbus serve.*--connect, connect\("tcp/HOST:PORT"\) or NED',
+    ):
         nedbus.connect(where, timeout=0.1)
 
 

@@ -233,7 +233,8 @@ def test_vehicle_received_by_one_service_is_not_missing() -> None:
 def test_missing_vehicles_are_faults() -> None:
     """A missing vehicle is a fault, whether expected by name or by count; one published by a script is present."""
     one = report(flying())
-    assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
+    assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher; published: 1"]
+    assert faults_of([], Expectation(("7",))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one, SCRIPT], Expectation(("1", "7"))) == []
     assert faults_of([one, SCRIPT], Expectation(vehicles=3)) == ["messages arrive from 2 of 3 vehicles: 1, 7"]
     assert faults_of([], Expectation(vehicles=1)) == ["messages arrive from 0 of 1 vehicles"]

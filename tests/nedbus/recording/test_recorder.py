@@ -401,7 +401,7 @@ def test_recording_without_messages_warns_and_removes_the_file(
     assert not path.exists()
 
 
-WRONG_SUFFIX = "not a recording; its name must end with .mcap"
+WRONG_SUFFIX = "its name must end with .mcap; for CSV, see nedbus.read in docs/recordings.md"
 
 
 @pytest.mark.parametrize(
@@ -413,7 +413,7 @@ WRONG_SUFFIX = "not a recording; its name must end with .mcap"
         ("record -o a.txt", 2, f"a.txt: {WRONG_SUFFIX}\n"),
         ("record -o a.csv", 2, f"a.csv: {WRONG_SUFFIX}\n"),
         ("convert flight.txt a.mcap", 2, "its name must end with .ulg or .mcap"),
-        ("convert flight.ulg a.mcap", 1, "no such file"),
+        ("convert flight.ulg a.mcap", 1, "/flight.ulg: no such file or directory\n"),
     ],
 )
 def test_invalid_argument_is_a_one_line_error(endpoint: str, arguments: str, exit_code: int, reason: str) -> None:

@@ -52,17 +52,21 @@ def test_annotations_become_rules() -> None:
         uint8 KIND_A = 1
         float32 share           # [-] @range 0, 1 @invalid -1 how much
         float32[2] pair         # @range 0.1,
+        float32 steer           # [@range -1 (Left), 1 (Right)] [@enum KIND] [@range_hint] [@other 1; 2
+        float32 heading         # [@range -pi, INF] as in PX4
         char[3] letters
     """
     definition = define_msg("Ranged", text)
     assert {name: str(kind) for name, kind in definition.types.items()} == {
-        "timestamp": "uint64", "share": "float32", "pair": "float32[2]", "letters": "char[3]",
+        "timestamp": "uint64", "share": "float32", "pair": "float32[2]", "steer": "float32", "heading": "float32",
+        "letters": "char[3]",
     }  # fmt: skip
     assert definition.meaning("timestamp") == "[us] time since system start"
+    definition.model.model_validate({"timestamp": 1, "steer": -1.0, "heading": -4.0})
     for share in (0.0, 1.0, -1.0, float("nan")):
         definition.model.model_validate({"timestamp": 1, "share": share})
     definition.model.model_validate({"timestamp": 1, "pair": (0.1, 5.0)})
-    for wrong in ({"share": 1.5}, {"share": -0.5}, {"pair": (0.2, 0.05)}, {"letters": "long"}):
+    for wrong in ({"share": 1.5}, {"share": -0.5}, {"pair": (0.2, 0.05)}, {"steer": 2.0}, {"letters": "long"}):
         with pytest.raises(ValidationError):
             definition.model.model_validate({"timestamp": 1, **wrong})
 
@@ -81,8 +85,10 @@ def test_annotations_become_rules() -> None:
         ("uint64 timestamp\nOther other\n", r"line 2, column 1: 'Other' is not a type"),
         (f"uint64 timestamp\nSelf a{NESTED}Self\nSelf a\n", r"line 5, column 1: 'Self' is not a type"),
         ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: unsupported constant type 'Other'"),
-        ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: invalid field name 'Upper'"),
-        ("uint64 timestamp\nfloat32 copy\n", r"invalid field name 'copy', which is a member of"),
+        ("uint64 timestamp\nuint8 Upper\n", r"line 2, column 1: invalid field name 'Upper'"),
+        ("uint64 timestamp\n  float32 range; # [m]\n", r"line 2, column 3: invalid field name 'range;'"),
+        (f"uint64 timestamp\nPart a{NESTED}Part\nbool B\n", r"line 5, column 1: invalid field name 'a_B'"),
+        ("uint64 timestamp\nfloat32 copy\n", r"line 2, column 1: invalid field name 'copy', which is a member of"),
         (f"uint64 timestamp\nfloat32 a_b\nBar a{NESTED}Bar\nfloat32 b\n", r"duplicate field 'a_b'"),
         (
             f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nC[999] c{NESTED}C\n",
@@ -109,6 +115,22 @@ def test_invalid_sentinel_survives_float32_rounding() -> None:
     assert decode(encode(message), definition.model) == message
 
 
+@pytest.mark.parametrize(
+    "rest",
+    [" x [m] [@range 0, 100]", " x [m", " x 5 m", " x true5", "[2] x [1 2]", " A=foo", " A =", " A=1 [m]", ' x "a'],
+)
+def test_text_that_is_no_comment_raises(rest: str) -> None:
+    """A missing # is reported; without the error, the annotations after it would be ignored."""
+    with pytest.raises(MsgError, match=r"line 2, column 2: expected a field, such as 'float32\[4\] q  # comment'"):
+        read_msg(f"uint64 timestamp\n float32{rest}\n")
+
+
+@pytest.mark.parametrize("annotation", ["[@range 0; 9]", "[@range 0, 9", "[@range]", "@range 0-9", "[@range 0, 9 m]"])
+def test_malformed_range_raises(annotation: str) -> None:
+    with pytest.raises(MsgError, match=r"line 2, column 1: malformed @range of x; expected limits, such as \[@range"):
+        define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # [m] {annotation}\n")
+
+
 @pytest.mark.parametrize("length", ["[x]", "[0]", "[-1]", "[1_0]", "[", "[2000]", "[<=3]"])
 def test_invalid_length_of_an_array_of_messages_raises(length: str) -> None:
     text = f"uint64 timestamp\nPart{length} parts\n===\nMSG: px4_msgs/Part\nbool flag\n"
@@ -128,6 +150,7 @@ def test_too_many_nested_fields_raise() -> None:
     "line",
     [
         "float32 angle 1.5", "float32 angle -.5e3 # the default", "float32[2] angle [1, 2]", "bool angle true",
+        "uint8 A = 0x1F # hexadecimal\nfloat32 angle", "string A = no quotes\nfloat32 angle", "char angle 'a'",
         'string FRAME="map"\nfloat32 angle', "string A = 'a # b'\nfloat32 angle", "float32 angle # \f form feed",
         "float32 angle # \u2028 line separator", "float32 angle # \x85 next line", "float32 angle\r\n",
     ],
@@ -144,11 +167,13 @@ def test_ros_2_syntax_is_accepted(line: str) -> None:
         "".join(f"uint8 f{number}\n" for number in range(19_000)),
         "uint8 a # @range" + " " * 200_000,
         "uint8 a # @range " + "9" * 200_000,
+        "uint8 a [" + "1, " * 80_000,
+        "uint8 a" + " " * 200_000 + "b",
         f"A[999] a{NESTED}A\nuint8 b #" + "@range " * 30_000,
         f"A[999] a{NESTED}A\nB[999] b{NESTED}B\n" + "".join(f"C[0] c{i}\n" for i in range(9000)) + f"{NESTED}C\nbool d",
         "A[999] " + "a" * 200_000 + f"{NESTED}A\nuint8 b",
     ],
-    ids=["fields", "spaces", "digits", "comment", "empty arrays", "long name"],
+    ids=["fields", "spaces", "digits", "list", "default", "comment", "empty arrays", "long name"],
 )
 def test_parsing_takes_linear_time(text: str) -> None:
     """Hostile texts of 200,000 characters are parsed or rejected within the time limit."""

@@ -131,7 +131,9 @@ class _Check:
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
         elif not self.ages and (self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)):
             states = ", ".join(f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self.sources)
-            what = "no vehicle is published" if self._vehicle is None else f"vehicle {self._vehicle} is not published"
+            others = sorted({each.vehicle for each in self._publishers} - {self._vehicle})[:20]
+            only = f" (published: {', '.join(others)})" if others and not self._is_refused else ""
+            what = f"vehicle {self._vehicle} is not published{only}" if self._vehicle else "no vehicle is published"
             yield f"{what}{_REFUSED if self._is_refused else f': {states[:300]}' if states else ''}"
         elif self.ages and min(self.ages.values()) > self._max_age:
             name = min(self.ages, key=lambda each: self.ages[each])
@@ -177,7 +179,7 @@ def doctor(
         str | None, typer.Option("--vehicle", "-v", help="Examine only this vehicle; also test the write permission")
     ] = None,
     mavlink: Annotated[
-        str | None, typer.Option(metavar="LINK", help="Also listen on a MAVLink link, such as udpin:0.0.0.0:14550")
+        str | None, typer.Option(metavar="LINK", help="Also listen on a MAVLink link, such as udpin:0.0.0.0:14540")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:

@@ -1,5 +1,6 @@
 """Links to MAVLink vehicles over UDP, TCP or a serial port, and checks of sender ids."""
 
+import errno
 import os
 import re
 import select
@@ -21,7 +22,7 @@ _MAX_READ: Final = 65535  # bytes
 _RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
-_FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
+_FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 
 
 class _UdpLink:
@@ -107,7 +108,8 @@ def open_link(text: str, *, baud: int) -> Link:
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
         reason = os.strerror(number).lower() if number and number > 0 else str(exc)
-        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason})") from exc
+        remedy = ": close the other program or use another port" * (number == errno.EADDRINUSE)
+        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason}){remedy}") from exc
 
 
 def _is_ready(file: Any, timeout: float) -> bool:

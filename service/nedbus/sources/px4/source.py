@@ -233,7 +233,7 @@ def _read_definitions(paths: str) -> Definitions:
                 text = _with_nested_messages(file)
                 definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
             except OSError as exc:
-                raise ConfigError(str(file), exc.strerror or str(exc), key="msg") from None
+                raise ConfigError(str(file), (exc.strerror or str(exc)).lower(), key="msg") from None
             except ValueError as exc:  # such as MsgError
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None

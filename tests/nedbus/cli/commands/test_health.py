@@ -100,7 +100,7 @@ def test_vehicle_option_checks_one_vehicle(endpoint: str, bus: nedbus.Bus, healt
         assert "ulog:/gone.ulg is retrying: " in health().err
         wait_for(lambda: health("--vehicle", "1").exit_code == 0, what="the simulated vehicle")
         assert health("--vehicle", "script", "--max-age", "60").exit_code == 0
-        assert "vehicle 9 is not published" in health("--vehicle", "9").err
+        assert "vehicle 9 is not published (published: 1, script): ulog:" in health("--vehicle", "9").err
         assert health("--vehicle", "a/b").exit_code == 2
 
 
@@ -123,8 +123,8 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
         result = health("--expect", "1,7, 8", "--vehicles", "3")
         assert (result.exit_code, result.out) == (1, "")
         assert result.err.splitlines() == [
-            "nedbus: vehicle 7 is missing: it has no publisher",
-            "nedbus: vehicle 8 is missing: it has no publisher",
+            "nedbus: vehicle 7 is missing: it has no publisher; published: 1",
+            "nedbus: vehicle 8 is missing: it has no publisher; published: 1",
             "nedbus: messages arrive from 1 of 3 vehicles: 1",
         ]
         publisher.publish(message(1, xy_valid=False))

@@ -248,6 +248,8 @@ def test_wait_option_waits_for_a_router(run_nedbus: Start) -> None:
         (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude (looks like a mis"),
         (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink has none of these topics"),
         (["schema", "vehicle_attitud"], "did you mean vehicle_attitude or VehicleAttitude?"),
+        (["echo", f"/px4_1/fmu/out/{VLP}"], f"expected {VLP}, without the ROS 2 prefix"),
+        (["echo", f"/fmu/out/{VLP}"], f"topic 'fmu/out/{VLP}' is not valid: expected {VLP}, without the ROS 2 prefix"),
         (["echo", "vehicle_attitude", "-t", VLP], "--topic: the argument already names the topic 'vehicle_attitude'"),
         (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),
         (["echo", "--once", "-n", "3"], "--count: cannot be combined with --once"),

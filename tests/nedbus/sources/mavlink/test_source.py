@@ -355,7 +355,7 @@ def test_serial_port_is_read_until_it_disappears() -> None:
 
 
 def test_port_in_use_raises(listener: Listener, port: int) -> None:
-    with pytest.raises(SourceError, match=r"cannot be opened \(address already in use\)"):
+    with pytest.raises(SourceError, match=r"\(address already in use\): close the other program or use another"):
         Listener(f"mavlink:udpin:127.0.0.1:{port}")
     assert not listener.rejections
 
@@ -364,8 +364,8 @@ def test_port_in_use_raises(listener: Listener, port: int) -> None:
     ("text", "reason"),
     [
         ("mavlink:", "write mavlink:LINK"),
-        ("mavlink:14550", "write udpin:0.0.0.0:14550"),
-        ("mavlink:udpin:0.0.0.0:99999", "write udpin:0.0.0.0:14550"),
+        ("mavlink:14540", "write udpin:0.0.0.0:14540"),
+        ("mavlink:udpin:0.0.0.0:99999", "write udpin:0.0.0.0:14540"),
         ("mavlink:udpin:0.0.0.0:14550?rate=0", "positions per second"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=1:a b", "SYSTEM_ID:VEHICLE"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=wing:1", "SYSTEM_ID:VEHICLE"),

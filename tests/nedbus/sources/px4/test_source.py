@@ -342,7 +342,7 @@ def test_invalid_msg_file_raises(tmp_path: Path, text: str, where: str, reason: 
     with pytest.raises(ConfigError, match=rf"{file}: {where}: .*{reason}"):
         parse_source(f"px4-zenoh:?msg={file}").open_source(vehicle="1")
     parse_source(f"px4-zenoh:?msg={tmp_path}").open_source(vehicle="1")
-    with pytest.raises(ConfigError, match=r"other\.msg: No such file"):
+    with pytest.raises(ConfigError, match=r"other\.msg: no such file"):
         parse_source(f"px4-zenoh:?msg={tmp_path},{tmp_path}/other.msg").open_source(vehicle="1")
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match=r"empty: no \.msg file in this folder"):
