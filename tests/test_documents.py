@@ -396,8 +396,8 @@ def test_reference_has_every_setting() -> None:
         assert all(f"| `{option}` |" in section for option in kind.options.model_fields)
 
 
-def test_reference_has_every_event_key_and_limit() -> None:
-    """The reference lists the events of logs and vehicles, topics, messages, and the limits named on the pages."""
+def test_reference_lists_events_topics_messages_and_limits() -> None:
+    """The reference lists the events of logs and vehicles, topics, messages, and limits such as the size of a queue."""
     events, keys, limits = events_page(), keys_page(), limits_page()
     assert all(f"| `{name}` | " in events for name in (*EVENTS, *KINDS))
     assert all(f"| `{name}` | " in keys for name in (*TOPICS, *MESSAGES))

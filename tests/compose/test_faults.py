@@ -35,7 +35,7 @@ def sent(sample: nedbus.Sample) -> int:
     return sample.sent
 
 
-def test_router_restart_is_recovered(make_stack: StartStack, record: Record) -> None:
+def test_clients_recover_from_router_restart(make_stack: StartStack, record: Record) -> None:
     """Both sides reconnect; `every` loses nothing, `latest` continues with the newest message, and counts are exact."""
     stack = make_stack("router")
     stack.up()

@@ -78,7 +78,7 @@ def test_counter_wrap_counts_as_one_reset() -> None:
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """After two resets between two messages, the delta covers only the last one, so the track is discontinued."""
+    """After two resets between two messages, the delta covers only the last one, so the track restarts."""
     _, second, third = track(
         at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
     )
@@ -88,8 +88,8 @@ def test_incomplete_delta_is_not_used() -> None:
     assert not third.discontinued
 
 
-def test_reset_without_delta_discontinues_the_track() -> None:
-    """A reset without a delta, as in old layouts and from some sources, discontinues the track."""
+def test_reset_without_delta_restarts_the_track() -> None:
+    """A reset without a delta, as in old layouts and from some sources, restarts the track."""
     _, second = track(at(1), at(2, heading=1.0, heading_reset_counter=1))
     assert second.discontinued == {"heading"}
 
@@ -137,8 +137,8 @@ def test_moved_origin_is_compensated(counted: int) -> None:
     assert (second.x, second.y, second.z) == pytest.approx((first.x + 0.1, 0.0, 0.0), abs=1e-3)
 
 
-def test_unexplained_jump_at_a_new_origin_discontinues_the_track() -> None:
-    """A jump explained neither by the delta nor by the origins is kept, and discontinues the track."""
+def test_unexplained_jump_at_a_new_origin_restarts_the_track() -> None:
+    """A jump explained neither by the delta nor by the origins is kept, and restarts the track."""
     _, second = track(at(1), at(2, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
     assert second.discontinued == {"xy"}
     assert second.x == 500.0

@@ -107,7 +107,7 @@ class WritePermission:
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
                 "the router refuses messages of %s, so they reach no reader: check that its access rules allow them for"
-                " the certificate %s ('nedbus pki rules', docs/security.md); the check is repeated",
+                " the certificate %s ('nedbus pki rules', docs/security.md); nedbus probes again every minute",
                 _list_vehicles(new),
                 self._tls.certificate,
                 extra=about("access_denied"),

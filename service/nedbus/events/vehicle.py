@@ -317,7 +317,7 @@ class Vehicle:
         self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
     def _is_flapping(self, event: Event) -> bool:
-        """Return True if such events are too frequent to report them all; `settle` then reports the last one."""
+        """Count an event; return True if its kind is too frequent to report each one; `settle` reports the last one."""
         keys = ((event.kind, event.names), (event.kind, None))  # flags of a kind may change in any combination
         limits = [*zip(keys, FLAPPING_CHANGES, strict=True)][keys[1] in self._suppressed :]
         for key, limit in [(keys[1], MAX_SINGLE)] if event.change == "once" else limits:

@@ -25,7 +25,7 @@ _SPARE: Final = 16  # slots in the channel beyond one probe per vehicle
 def probe_writes(
     reader: Session, writer: Session, vehicles: Collection[str], *, prefix: str, timeout: float = 1.0
 ) -> dict[str, Verdict]:
-    """Return for each vehicle whether `writer` may publish it; "unknown" if `reader` may not subscribe.
+    """Return for each vehicle whether `writer` may publish it; "unknown" if `reader` is not allowed to subscribe.
 
     `timeout`: time for the router to announce the subscriber, and again for an allowed message to arrive [s].
     """

@@ -76,7 +76,7 @@ class Origin:
     projection: MapProjection | None = None
 
     def locate(self, message: VehicleLocalPosition, missing: frozenset[str] = frozenset()) -> Position:
-        """Return the position in a message, NaN where invalid; validity flags in `missing` are unknown."""
+        """Return the position in a message, NaN where invalid; a validity flag in `missing` counts as valid."""
         position = to_global(message)
         north, east = message.x, message.y
         if position:

@@ -78,7 +78,7 @@ def test_clock_set_back_is_accepted_within_two_minutes() -> None:
     assert 0 < steps.count(False) <= 2 * DRIFT / SECOND * 10
 
 
-def test_stalled_zenoh_timestamps_are_current() -> None:
+def test_samples_with_stalled_zenoh_timestamps_are_current() -> None:
     """Zenoh's timestamps never decrease: if a clock is set back, they stall, and all samples are current."""
     late = LateFilter()
     admitted(late, *((each / 100, each / 100) for each in range(200)))

@@ -173,7 +173,7 @@ def test_watchdog_is_not_sent_without_ticks(systemd: Systemd) -> None:
 
 
 def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event, threading.Event]:
-    """Block sources in a method of their output; return an event set when one blocks, and one that releases all."""
+    """Block sources in a method of their output; return two events: one is set on entry, the other releases all."""
     entered, opened = threading.Event(), threading.Event()
     original = getattr(SourceOutput, method)
 

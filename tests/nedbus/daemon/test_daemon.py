@@ -139,7 +139,7 @@ def test_replay_at_full_speed_is_lossless_for_a_slow_reader(tmp_path: Path, serv
 
 
 def test_replay_keeps_order_and_speed(tmp_path: Path, serve: Serve) -> None:
-    """At speed=10 a flight of 4 s takes about 0.4 s, never less; with wait=1 it starts with the first subscriber."""
+    """At speed=10 a flight of 4 s takes 0.36 s or more, and with wait=1 it starts with the first subscriber."""
     path = write_log(tmp_path / "a.ulg", range(0, 4_000_001, 100_000))
     service, bus = serve("--until-done", "-s", f"ulog:{path}?speed=10&wait=1")
     wait_for(has_state(bus, "waiting"), what="the service")

@@ -307,7 +307,7 @@ def test_no_fix_in_the_first_message_is_info(flight: Flight) -> None:
     assert brief(flight.gps()) == [("gps_fix_lost", "end", "info"), ("few_satellites", "end", "info")]
 
 
-def test_flags_changed_in_one_message_are_one_event(flight: Flight) -> None:
+def test_flags_of_a_kind_set_in_one_message_are_one_event(flight: Flight) -> None:
     """Flags of one kind that are set in one message are one event that names them; each flag ends separately."""
     names = ["reject_hor_pos", "reject_hor_vel", "fs_bad_hdg", "cs_baro_fault", "cs_gnss_pos", "cs_baro_hgt"]
 

@@ -249,8 +249,8 @@ def test_other_hosts_are_not_checked() -> None:
     assert len(faults_of([report(silent, host="this")], NOTHING, only="this")) == 1
 
 
-def test_invalid_flags_are_one_fault_since_the_first() -> None:
-    """The invalid flags of a vehicle are one fault since the first of them, not since an earlier failsafe."""
+def test_invalid_flags_form_one_fault_from_the_first_on() -> None:
+    """Invalid flags of a vehicle form one fault, which begins with the first of them, not with an earlier failsafe."""
     flight = Flight()
     flight.send()
     flight.status(ARMED, failsafe=True)

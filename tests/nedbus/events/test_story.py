@@ -118,7 +118,7 @@ def test_active_watch_condition_is_a_story_after_ended_fault() -> None:
 
 
 def test_condition_without_begin_event_is_a_story() -> None:
-    """A condition without a begin event is active since its recorded start, or since the first message."""
+    """A condition without a begin event is active from its recorded start, or from the first message on."""
     flight = Flight()
     flight.send(z_valid=False)
     flight.wait(2.0).send(z_valid=False, xy_valid=False)

@@ -221,7 +221,7 @@ def test_only_primary_ekf_has_conditions(vehicle: SimpleVehicle) -> None:
     assert vehicle.state(4.0) == "info"
 
 
-def test_fault_of_other_ekf_is_info_with_its_instance(vehicle: SimpleVehicle) -> None:
+def test_fault_of_non_primary_ekf_is_info(vehicle: SimpleVehicle) -> None:
     """A fault of a non-primary EKF has severity "info" and is no evidence; once the EKF is primary, it is a fault."""
     for time, primary, rejects in ((0.0, 0, False), (1.0, 0, True), (2.0, 1, True), (3.0, 0, True)):
         vehicle.send(time, "estimator_status_flags", 1, reject_hor_pos=rejects)

@@ -220,7 +220,7 @@ def test_verdict_is_limited_to_vehicle_and_time() -> None:
 
 
 def test_verdict_on_never_valid_vehicle_quotes_px4() -> None:
-    """If a fault is active since the first message, PX4's most severe text is evidence, however late it appears."""
+    """If a fault has been active since the first message, PX4's most severe text is evidence, however late it is."""
     flight = Flight()
     flight.send(xy_valid=False)
     px4_text(flight, "Preflight Fail: GPS Vertical Pos Drift too high", 4)

@@ -139,7 +139,7 @@ def test_fields_select_the_columns() -> None:
         nedbus.align(flight, fields=["zz"])
 
 
-def test_rate_covers_the_flight() -> None:
+def test_rows_at_a_fixed_rate_span_the_flight() -> None:
     """A rate returns evenly spaced rows from the first to the last message; invalid rates and too many rows raise."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME}, on=20)
     assert table["timestamp"].tolist() == list(range(1_000_000, 1_400_001, 50_000))

@@ -131,7 +131,7 @@ def test_altitude_plot_marks_only_z_and_vz_resets() -> None:
 
 
 def test_events_are_marked_by_severity() -> None:
-    """A condition is a bar from start to end; the shape of a mark is its severity."""
+    """A condition is drawn as a bar from start to end; the shape of a marker shows its severity."""
     lost = event_of("gps_fix_lost", "begin", "watch", 4.0, text="GPS fix lost: 3D to none")
     events = [
         event_of("mode", "once", "info", 2.0, names=("Hold", "Mission")),

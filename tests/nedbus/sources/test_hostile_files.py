@@ -139,7 +139,7 @@ def test_hostile_recording_is_read_within_limits(start: Start, tmp_path: Path, k
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nested", "topics", "instances"])
 def test_service_ends_after_hostile_log(run_nedbus: Start, endpoint: str, tmp_path: Path, kind: str) -> None:
-    """A service publishes the messages of a hostile log that it can decode, and exits with 1."""
+    """A service publishes the decodable messages of a hostile log, and exits with 1."""
     (tmp_path / "hostile.ulg").write_bytes(ULOGS[kind]())
     service = run_nedbus("serve", "-s", f"ulog:{tmp_path}/hostile.ulg?topics=*", "-c", endpoint, "--until-done")
     assert service.wait() == 1

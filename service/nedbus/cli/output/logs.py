@@ -152,7 +152,7 @@ class RateLimit(logging.Filter):
 
 
 class _StderrHandler(logging.StreamHandler[TextIO]):
-    """Write to the current `sys.stderr`: a live table replaces it, to stay below the log."""
+    """Write to the current `sys.stderr`, which `live_table` replaces to print log lines above the table."""
 
     def emit(self, record: logging.LogRecord) -> None:
         self.setStream(sys.stderr)

@@ -18,7 +18,7 @@ from .table import COLUMN_GAP, fit_columns, terminal_width
 _TIMES: Final = ("timestamp", "timestamp_sample")
 _DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
-_MIN_PAGE: Final = 10  # minimum number of lines between two headings
+_MIN_PAGE: Final = 10  # minimum number of lines between two headers
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
 _ADDRESS, _POSITION, _STATE = "VEHICLE/TOPIC", f"{'X m':>7} {'Y m':>7} {'Z m':>7}", "STATE"
 _VELOCITY, _HEADING, _EPH = f"{'VX m/s':>6} {'VY m/s':>6} {'VZ m/s':>6}", "HDG deg", "EPH m"
@@ -43,19 +43,19 @@ def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38)
 
 
 class Lines:
-    """Format samples as lines; on a terminal in columns, with a heading per screenful and when the columns change.
+    """Format samples as lines; on a terminal in columns, with a header per screenful and when the columns change.
 
     A narrow terminal omits eph, then heading, then velocity, but never position, doubtful flags or loss.
-    If stdout is not a terminal, lines are complete and have no heading.
+    If stdout is not a terminal, lines are complete and have no header.
     """
 
     def __init__(self) -> None:
         self._widths: dict[str, int] = {}
         self._head = ""
-        self._lines_left = 0  # before the next heading
+        self._lines_left = 0  # before the next header
 
     def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
-        """Return the line of a sample, preceded by a heading if one is due."""
+        """Return the line of a sample, preceded by a header if one is due."""
         width, message = terminal_width(), sample.message
         if width is None:
             return to_line(sample, fields)

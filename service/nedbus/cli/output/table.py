@@ -81,7 +81,7 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
 
 @contextmanager
 def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callable[[Rows], None]]:
-    """Yield a function that shows rows; on a terminal it replaces the previous rows, below the log."""
+    """Yield a function that prints rows; on a terminal, each call redraws the table in place, below the log lines."""
     if terminal_width() is None:
         yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=_MAX_ROWS))
         return

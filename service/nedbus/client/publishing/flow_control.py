@@ -50,7 +50,7 @@ class SharedWindow:
 
 
 class ReaderProxies:
-    """The readers of a publisher, matched or away until a deadline; closed readers are removed. No I/O."""
+    """A publisher's readers: matched, or disconnected and awaited until a deadline; closed ones are removed. No I/O."""
 
     def __init__(self) -> None:
         self._matched: set[str] = set()

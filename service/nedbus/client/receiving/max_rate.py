@@ -1,6 +1,6 @@
 """Subscription with a maximum rate: last messages first, then the streams downsampled by publishers.
 
-If a publisher does not downsample, a warning is logged; the full rate is never used, because the link may not carry it.
+If a publisher does not downsample, a warning is logged; the full rate is never used: it could overload the link.
 """
 
 import logging

@@ -306,7 +306,7 @@ class PendingQueue:
         return stream
 
     def _evict(self, now: float) -> None:
-        """Evict silent keys above KEPT_KEYS and, at MAX_KEYS, the least recently active, keys with a gap last."""
+        """Evict silent keys above KEPT_KEYS, and the least recently active at MAX_KEYS; keys with requests are last."""
         order = self._by_activity
         while len(order) >= MAX_KEYS or (len(order) >= KEPT_KEYS and order[0][0] < now - MAX_SILENCE):
             since, key = order[0]

@@ -235,7 +235,7 @@ class StreamRegistry:
         return "" if options.topics else f"{name} on {topic}" if is_known else name
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
-        """Return the vehicle of the namespace, else that of the domain joined with the namespace, else the default."""
+        """Return the namespace's vehicle, else the domain's or `domain<N>` and the namespace, else the default."""
         vehicles = self._options.vehicles
         if namespace in vehicles:
             return vehicles[namespace]

@@ -31,7 +31,7 @@ def passes(*arguments: object) -> bool:
 
 
 def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
-    """Each setting and list item is checked even if others are wrong. Of each source, the first mistake is reported."""
+    """Settings and list items are all checked, even if some are invalid; only a source's first mistake is reported."""
     file, closed = tmp_path / "nedbus.toml", free_endpoint()
     file.write_text(
         'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\n'

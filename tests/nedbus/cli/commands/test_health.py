@@ -166,7 +166,7 @@ def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: H
 
 
 def test_silent_vehicle_is_a_fault(endpoint: str, health: Health) -> None:
-    """By default every silent vehicle is a fault; --expect and --vehicle restrict the check to other vehicles."""
+    """Every silent vehicle is a fault; --expect and --vehicle restrict the check to the vehicles they name."""
     with serving(endpoint, "sim:") as daemon:
         wait_for(lambda: health().exit_code == 0, what="health")
         daemon.event_log.add(Address("2", VLP), message(1, **VALID), time.time() - 100)

@@ -121,16 +121,16 @@ def test_narrow_terminal_removes_columns_in_order(lines: Callable[[int], Lines])
     assert seen == [[*most[:count], "STATE"] for count in (4, 3, 2, 1)]
 
 
-def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
-    """The heading is repeated once per screenful and when the columns change, and every state is below STATE."""
-    to_line, with_heading, state = lines(150), [], 0
+def test_header_is_aligned_with_its_columns(lines: Callable[[int], Lines]) -> None:
+    """The header is repeated once per screenful and when the columns change, and every state is below STATE."""
+    to_line, with_header, state = lines(150), [], 0
     for number in range(80):
         *head, line = to_line(sample(nedbus.Address("1" if number < 40 else "wing", VLP))).splitlines()
         if head:
-            with_heading.append(number)
+            with_header.append(number)
             state = head[0].index("STATE")
         assert line.index("z vxy vz unknown") == state
-    assert with_heading == [0, 22, 40, 62]
+    assert with_header == [0, 22, 40, 62]
     of_fields = lines(150)(sample(nedbus.Address("1", VLP)), ["x", "eph"]).splitlines()
     assert of_fields[0].split() == ["VEHICLE/TOPIC", "TIME", "s", "x", "eph", "STATE"]
 
@@ -195,7 +195,7 @@ def publishing(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)
 
 @pytest.mark.process
 def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus) -> None:
-    """At 80 columns a message is one line below a heading, with complete addresses in one column."""
+    """At 80 columns a message is one line below a header, with complete addresses in one column."""
     with publishing(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
         assert terminal.wait() == 0
     shown = [line for line in terminal.output.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
@@ -327,7 +327,7 @@ def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, t
 
 
 def answer(zenoh_session: Session, key: str, status: object) -> object:
-    """Answer queries for a status like a malicious service."""
+    """Reply to queries of a service's status with the given status, which may be malicious."""
     return zenoh_session.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
 
 

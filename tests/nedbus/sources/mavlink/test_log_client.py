@@ -204,7 +204,7 @@ def test_start_waits_for_disarming() -> None:
     assert session.client.status.state == "streaming"
 
 
-def test_log_armed_starts_in_flight() -> None:
+def test_log_option_armed_starts_stream_in_flight() -> None:
     session = Session("armed", armed=True)
     session.start()
     assert session.client.status.state == "streaming"
