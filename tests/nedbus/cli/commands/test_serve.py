@@ -27,7 +27,7 @@ def wait_for_message(endpoint: str) -> None:
 
 
 def test_suggested_commands_for_wildcard_address_use_loopback(run_nedbus: Start) -> None:
-    """For a service that listens on 0.0.0.0, the suggested commands name 127.0.0.1, and work."""
+    """For a service that listens on a wildcard address, the suggested commands name a loopback address, and work."""
     port = free_port()
     service = run_nedbus("serve", "--listen", f"tcp/0.0.0.0:{port}", "-s", "sim:")
     wait_for(lambda: " all fields" in service.err, what="the hint")
@@ -35,3 +35,4 @@ def test_suggested_commands_for_wildcard_address_use_loopback(run_nedbus: Start)
     assert here == f"tcp/127.0.0.1:{port}"
     wait_for_message(here)
     assert " list  published" in suggested_commands(["tcp/0.0.0.0:7447"])
+    assert " list -c tcp/[::1]:7448  published" in suggested_commands(["tcp/[::]:7448"])
