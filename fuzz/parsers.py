@@ -240,7 +240,7 @@ def frames(data: bytes) -> Iterator[bytes]:
 
 
 class _EndOfInput(Exception):  # noqa: N818 - not an error
-    """Ends the thread of the receiver."""
+    """End the thread of the receiver."""
 
 
 class _Link:

@@ -5,7 +5,7 @@ speed without loss, then at 1 kHz and at 100 Hz; some also with ten vehicles in 
 other flights.
 Machines are shared and noisy: rounds are interleaved, medians are reported, and only ratios within one run are
 meaningful. Other libraries are installed in virtual environments under build/bench; failures are reported.
-A complete run is written to docs/explanation/performance.json and, as tables, to its page and the README; partial
+A complete run is written to docs/explanation/performance.json and, as tables, to performance.md and the README; partial
 results, such as those of `--forms raw models --loads 1kHz --flights "no origin"`, are only printed.
 """
 

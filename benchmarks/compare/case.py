@@ -1,4 +1,4 @@
-"""Parameters of one run of a form."""
+"""Parameters of one benchmark run of one compared library or API."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Output of the results: performance.json, two tables for its page, and four rows for the README."""
+"""Write the results: performance.json, two tables in performance.md, and four rows in the README."""
 
 from __future__ import annotations
 

@@ -252,7 +252,7 @@ class Monitor:
         self._streams: dict[Address, StreamHealth] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample and return True, unless it is retained. `received`: arrival time on another clock [ns]."""
+        """Add a sample; return False if it is retained. `received`: arrival time [ns], by default on `monotonic_ns`."""
         if sample.retained:
             return False
         if received is None:  # not the time of reading: a reader that starts or lags would show a higher rate

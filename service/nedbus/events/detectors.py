@@ -49,7 +49,7 @@ class Finding:
 
 
 Detect = Callable[[Fields, Fields], Iterator[Finding]]
-"""Yields findings from the fields of the previous message ({} for the first one) and of the current message."""
+"""Yield findings from the fields of the previous message ({} for the first one) and of the current message."""
 Detection = tuple[Sequence[str], Sequence[str], Detect]
 """Fields whose changes trigger the function, other fields that it needs, and the function."""
 

@@ -24,11 +24,11 @@ _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition, and the kinds of all.
+    """State of one vehicle: severity ("info" if healthy), text and start of the worst condition.
 
     `flags`: position validity flags that are false, with their start times if known. `topics`: published topics.
     `has_position`: it publishes a position. `held`: active conditions whose start is not among the events.
-    `unknown`: flags that its position does not provide.
+    `unknown`: flags that its position does not provide. `kinds`: kinds of all active conditions.
     """
 
     severity: Literal["bad", "watch", "info"]

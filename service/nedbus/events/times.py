@@ -98,7 +98,7 @@ class Times:
 
 
 def unit_of(clock: str) -> str:
-    """Return the unit of a clock's times: UTC, or s with its epoch."""
+    """Return the unit of a clock's times: "UTC", or seconds with their epoch, such as "s since boot"."""
     return CLOCKS[clock].partition(",")[0].replace("seconds", "s")
 
 

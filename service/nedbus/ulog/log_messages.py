@@ -161,7 +161,7 @@ class RateLimit:
 
 
 class LogMessageBuilder:
-    """Adds `log_message` messages to the records of a log or a stream.
+    """Add `log_message` messages to the records of a log or a stream.
 
     A logged string with a trailing tab repeats an event that was logged before it in more detail, and is dropped.
     PX4 reports all failed checks when one changes: only new ones become messages, with severity info if they do not

@@ -48,7 +48,7 @@ class _Inspection(NamedTuple):
 
 
 class UlogParser:
-    """Parses a ULog in chunks of any size; memory is limited to one chunk, the definitions, and 256 KiB.
+    """Parse a ULog in chunks of any size; memory is limited to one chunk, the definitions, and 256 KiB.
 
     `verify`: return a message only if a valid record follows it, and resynchronise after damage; for files, which have
     no checksums. Without it, the lengths are trusted; for transports with checksums.

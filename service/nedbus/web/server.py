@@ -133,7 +133,7 @@ class LiveFleet(Exporter):
 class WebServer:
     """Server of the Bokeh page and of text pages by path.
 
-    Rejects cross-site requests and DNS rebinding by other sites in the same browser: the Host header must be a name
+    It rejects cross-site requests and DNS rebinding by other sites in the same browser: the Host header must be a name
     that such a site cannot control, as for `HttpServer`, or one of `options.origins`.
 
     Raises ListenError if the address is not available.

@@ -40,7 +40,7 @@ _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s 
 
 
 class Viewer:
-    """One page in one browser; `update` sends changes of the fleet ten times a second.
+    """One page in one browser; `update`, called ten times a second, sends it the changes to the fleet.
 
     `timeline`: the events; `player`: playback of a recording, None for live vehicles.
     The URL always contains the selected vehicle, moment, view and theme, so it can be shared.

@@ -759,8 +759,8 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 @given(STEPS)
 @example([("send", {"xy_valid"}), ("send", set()), ("lose", 1), *[("send", set()), ("send", {"xy_valid"})] * 2])
-def test_begins_and_ends_of_conditions_are_consistent(steps: list[tuple[str, Any]]) -> None:
-    """For any messages, an end follows a begin or, at most once since boot, an initial condition.
+def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
+    """For any messages, each end event follows a begin event or, at most once since boot, an initial condition.
 
     The last event of flapping may repeat an end, if an even number of changes was suppressed.
     No condition ends before it began, and evidence precedes the event.
@@ -772,7 +772,7 @@ def test_begins_and_ends_of_conditions_are_consistent(steps: list[tuple[str, Any
     for _ in range(3):  # reports ended flapping and losses
         flight.wait(20.0).update()
     begun: dict[tuple[str, str], Event] = {}
-    initial: set[tuple[str, str]] = set()  # ended without a begin, which is possible once
+    initial: set[tuple[str, str]] = set()  # ended without a begin event, which is possible once
     for event in sorted(flight.event_log.events, key=lambda each: each.time):
         assert event.kind in KINDS
         assert all(each.time <= event.time for each in event.evidence)

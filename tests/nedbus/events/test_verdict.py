@@ -244,8 +244,8 @@ def test_verdict_counts_equal_faults() -> None:
     )
 
 
-def test_short_evidence_is_the_lost_fix_not_its_effect() -> None:
-    """Where there is room for only a part of the evidence, a sensor's event precedes those of the estimator."""
+def test_shortened_evidence_prefers_sensor_events() -> None:
+    """If only part of the evidence fits, events of sensors precede those of the estimator."""
     flight = Flight()
     for _ in range(3):
         flight.gps()

@@ -198,8 +198,8 @@ def test_position_replaces_other_streams_at_the_limit(sim: SimulatedFleet, monke
     assert sim.stream().minute.written
 
 
-def test_status_values_come_from_other_messages(sim: SimulatedFleet) -> None:
-    """Mode, arming, battery and GPS come from other topics; an unknown charge or a second battery is not shown."""
+def test_mode_arming_battery_and_gps_are_shown(sim: SimulatedFleet) -> None:
+    """Mode and arming come from `vehicle_status`, charge from the first battery if known, and GPS from the fix."""
 
     def status() -> list[str]:
         return [fact.text for fact in sim.vehicle().status.values()]
@@ -274,8 +274,8 @@ def test_reset_adds_a_gap_to_the_history(sim: SimulatedFleet) -> None:
     assert stream.minute.written == written + 4
 
 
-def test_history_has_ten_points_per_second(sim: SimulatedFleet) -> None:
-    """At 100 Hz the history covers a minute with every flag change; the long history has about one point per second."""
+def test_histories_have_ten_points_and_one_point_per_second(sim: SimulatedFleet) -> None:
+    """The minute history has ten points per second, plus one per flag change; the long history has about one."""
     sim.fly(2, rate=100)
     minute, long = sim.stream().minute, sim.stream().long
     assert 18 <= minute.written <= 22

@@ -50,7 +50,7 @@ def cert(
 @command
 def enroll(
     folder: FolderArgument,
-    vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Vehicle id, the second chunk of its keys")],
+    vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Vehicle id, the second part of its Zenoh keys")],
     *,
     router: Annotated[list[str], typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="Router; repeatable")],
     output: Annotated[

@@ -33,7 +33,7 @@ _FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three r
 
 
 class PublisherRegistry:
-    """Creates the publishers of a session, one per address, and replies to queries for their last messages.
+    """Create the publishers of a session, one per address, and reply to queries for their last messages.
 
     `is_client`: the session is a client, and reaches readers through a router.
     """

@@ -28,7 +28,7 @@ Reply = Callable[[zenoh.Query], object]
 
 
 class QueryServer:
-    """Replies to queries on key expressions of a session; close it before the session."""
+    """Reply to queries on key expressions of a session; close it before the session."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

@@ -21,7 +21,7 @@ HEARTBEAT: Final = _PAUSES[0] + 2 * TICK  # maximum time [s] until readers detec
 
 
 class Writer:
-    """Puts payloads of one topic on one key, with a history cache of `cache` messages."""
+    """Put payloads of one topic on one key, with a history cache of `cache` messages."""
 
     def __init__(
         self, heartbeats: Heartbeats, key: str, topic: Topic, *, cache: int, encoding: str | None = None
@@ -73,7 +73,7 @@ class Writer:
 
 
 class Heartbeats:
-    """Sends the heartbeats of all writers of a session; without readers they cause no traffic."""
+    """Send the heartbeats of all writers of a session; without readers they cause no traffic."""
 
     def __init__(self, session: Session) -> None:
         self.session = session

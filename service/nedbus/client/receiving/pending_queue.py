@@ -356,7 +356,7 @@ class PendingQueue:
 
     def _accept(self, arrivals: list[Arrival], *, overflowed: bool) -> None:
         """Order arrivals, count gaps and queue what can be delivered; `overflowed`: the ring was full."""
-        if len(arrivals) >= _MIN_IN_ORDER and self._are_in_order(arrivals):
+        if len(arrivals) >= _MIN_IN_ORDER and self._accept_in_order(arrivals):
             self.counters.delivered += arrivals
             self._queue()
             return
@@ -392,8 +392,8 @@ class PendingQueue:
             self.give_up(MAX_HELD)
         self._queue()
 
-    def _are_in_order(self, arrivals: list[Arrival]) -> bool:
-        """Return whether a batch continues one key's last publisher without a gap; if so, advance its `expected`."""
+    def _accept_in_order(self, arrivals: list[Arrival]) -> bool:
+        """Advance `expected` and return True if a batch continues the sequence of a key's writer without a gap."""
         stream, info = arrivals[0][0], arrivals[-1][2].source_info
         writer = stream.writer
         if writer is None or info is None or writer.request is not None or stream.gap:
@@ -406,8 +406,7 @@ class PendingQueue:
         infos = [raw.source_info for _, _, raw, _, _ in arrivals]
         if [info and info.source_sn for info in infos] != list(range(writer.expected, stop)):
             return False
-        writer.expected = stop
-        stream.last_active = self._clock()
+        writer.expected, stream.last_active = stop, self._clock()
         return True
 
     def _add_writer(self, stream: KeyState, name: str, expected: int, *, history_end: int) -> WriterProxy | None:

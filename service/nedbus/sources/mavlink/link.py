@@ -127,7 +127,7 @@ def ignore_reason(system: int, component: int) -> str:
 
 
 class DuplicateIds:
-    """Detects system ids with two senders, whose messages arrive alternately from two addresses."""
+    """Detect system ids with two senders, whose messages arrive alternately from two addresses."""
 
     def __init__(self) -> None:
         self._changes: defaultdict[int, deque[tuple[Peer, float]]] = defaultdict(lambda: deque(maxlen=_CHANGES))

@@ -71,7 +71,7 @@ class Command(NamedTuple):
 
 
 class LogStreamClient:
-    """Requests the stream, acknowledges it, and detects its end, which PX4 does not announce.
+    """Request the stream, acknowledge it, and detect its end, which PX4 does not announce.
 
     Pass every event to its method, call `tick` several times a second, and send the returned commands at once.
     Log `status` when it changes; repeated attempts with the same outcome do not change it.

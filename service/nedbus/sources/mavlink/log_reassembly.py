@@ -37,7 +37,7 @@ class Chunk(NamedTuple):
 
 
 class Reassembly:
-    """Reassembles the successive ULog streams of one vehicle since its boot.
+    """Reassemble the successive ULog streams of one vehicle since its boot.
 
     After a reboot create a new instance, because the header may have the same bytes as before.
     A lost message contains at most 249 bytes; each gap loses at least one ULog record.

@@ -37,7 +37,7 @@ class LogStream:
     """ULog stream of one vehicle, used on the thread of the source; `client` is used on the thread of the link."""
 
     def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
-        self._name, self._client = name, client
+        self._name, self._client, self._extra = name, client, about("log_stream", Address(name, DEFAULT_TOPIC))
         self._topics = options.chosen_topics
         self._folder = Path(options.save).expanduser() if options.save else None
         self._file: LogFile | None = None
@@ -119,7 +119,7 @@ class LogStream:
 
     def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
-        status, address = self._client.status, Address(self._name, DEFAULT_TOPIC)
+        status = self._client.status
         if not self.is_streaming:
             self._streamed.clear()
         if status[:2] == self._logged[:2]:
@@ -128,9 +128,9 @@ class LogStream:
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
             text = f"the log on the SD card lacks the {header:.1f} s in which the header was sent"
-            _log.info("vehicle %s: receiving the ULog stream; %s", self._name, text, extra=about("log_stream", address))
+            _log.info("vehicle %s: receiving the ULog stream; %s", self._name, text, extra=self._extra)
         elif status.reason is not None:
-            extra = about("log_stream", address, reason=status.text)
+            extra = about("log_stream", Address(self._name, DEFAULT_TOPIC), reason=status.text)
             _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
@@ -196,7 +196,7 @@ class LogStream:
         try:
             if chunk.begins and self._folder is not None:
                 self._file = LogFile(self._folder, self._name)
-                _log.info("%s: saving the ULog stream to %s", self._name, self._file.path, extra=about("log_stream"))
+                _log.info("vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=self._extra)
             if self._file is not None:
                 if chunk.lost:
                     self._file.mark_gap(now - (self._last_chunk or now))
@@ -204,7 +204,8 @@ class LogStream:
         except OSError as exc:
             error = OutputError(self._file.path if self._file else Path(exc.filename), exc)
             self.close()
-            _log.error("%s: stopped saving the ULog stream; %s", self._name, error, extra=about("log_stream"))
+            extra = about("log_stream", Address(self._name, DEFAULT_TOPIC), reason=str(error))
+            _log.error("vehicle %s: stopped saving the ULog stream: %s", self._name, error, extra=extra)
 
 
 class LogFile:

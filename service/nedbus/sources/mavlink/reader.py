@@ -41,7 +41,7 @@ class Received(NamedTuple):
 
 
 class LinkReader:
-    """Parses the MAVLink messages of a link."""
+    """Parse the MAVLink messages of a link."""
 
     def __init__(self, link: Link, *, name: str) -> None:
         self._link, self.name = link, name
@@ -92,7 +92,7 @@ class _Vehicle:
 
 
 class LogReceiver:
-    """Reads a link on a dedicated thread, which acknowledges PX4's log stream even while publishing blocks.
+    """Read a link on a dedicated thread, which acknowledges PX4's log stream even while publishing blocks.
 
     `send`: sends a MAVLink message to a peer, without blocking. `vehicles`: by system id, from the first heartbeat on.
     """

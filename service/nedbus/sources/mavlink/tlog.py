@@ -27,7 +27,7 @@ _SIGNATURE: Final = 13  # bytes
 
 
 class TlogReader:
-    """Reads the messages of all autopilots in a .tlog; `due` is the host's time since the first frame [s]."""
+    """Read the messages of all autopilots in a .tlog; `due` is the host's time since the first frame [s]."""
 
     def __init__(self, path: Path, topics: Collection[str] | None = None, *, vehicle: str | None = None) -> None:
         self._path, self._options, self._vehicle = path, MavlinkOptions(topics=tuple(topics or ())), vehicle

@@ -261,7 +261,7 @@ def _validity(bits: int) -> dict[str, object]:
 
 
 class _StatusTexts:
-    """Joins the STATUSTEXT chunks of one vehicle."""
+    """Join the STATUSTEXT chunks of one vehicle."""
 
     def __init__(self) -> None:
         self._current = (0, 0)  # severity and id of the incomplete text

@@ -242,7 +242,7 @@ def _read_definitions(paths: str) -> Definitions:
             found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
     if skipped:
         extra = about("damaged", source="px4-zenoh")
-        _log.info("px4-zenoh: skipped unsupported messages in %s: %.2000s", paths, ", ".join(skipped), extra=extra)
+        _log.info("px4-zenoh: skipped unsupported definitions in %s: %.2000s", paths, ", ".join(skipped), extra=extra)
     return found
 
 

@@ -92,7 +92,7 @@ class Px4Stream:
         return {(session, node) for session, node in every if not node.startswith("nedbus_")}
 
     def is_silent(self, now: float) -> bool:
-        """Return whether messages are overdue; never for topics without a nominal rate, which are sent on events."""
+        """Return whether messages are overdue; never for topics without a nominal rate, which may pause."""
         rate = get_topic(self.address.topic).rate if self.unsupported is None else 0.0
         return rate > 0 and now - max(self.since, self.last_message) >= max(_SILENCE, _SILENCE / rate)
 

@@ -137,7 +137,7 @@ def test_missing_expected_vehicles_are_faults(endpoint: str, bus: nedbus.Bus, he
         ]
 
 
-def test_valid_and_within_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
+def test_valid_and_within_options_report_faults(endpoint: str, tmp_path: Path, health: Health) -> None:
     """--valid checks current flags and --within past events; stderr has one line per fault, and --json lists all."""
     writer = UlogWriter()
     writer.define([VLP])

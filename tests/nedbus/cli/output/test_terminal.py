@@ -473,7 +473,7 @@ app(["serve", "-s", "sim:", "-l", sys.argv[1]])
 
 
 def test_interrupt_during_a_slow_start_exits_with_130(start: Start) -> None:
-    """Ctrl-C while a router opens slowly exits with 130, even if that takes longer than the timeout for closing."""
+    """Ctrl-C during a slow router start exits with 130, even if the start takes longer than the close timeout."""
     service = start("-c", SLOW, free_endpoint(), coverage=False)
     wait_for(lambda: "opening" in service.out, what="the service to open its router")
     service.signal(signal.SIGINT)

@@ -9,7 +9,7 @@ from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly, Verdict
 
 
 class CountingReassembly(Reassembly):
-    """Counts messages per verdict, and also lost messages, delivered bytes and bytes skipped after a gap."""
+    """Count messages per verdict, and also lost messages, delivered bytes and bytes skipped after a gap."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -438,7 +438,7 @@ class TestSilence:
         assert "stop" not in session.commands
 
     def test_ended_stream_restarts_within_seconds(self, session: Session) -> None:
-        """If PX4 accepts START, the old stream is over and a new one begins with sequence number 0."""
+        """START is sent after 1 s without data; if PX4 accepts it, a new stream begins with sequence number 0."""
         session.start()
         session.wait(1.2)
         session.answer(START, ACCEPTED)
@@ -447,8 +447,8 @@ class TestSilence:
         session.stream()
         assert session.states[-3:] == [("starting", "silent"), ("header", None), ("streaming", None)]
 
-    def test_silence_without_answer_ends_stream(self, session: Session) -> None:
-        """Without data and without an answer to START the stream has ended; START is retried later."""
+    def test_stream_ends_without_data_and_start_reply(self, session: Session) -> None:
+        """Without data and without a reply to START, the stream has ended; START is retried later."""
         session.start()
         session.wait(10)
         assert session.states[-1] == ("ended", "silent")
@@ -586,7 +586,7 @@ def recorded(name: str) -> list[tuple[float, bool, bytes]]:
 
 
 class Replay:
-    """Replays part of a recorded session to a client, and collects the recorded client's acknowledgements."""
+    """Replay part of a recorded session to a client, and collect the recorded client's acknowledgements."""
 
     def __init__(self, name: str, begin: float, end: float, ids: tuple[int, int], *log: Log) -> None:
         self.client = LogStreamClient({"1", *log}, system=ids[0], component=ids[1])
