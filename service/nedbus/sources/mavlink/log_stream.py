@@ -37,7 +37,7 @@ class LogStream:
     """ULog stream of one vehicle, used on the thread of the source; `client` is used on the thread of the link."""
 
     def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
-        self._name, self._client, self._extra = name, client, about("log_stream", Address(name, DEFAULT_TOPIC))
+        self._name, self._client, self._address = name, client, Address(name, DEFAULT_TOPIC)
         self._topics = options.chosen_topics
         self._folder = Path(options.save).expanduser() if options.save else None
         self._file: LogFile | None = None
@@ -128,9 +128,10 @@ class LogStream:
         if status.state == "streaming":
             header = self._client.header_seconds or 0.0
             text = f"the log on the SD card lacks the {header:.1f} s in which the header was sent"
-            _log.info("vehicle %s: receiving the ULog stream; %s", self._name, text, extra=self._extra)
+            extra = about("log_stream", self._address)
+            _log.info("vehicle %s: receiving the ULog stream; %s", self._name, text, extra=extra)
         elif status.reason is not None:
-            extra = about("log_stream", Address(self._name, DEFAULT_TOPIC), reason=status.text)
+            extra = about("log_stream", self._address, reason=status.text)
             _log.warning("vehicle %s: no ULog stream; %s", self._name, status.text, extra=extra)
 
     def status(self, now: float) -> LogStreamStatus:
@@ -196,7 +197,8 @@ class LogStream:
         try:
             if chunk.begins and self._folder is not None:
                 self._file = LogFile(self._folder, self._name)
-                _log.info("vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=self._extra)
+                extra = about("log_stream", self._address)
+                _log.info("vehicle %s: saving the ULog stream to %s", self._name, self._file.path, extra=extra)
             if self._file is not None:
                 if chunk.lost:
                     self._file.mark_gap(now - (self._last_chunk or now))
@@ -204,7 +206,7 @@ class LogStream:
         except OSError as exc:
             error = OutputError(self._file.path if self._file else Path(exc.filename), exc)
             self.close()
-            extra = about("log_stream", Address(self._name, DEFAULT_TOPIC), reason=str(error))
+            extra = about("log_stream", self._address, reason=str(error))
             _log.error("vehicle %s: stopped saving the ULog stream: %s", self._name, error, extra=extra)
 
 
