@@ -151,6 +151,15 @@ def test_replay_keeps_order_and_speed(tmp_path: Path, serve: Serve) -> None:
     assert service.wait() == 0
 
 
+def test_replayed_messages_to_a_vehicle_have_their_own_source(serve: Serve) -> None:
+    """Readers of a replayed bag see `mcap-input` as the source of /fmu/in/..., and `mcap` for all other topics."""
+    path = Path(__file__).parents[2] / "data" / "fmu_in_topics.mcap"
+    _, bus = serve("-s", f"mcap:{path}?topics=*&wait=1")
+    with bus.subscribe("trajectory_setpoint") as inputs, bus.subscribe() as positions:
+        assert inputs.receive(DEADLINE).source == "mcap-input"
+        assert positions.receive(DEADLINE).source == "mcap"
+
+
 @pytest.mark.parametrize("locale", ["C.UTF-8", "C"])
 def test_file_with_any_name_is_replayed(tmp_path: Path, serve: Serve, locale: str) -> None:
     """File names with ?, % or invalid UTF-8 are replayed and appear in the status, even in the C locale."""

@@ -327,7 +327,7 @@ def test_renew_replaces_only_expiring_certificates(tmp_path: Path) -> None:
     assert (out, "no certificate expires within 30 days" in err) == ([], True)
     pki_command(0, "renew", str(folder), "operator", "--new-key", "--days", "10")
     assert states()["operator"] == ("client", "expires soon")
-    for name, reason in (("nobody", "has no certificate named 'nobody'"), ("alien", "in the folder of that CA")):
+    for name, reason in (("absent", "has no certificate named 'absent'"), ("alien", "in the folder of that CA")):
         assert reason in pki_command(1, "renew", str(folder), name)[1]
     assert [line.split()[0] for line in pki_command(0, "list", str(folder))[0]][:2] == ["NAME", "ca"]
 
