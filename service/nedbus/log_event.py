@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Final
 
@@ -99,7 +100,7 @@ def about(
     return {"about": About(event, address.vehicle, address.topic, address.instance, source, reason)}
 
 
-class UnexpectedErrors:
+class UnexpectedErrors(AbstractContextManager[None]):
     """A context manager that survives every error of its block, and logs the first one with `text`.
 
     For the loops of threads: a panic of Zenoh or Pydantic is a BaseException, not an Exception. Ctrl-C and exit pass.
@@ -107,9 +108,6 @@ class UnexpectedErrors:
 
     def __init__(self, log: logging.Logger, text: str, *args: object) -> None:
         self._log, self._text, self._logged = log, (text, *args), False
-
-    def __enter__(self) -> None:
-        pass
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
         return error is not None and self.survives(error)

@@ -72,11 +72,10 @@ class PublisherRegistry:
         with self._lock, ExitStack() as undo:
             if address in self.publishers:
                 raise AddressInUseError(address)
-            vehicle = address.vehicle
-            if vehicle not in self._rate_listeners:
-                undo.callback(self._forget_vehicle, vehicle)
-                self._add_vehicle(vehicle)
-            listener = self._rate_listeners[vehicle]
+            if address.vehicle not in self._rate_listeners:
+                undo.callback(self._forget_vehicle, address.vehicle)
+                self._add_vehicle(address.vehicle)
+            listener = self._rate_listeners[address.vehicle]
             publisher = self.publishers[address] = Publisher(
                 address, definition, registry=self, listener=listener, lossless=lossless, source=source, owner=owner
             )
@@ -142,15 +141,15 @@ class PublisherRegistry:
                 self._forget_vehicle(address.vehicle)
 
     def _add_vehicle(self, vehicle: str) -> None:
-        selection, schema = Selection(vehicle=vehicle), partial(schema_key, vehicle=vehicle, prefix=self.prefix)
-        self._directories[vehicle] = VehicleDirectory(selection, prefix=self.prefix)
-        rates = selection.rate_key_expr(ANY, prefix=self.prefix)
-        self._rate_listeners[vehicle] = MatchingListener(self._session, rates)
-        self._queries.answer(f"{self.prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
+        prefix, selection = self.prefix, Selection(vehicle=vehicle)
+        schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
+        self._directories[vehicle] = VehicleDirectory(selection, prefix=prefix)
+        self._rate_listeners[vehicle] = MatchingListener(self._session, selection.rate_key_expr(ANY, prefix=prefix))
+        self._queries.answer(f"{prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
         # One key per vehicle, for the access rules: a vehicle may answer for its own messages only.
         self._queries.answer(schema(ANY), partial(_reply_schemas, schema, self._definitions))
         if self._former != vehicle:
-            self._queries.end(schema_key(ANY, vehicle=self._former, prefix=self.prefix))
+            self._queries.end(schema_key(ANY, vehicle=self._former, prefix=prefix))
         self._former = ""
 
     def _forget_vehicle(self, vehicle: str) -> None:
@@ -158,7 +157,7 @@ class PublisherRegistry:
         if (listener := self._rate_listeners.pop(vehicle, None)) is not None:
             listener.close()
         self._directories.pop(vehicle, None)
-        if self._rate_listeners:  # another vehicle can answer
+        if self._rate_listeners or self._former:  # another vehicle can answer
             self._queries.end(schema_key(ANY, vehicle=vehicle, prefix=self.prefix))
         else:
             self._former = vehicle

@@ -51,11 +51,8 @@ _ANYONE: Final = Sender()
 @dataclass(slots=True)
 class _Known:
     codec: Codec[Any]
+    size: int  # memory, in units of one field
     used: float  # monotonic time of the last use [s]
-
-    @property
-    def size(self) -> int:
-        return len(self.codec.definition.types) + _BASE
 
 
 class LayoutLookup:
@@ -87,13 +84,11 @@ class LayoutLookup:
         `wait`: wait for a lookup in progress, up to 3 s; never use it on a receiving thread.
         """
         schema_id = name, identity
-        known = self._known.get(schema_id)
-        if known is None:
+        if schema_id not in self._known:
             self._request(schema_id, sender)
             if wait:
                 self.wait(schema_id)
-                known = self._known.get(schema_id)
-        if known is None:
+        if (known := self._known.get(schema_id)) is None:
             return None
         known.used = self._now()
         return known.codec
@@ -160,7 +155,8 @@ class LayoutLookup:
                 self._changed.wait_for(lambda: self._closed, _QUERY_PAUSE)
 
     def _add(self, name: str, identity: str, fields: Mapping[str, str]) -> bool:
-        if not self._evict(len(fields) + _BASE):
+        size, reason = len(fields) + _BASE, f"hash {identity}"
+        if not self._evict(size):
             if not self._full:
                 text = "%s is not decoded, because too many definitions from publishers are in use"
                 _log.warning(text, name, extra=about("invalid"))
@@ -171,7 +167,7 @@ class LayoutLookup:
         except ValueError as exc:
             _log.warning("ignored a peer's definition of %s: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
-        self._known[name, identity], reason = _Known(codec_of(definition), self._now()), f"hash {identity}"
+        self._known[name, identity] = _Known(codec_of(definition), size, self._now())
         if name in MESSAGES:
             unknown = ", ".join(field for field in fields if field not in MESSAGES[name].types)[:_MAX_TEXT] or "nothing"
             text = "a layout of %s is newer than this reader; ignored fields: %s"

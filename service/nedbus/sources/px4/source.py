@@ -214,10 +214,9 @@ class Px4ZenohNode:
                     self._dropped[_TOO_LARGE] += 1
                 else:
                     self._pending.put(sample)
-        except zenoh.ZError:  # undeclared
-            pass
         except BaseException as exc:  # noqa: BLE001 - re-raised by `run`, on the thread of the source
-            self._pending.put(exc)
+            if not isinstance(exc, zenoh.ZError):  # else it is undeclared
+                self._pending.put(exc)
 
 
 def _read_definitions(paths: str) -> Definitions:
