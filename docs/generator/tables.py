@@ -128,9 +128,9 @@ def keys_page() -> str:
             "every field at a fixed offset; any other valid msgpack encoding of the array is also accepted."
             "\nThe Zenoh encoding starts with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
             "mask with one bit for each field that was not provided, the lowest for `timestamp`."
-            "\nFor any message that is not in this table, `;hash=...` follows the name: the first 32 hexadecimal "
-            "digits of its RIHS01 hash as ROS 2 computes it (`nedbus_msgs.short_hash`), because builds of PX4 may "
-            "define the same message differently."
+            "\nFor any message that is not in this table, and for newer layouts, `;hash=...` follows the name: the "
+            "first 32 hexadecimal digits of its RIHS01 hash as ROS 2 computes it (`nedbus_msgs.short_hash`), because "
+            "builds of PX4 may define the same message differently."
             "\nA reader queries `nedbus/@schema/*/<Message>?hash=...`, computes the hash of the fields in each reply, "
             "and decodes a payload only with the fields that match its hash; without a match the message is invalid.",
             table(["message", "fields", "bytes", "encoding"], messages),

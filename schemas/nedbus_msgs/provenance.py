@@ -3,8 +3,8 @@
     application/msgpack;px4_msgs/VehicleLocalPosition;source=mavlink;missing=fffff00000000
     application/msgpack;px4_msgs/WheelEncoders;hash=0123456789abcdef0123456789abcdef;source=ulog
 
-`hash` identifies the definition: builds of PX4 may differ (see `short_hash`); the twelve messages of the first
-version of nedbus omit it.
+`hash` identifies the definition: builds of PX4 may differ (see `short_hash`). Only the layouts that every version of
+nedbus has, those of the first version, omit it.
 `missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; omitted if 0.
 Encoding and parsing are cached, because almost all messages of a publisher have the same encoding.
 """
@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from .errors import ArgumentError
 from .model.declaration import Layout, cached_on_owner
@@ -25,11 +25,13 @@ from .ros2.types import PACKAGE, hash_of
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
 _MISSING = re.compile(r"[0-9a-f]+")
 _IDENTITY = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63});hash=([0-9a-f]{32})(?:;.*)?")
-# Built in since the first version, so every reader has their definitions.
-_WITHOUT_HASH: Final = re.compile(
-    "BatteryStatus|EstimatorStatusFlags|FailsafeFlags|HomePosition|SensorGps|TimesyncStatus|VehicleAttitude"
-    "|VehicleGlobalPosition|VehicleLandDetected|VehicleLocalPosition|VehicleOdometry|VehicleStatus"
-)
+# Number of the newest layout that needs no hash, because the first version has it. Never add to this table: readers
+# find the fields of any other layout by its hash.
+_WITHOUT_HASH: Final[Mapping[str, int]] = {
+    "BatteryStatus": 0, "EstimatorStatusFlags": 0, "FailsafeFlags": 0, "HomePosition": 0, "SensorGps": 0,
+    "TimesyncStatus": 0, "VehicleAttitude": 0, "VehicleGlobalPosition": 0, "VehicleLandDetected": 0,
+    "VehicleLocalPosition": 1, "VehicleOdometry": 0, "VehicleStatus": 0,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,8 @@ def encoding_of(definition: Definition[Any], source: str | None, provided: froze
     names = definition.names
     mask = 0 if provided is None else sum(1 << index for index, name in enumerate(names) if name not in provided)
     parts = [f"application/msgpack;px4_msgs/{definition.name}"]
-    if not _WITHOUT_HASH.fullmatch(definition.name) or MESSAGES[definition.name] is not definition:
+    is_built_in = MESSAGES.get(definition.name) is definition
+    if not is_built_in or cast("int", definition.current.wire) > _WITHOUT_HASH.get(definition.name, -1):
         parts.append(f"hash={short_hash(definition.name, definition.types)}")
     if source is not None:
         parts.append(f"source={source}")

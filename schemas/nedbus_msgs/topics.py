@@ -144,9 +144,9 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
 
 
-def schema_key(message: str, *, session: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key to query publishers, or one session, for the JSON Schema and the layouts of a message."""
-    return f"{prefix}/@schema/{session}/{message}"
+def schema_key(message: str, *, vehicle: str = ANY, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key to query the publishers of a vehicle for the JSON Schema and the layouts of a message."""
+    return f"{prefix}/@schema/{vehicle}/{message}"
 
 
 def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:

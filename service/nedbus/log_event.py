@@ -1,6 +1,8 @@
-"""The complete list of log events, and the structured data of a log record."""
+"""The complete list of log events, the structured data of a log record, and the log of unexpected errors."""
 
+import logging
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Final
 
@@ -96,3 +98,25 @@ def about(
     if address is None:
         return {"about": About(event, source=source, reason=reason)}
     return {"about": About(event, address.vehicle, address.topic, address.instance, source, reason)}
+
+
+class UnexpectedErrors(AbstractContextManager[None]):
+    """A context manager that survives every error of its block, and logs the first one with `text`.
+
+    For the loops of threads: a panic of Zenoh or Pydantic is a BaseException, not an Exception. Ctrl-C and exit pass.
+    """
+
+    def __init__(self, log: logging.Logger, text: str, *args: object) -> None:
+        self._log, self._text, self._logged = log, (text, *args), False
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        return error is not None and self.survives(error)
+
+    def survives(self, error: BaseException) -> bool:
+        """Log an error and return True; return False for Ctrl-C and exit."""
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            return False
+        level = logging.DEBUG if self._logged else logging.ERROR
+        self._log.log(level, *self._text, exc_info=error, extra=about("internal_error"))
+        self._logged = True
+        return True

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
+from pydantic import ValidationError, create_model
 from typing_extensions import TypeVar
 
 from nedbus_msgs import (
@@ -32,6 +33,7 @@ from nedbus_msgs import encoding_of as _encoding_of
 from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.codecs.msgpack import NewerLayouts
+from nedbus_msgs.model.px4_types import Float32, field
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 LAYOUTS: Final = DEFAULT.layouts
@@ -155,6 +157,16 @@ def layout_table(message: type[Message] | str = _DEFAULT) -> list[dict[str, obje
     """Return name, layout number (or None), and fields with name and type, of every layout."""
     layouts: list[dict[str, object]] = definition_of(message).schema()["layouts"]
     return layouts
+
+
+def next_release() -> Definition[Any]:
+    """Return VehicleLocalPosition of a newer release: with another field at the end, and so with layout number 2."""
+    new: Any = (Float32, field("A field that this release does not have"))
+    model = cast("Any", create_model("VehicleLocalPosition", __base__=VehicleLocalPosition, brand_new=new))
+    *older, last = VehicleLocalPosition.LAYOUTS
+    model.LAYOUTS = (*older, replace(last, text="2.0, without brand_new"), Layout("2.0", "*", wire=2))
+    model.DEFINITION = definition = Definition[Any](model)
+    return definition
 
 
 def _layout(text: str, message: type[Message] | str) -> tuple[Definition[Any], Layout]:

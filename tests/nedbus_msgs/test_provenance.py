@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import ArgumentError, Provenance
-from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, provenance_of
+from nedbus_msgs import MESSAGES, ArgumentError, Provenance, identity_of, short_hash
+from nedbus_msgs import encoding_of as encoding_with
+from tests.flights.local_position import ENCODING, FIELD_TYPES, encoding_of, next_release, provenance_of
 
 
 @given(st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True), st.sets(st.sampled_from(list(FIELD_TYPES))))
@@ -23,6 +24,17 @@ def test_encoding_without_missing_fields_has_no_mask() -> None:
     assert encoding_of(None) == ENCODING
     assert encoding_of("sim") == f"{ENCODING};source=sim" == encoding_of("sim", frozenset(FIELD_TYPES))
     assert encoding_of("x", frozenset(FIELD_TYPES.keys() - {"timestamp", "x"})) == f"{ENCODING};source=x;missing=41"
+
+
+def test_only_layouts_of_the_first_version_have_no_hash(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Encodings of the layouts that every reader has are unchanged; a newer layout carries the hash of its fields."""
+    with_hash = [name for name, each in MESSAGES.items() if ";hash=" in encoding_with(each, None)]
+    assert [name for name in with_hash if MESSAGES[name].model.__module__.startswith("nedbus_msgs.")] == ["LogMessage"]
+    newer = next_release()
+    monkeypatch.setitem(MESSAGES, newer.name, newer)
+    expected = f"{ENCODING};hash={short_hash(newer.name, newer.types)};source=sim"
+    assert encoding_with(newer, "sim") == expected
+    assert identity_of(expected) == (newer.name, short_hash(newer.name, newer.types))
 
 
 @pytest.mark.parametrize(

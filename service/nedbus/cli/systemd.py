@@ -11,6 +11,7 @@ from functools import partial
 from typing import Final, Self
 
 from nedbus.daemon import Daemon
+from nedbus.log_event import UnexpectedErrors
 from nedbus.monitoring import why_not_ready
 from nedbus.timings import TIMINGS
 
@@ -98,20 +99,21 @@ class Notifier:
 
     def _run(self) -> None:
         next_status = next_ping = 0.0
+        interval, errors = self._watchdog, UnexpectedErrors(_log, "unexpected error in a status update (logged once)")
         while True:
             now = time.monotonic()
             is_overdue = self._daemon.role == "client" and now >= self._router_deadline
-            if not self._is_ready and (self._daemon.ready.is_set() or is_overdue):
-                self._is_ready = True  # set before sending: a reload may unset it at any moment
-                if not self._send(READY=1, STATUS=self._status()):
-                    self._is_ready = False
-            elif now >= next_status:
-                self._send(STATUS=self._status())
-                next_status = now + TIMINGS.systemd_status
-            interval = self._watchdog
-            if interval is not None and now >= next_ping and self._ticked and self._daemon.busy < interval:
-                self._ticked, next_ping = False, now + interval
-                self._send(WATCHDOG=1)
+            with errors:  # an error in the status also omits WATCHDOG
+                if not self._is_ready and (self._daemon.ready.is_set() or is_overdue):
+                    self._is_ready = True  # set before sending: a reload may unset it at any moment
+                    if not self._send(READY=1, STATUS=self._status()):
+                        self._is_ready = False
+                elif now >= next_status:
+                    self._send(STATUS=self._status())
+                    next_status = now + TIMINGS.systemd_status
+                if interval is not None and now >= next_ping and self._ticked and self._daemon.busy < interval:
+                    self._ticked, next_ping = False, now + interval
+                    self._send(WATCHDOG=1)
             pause = TIMINGS.systemd_status if self._is_ready else _START_INTERVAL
             if self._stop.wait(pause if interval is None else min(pause, interval / 2)):
                 return

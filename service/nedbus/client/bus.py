@@ -88,8 +88,8 @@ class Bus(AbstractContextManager["Bus"]):
         `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
         `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which caches
         about 20 s of messages. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
-        In both modes `counts` reports lost, dropped and invalid samples, and a slow reader never delays other readers.
-        `max_rate`: maximum number of messages per second of each stream, downsampled by its publisher, for slow links.
+        In both modes `counts` reports lost, dropped and invalid samples. A slow reader delays lossless publishers only.
+        `max_rate`: messages per second of each stream on average, downsampled by its publisher, for slow links.
         The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`. If that is
         below 1, the reader downsamples further. Messages left out by downsampling count as neither lost nor dropped.
 
@@ -190,8 +190,12 @@ class Bus(AbstractContextManager["Bus"]):
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)
-        # This key matches nothing: if a session queries its own token, Zenoh 1.10 sometimes lists that token forever.
-        token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=2.0)  # usually milliseconds
+        try:
+            # This key matches nothing: a session that queries its own token sometimes lists it forever (Zenoh 1.10).
+            token_keys(self._zenoh, f"{self.prefix}/{address.vehicle}/@alive", timeout=2.0)  # usually milliseconds
+        except BaseException:  # such as Ctrl-C
+            publisher.close(timeout=0.0)
+            raise
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Final
 
 import zenoh
@@ -170,7 +171,7 @@ class SourceStatus(_UntrustedReply):
     vehicle announces without sending messages, while messages of its other topics arrive.
     `rejections`: the number of rejected messages by rule.
     `retries`: restarts after a failure. `error`: the reason of the last failure.
-    `streams`: the health of each published stream, 100 at most. `log_streams`: the ULog stream of each vehicle.
+    `streams`: the health of the first 100 published streams. `log_streams`: the ULog stream of each vehicle.
     """
 
     source: str = ""
@@ -293,7 +294,7 @@ class Rejections:
     def take(self) -> list[RejectionReport]:
         """Return the reports received since the last call, at most 1000, without waiting."""
         with translate_zenoh_errors():
-            samples = list(iter(self._handler.try_recv, None))
+            samples = list(islice(iter(self._handler.try_recv, None), _MAX_REPORTS))
         reports: list[RejectionReport] = []
         for sample in samples:
             try:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
-from nedbus.log_event import about
+from nedbus.log_event import UnexpectedErrors
 
 _log = logging.getLogger(__name__)
 
@@ -41,8 +41,10 @@ class Job:
     def __init__(self, call: Callable[[float], float]) -> None:
         self._call = call
         self._running = threading.RLock()  # a job may end itself
-        self._due, self._requested = 0.0, math.inf
-        self._ended = self._failed = False
+        self._due = 0.0
+        self._requested: set[float] = set()  # ticks; changed by single atomic calls, because any thread may add one
+        self._errors = UnexpectedErrors(_log, "unexpected error in an I/O job, retrying (logged once)")
+        self._ended = False
         _jobs[self] = None
         _thread.start()
         self.wake()
@@ -50,12 +52,12 @@ class Job:
     @property
     def due(self) -> float:
         """The monotonic time of the next call [s]."""
-        return min(self._due, self._requested)
+        return min((self._due, *self._requested))
 
     def wake(self, at: float = 0.0) -> None:
         """Call the job now, or at the first tick after a monotonic time [s]; any thread may call this."""
         at = math.ceil(at / TICK) * TICK
-        self._requested = min(self._requested, at)
+        self._requested.add(at)
         if at < _sleeps_until and _woken.empty():
             _woken.put(None)
 
@@ -68,15 +70,10 @@ class Job:
 
     def run(self, now: float) -> None:
         """Call the job; only for the I/O thread."""
-        self._requested = math.inf
-        try:
-            with self._running:
-                pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
-        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; other jobs must continue
-            pause = _RETRY_PAUSE
-            if not self._failed:
-                _log.exception("unexpected error in an I/O job, retrying (logged once)", extra=about("internal_error"))
-            self._failed = True
+        self._requested.difference_update([at for at in tuple(self._requested) if at <= now])
+        pause = _RETRY_PAUSE
+        with self._errors, self._running:
+            pause = math.inf if self._ended else max(_MIN_PAUSE, self._call(now))
         self._due = now + pause if pause < TICK or pause == math.inf else math.floor((now + pause) / TICK) * TICK
 
 
@@ -87,6 +84,7 @@ class CallThread:
         self._name = name
         self._calls: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # `put` must be reentrant
         self._thread: threading.Thread | None = None
+        self._errors = UnexpectedErrors(_log, "unexpected error in thread %s (logged once)", name)
 
     def start(self) -> None:
         """Start the thread unless it is running."""
@@ -109,10 +107,8 @@ class CallThread:
     def _run(self) -> None:
         while True:
             call = self._calls.get()
-            try:
+            with self._errors:
                 call()
-            except Exception:  # noqa: BLE001 - one failed call must not stop the others
-                _log.debug("unexpected error in thread %s", self._name, exc_info=True)
             del call  # release its references before blocking
 
 

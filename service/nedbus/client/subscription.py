@@ -71,7 +71,10 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
         return self._next(self._queue.pop, timeout)
 
     def receive_batch(self, timeout: float | None = None) -> Batch:
-        """Wait for at least one message and return all unread ones as arrays; raises the errors of `receive`."""
+        """Wait for at least one message and return unread ones as arrays, as `batches` does.
+
+        Raises the errors of `receive`.
+        """
         return self._next(self._queue.pop_batch, timeout)
 
     def rows(self) -> Iterator[Sample[M_co]]:
@@ -79,7 +82,10 @@ class Subscription(_SubscriptionBase[M_co], AbstractContextManager["Subscription
         return self._each(self._pop_row)
 
     def batches(self) -> Iterator[Batch]:
-        """Iterate over batches of up to 4096 unread messages as NumPy arrays, with the same validation."""
+        """Iterate over batches of unread messages of one type as NumPy arrays, with the same validation.
+
+        In mode `every` a batch has up to 4096 messages, in mode `latest` the newest of each of up to 10,000 keys.
+        """
         return self._each(self._queue.pop_batch)
 
     def close(self) -> None:
@@ -138,7 +144,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         return await self._next(self._queue.pop, timeout)
 
     async def receive_batch(self, timeout: float | None = None) -> Batch:
-        """Wait for at least one message and return all unread ones, as `Subscription.receive_batch` does."""
+        """Wait for at least one message and return unread ones, as `Subscription.receive_batch` does."""
         return await self._next(self._queue.pop_batch, timeout)
 
     def rows(self) -> AsyncIterator[Sample[M_co]]:

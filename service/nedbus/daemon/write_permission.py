@@ -16,7 +16,7 @@ from typing import Final
 
 from nedbus.client import PublisherRegistry
 from nedbus.errors import ConnectError, NedbusError
-from nedbus.log_event import about
+from nedbus.log_event import UnexpectedErrors, about
 from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, translate_zenoh_errors
@@ -74,16 +74,19 @@ class WritePermission:
 
     def _run(self) -> None:
         due, routers, vehicles = 0.0, set[str](), set[str]()
+        errors = UnexpectedErrors(_log, "unexpected error while probing the write permission (logged once)")
         while not self._stop.wait(TIMINGS.probe_poll):
             now, last_routers, last_vehicles = time.monotonic(), routers, vehicles
-            routers, vehicles = _routers_of(self._session), self._vehicles()
-            if routers != last_routers:
-                self._denials = {vehicle: _CONFIRMED * refused for vehicle, refused in self.refused.items()}
-                due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
-            elif vehicles - last_vehicles:
-                due = min(due, now + TIMINGS.probe_first[0])
-            if routers and vehicles and now >= due:
-                due = now + self.check()
+            with errors:
+                routers, vehicles = _routers_of(self._session), self._vehicles()
+                if routers != last_routers:
+                    self._denials = {vehicle: _CONFIRMED * refused for vehicle, refused in self.refused.items()}
+                    due = now + random.uniform(*TIMINGS.probe_first)  # noqa: S311 - spreads the load, not a secret
+                elif vehicles - last_vehicles:
+                    due = min(due, now + TIMINGS.probe_first[0])
+                if routers and vehicles and now >= due:
+                    due = now + TIMINGS.probe_pause
+                    due = now + self.check()
 
     def check(self) -> float:
         """Check once, and return the time until the next check [s]."""

@@ -152,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
             return Page.text(f"{path} is only served under an IP address or a name of this host", status=403)
         try:
             return pages[path]()
-        except Exception:  # noqa: BLE001 - one page must not break the server
+        except BaseException:  # noqa: BLE001 - one page, even with a panic of Zenoh, must not break the server
             _log.exception("unexpected error in page %s", path, extra=about("internal_error"))
             return Page.text("unexpected error: see the log", status=500)
 

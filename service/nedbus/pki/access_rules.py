@@ -25,7 +25,7 @@ _SUBJECT: Final = re.compile(
     rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE
 )
 # A vehicle sends data, last messages, retransmissions (@adv), downsampled streams (@rate), liveliness tokens, probes of
-# `nedbus doctor`, rejection reports and the service status.
+# `nedbus doctor`, schemas, rejection reports and the service status.
 _MESSAGES: Final = '["put", "delete", "reply", "declare_queryable", "liveliness_token"]'
 _KEYS: Final = (
     "{p}/{v}/**",
@@ -34,6 +34,7 @@ _KEYS: Final = (
     "{p}/{v}/**/@rate/*",
     "{p}/{v}/**/@rate/*/@adv/**",
     "{p}/{v}/@doctor/*",
+    "{p}/@schema/{v}/*",
     "{p}/@rejected/{v}/**",
     "{p}/@service/*/status",
 )

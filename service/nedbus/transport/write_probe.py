@@ -7,6 +7,7 @@ arrives although the router has announced the subscriber to the publisher, the r
 import secrets
 import time
 from collections.abc import Callable, Collection
+from itertools import islice
 from typing import Final, Literal, cast
 
 import zenoh
@@ -31,15 +32,14 @@ def probe_writes(
     """
     probe = f"@doctor/{secrets.token_hex(8)}"  # the `**` of readers does not match a chunk that starts with @
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
-    missing = dict(keys)
+    missing, capacity = dict(keys), len(keys) + _SPARE
 
     def receive() -> bool:
-        while (sample := subscriber.handler.try_recv()) is not None:
+        for sample in islice(iter(subscriber.handler.try_recv, None), capacity):
             missing.pop(str(sample.key_expr), None)
         return not missing
 
     with translate_zenoh_errors():
-        capacity = len(keys) + _SPARE
         subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", zenoh.handlers.RingChannel(capacity))
         # Deleted rather than undeclared, because `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))

@@ -131,6 +131,21 @@ def test_silent_source_does_not_delay_ready(systemd: Systemd) -> None:
     assert " messages/s, 0 sessions" in status
 
 
+@pytest.mark.usefixtures("frequent_status")
+def test_status_continues_after_a_panic(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a panic of Zenoh in a status update, READY and the following updates are sent."""
+    status, panics = Notifier._status, iter(["panic"])
+
+    def panic_once(notifier: Notifier) -> str:
+        for text in panics:
+            raise BaseException(text)  # noqa: TRY002 - like pyo3's PanicException, it is not an Exception
+        return status(notifier)
+
+    monkeypatch.setattr(Notifier, "_status", panic_once)
+    with notified(systemd, "sim:"):
+        systemd.receive_until(lambda datagram: "1 source, " in datagram.get("STATUS", ""))
+
+
 def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
     """Return whether the status text has counts, and reports a rejected configuration if and only if `is_wrong`."""
     return "messages/s" in datagram["STATUS"] and ("configuration rejected" in datagram["STATUS"]) == is_wrong

@@ -17,7 +17,6 @@ from contextlib import closing, suppress
 from functools import partial
 from typing import cast
 
-import msgpack
 import pytest
 import zenoh
 
@@ -269,16 +268,6 @@ def test_latest_prefers_a_live_message_to_a_stored_one(
 
     with answer_queries(zenoh_session, f"nedbus/*/{VLP}", reply_with(stored, timestamp=later)):
         wait_for(lambda: found() == [("1", 1, False), ("2", 99, True)], what="a live and a stored message")
-
-
-def test_last_message_of_a_newer_layout_is_read(client: nedbus.Bus, zenoh_session: Session) -> None:
-    """`latest` looks up the layout from its publisher, as `subscribe` does."""
-    types = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
-    layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
-    schema = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
-    last = reply_with({f"nedbus/1/{VLP}": msgpack.packb([9, 5, True, 2.5])})
-    with answer_queries(zenoh_session, SCHEMA, schema), answer_queries(zenoh_session, f"nedbus/1/{VLP}", last):
-        wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
 
 
 def reply_with_statuses(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:

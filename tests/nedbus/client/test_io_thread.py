@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import logging
+import math
+import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 
 import pytest
+import zenoh
 
 import nedbus
-from nedbus.client import io_thread
+from nedbus.client import QueryServer, io_thread
 from nedbus.client.io_thread import TICK, CallThread, Job
+from nedbus.transport import Session, query
 from tests.flights.messages import VLP, message
 from tests.waits import DEADLINE, wait_for
 
@@ -50,6 +56,44 @@ def test_job_is_called_when_woken() -> None:
     wait_for(lambda: len(calls.times) == 3, what="the third call")
     assert calls.times[2] >= due
     job.end()
+
+
+def test_wake_at_a_time_survives_earlier_calls() -> None:
+    """A job woken for a later time is called then, even if it is also called before."""
+    calls = Calls(math.inf)
+    job = Job(calls)
+    due = time.monotonic() + 0.3
+    job.wake(due)
+    job.wake()
+    wait_for(lambda: calls.times and calls.times[-1] >= due, what="the call at the later time")
+    job.end()
+
+
+def test_wakes_from_several_threads_are_not_lost() -> None:
+    """While other threads wake a job for a later time, each `wake()` calls it at once."""
+    calls, stop = Calls(math.inf), threading.Event()
+    job = Job(calls)
+
+    def wake_later() -> None:
+        while not stop.is_set():
+            job.wake(time.monotonic() + 3600.0)
+
+    others = [threading.Thread(target=wake_later) for _ in range(2)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in others:
+            thread.start()
+        for _ in range(500):
+            before = len(calls.times)
+            job.wake()
+            wait_for(lambda: len(calls.times) > before, what="the call")  # noqa: B023 - called immediately
+    finally:
+        sys.setswitchinterval(interval)
+        stop.set()
+        for thread in others:
+            thread.join()
+        job.end()
 
 
 def test_end_waits_for_a_running_job() -> None:
@@ -100,13 +144,33 @@ def test_failed_job_is_called_again(caplog: pytest.LogCaptureFixture) -> None:
     assert sum("unexpected error" in text for text in caplog.messages) == 1
 
 
-def test_failed_call_does_not_stop_the_thread() -> None:
-    """After a call that raises, a CallThread runs the next one."""
+def panic(*_: object) -> None:
+    """Raise an error that is not an Exception, like pyo3's PanicException after a panic of Zenoh."""
+    raise BaseException("panic")  # noqa: TRY002 - see above
+
+
+def test_failed_call_does_not_stop_the_thread(caplog: pytest.LogCaptureFixture) -> None:
+    """After calls that raise, even with a panic, a CallThread runs the next one; only the first error is logged."""
     thread, done = CallThread("nedbus-test"), threading.Event()
     thread.start()
+    thread.put(panic)
     thread.put(lambda: 1 // 0)
     thread.put(done.set)
     assert done.wait(DEADLINE)
+    logged = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert [record.getMessage() for record in logged] == ["unexpected error in thread nedbus-test (logged once)"]
+
+
+def test_queryable_replies_after_a_panic(bus: nedbus.Bus, zenoh_session: Session) -> None:
+    """After a panic in the reply to one query, a service replies to the next ones."""
+    server, replies = QueryServer(bus._session), iter([panic])
+
+    def reply(received: zenoh.Query) -> None:
+        next(replies, partial(received.reply, "nedbus/test", b"reply"))()
+
+    server.answer("nedbus/test", reply)
+    wait_for(lambda: query(zenoh_session, "nedbus/test", timeout=DEADLINE), what="a reply")
+    server.close()
 
 
 def test_sessions_share_threads(endpoint: str) -> None:

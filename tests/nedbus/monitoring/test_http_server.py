@@ -24,16 +24,19 @@ PATHS = ("/metrics", "/healthz", "/readyz", "/vehicles", "/status")
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[HttpClient]:
-    """Serve a page, one that raises, and one that blocks until GO is set."""
+    """Serve a page, two that raise, and one that blocks until GO is set."""
 
     def fail() -> Page:
         raise RuntimeError("broken page")
+
+    def panic() -> Page:
+        raise BaseException("panic")  # noqa: TRY002 - like pyo3's PanicException, it is not an Exception
 
     def wait() -> Page:
         BUSY.release()
         return Page.text(str(GO.wait(DEADLINE)))
 
-    pages = {"/page": lambda: Page.text("a page"), "/fails": fail, "/waits": wait}
+    pages = {"/page": lambda: Page.text("a page"), "/fails": fail, "/panics": panic, "/waits": wait}
     with closing(HttpServer("127.0.0.1:0", pages)) as server:
         yield HttpClient(server.port)
 
@@ -47,11 +50,12 @@ def others() -> Iterator[tuple[HttpClient, HttpClient]]:
 
 
 def test_unknown_path_returns_404_and_failing_page_500(server: HttpClient, caplog: pytest.LogCaptureFixture) -> None:
-    """404 and / list the available pages; a page that raises returns 500, is logged, and does not stop the server."""
-    assert server.request("/other") == (404, "available pages: /page, /fails, /waits\n")
+    """404 and / list the available pages; a page that raises, even a panic, returns 500 and is logged."""
+    assert server.request("/other") == (404, "available pages: /page, /fails, /panics, /waits\n")
     assert server.request("/")[0] == 200
     assert server.request("/fails") == (500, "unexpected error: see the log\n")
     assert "broken page" in caplog.text
+    assert server.request("/panics") == (500, "unexpected error: see the log\n")
     assert server.request("/page") == (200, "a page\n")
 
 

@@ -20,7 +20,7 @@ from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.daemon.write_permission import WritePermission
 from nedbus.pki import write_access_rules
 from nedbus.timings import Timings
-from nedbus.transport import Session, open_client, open_router
+from nedbus.transport import Session, open_client, open_router, query
 from nedbus_msgs import Address, define, field_type
 from nedbus_msgs.arrays import to_array
 from tests.flights.local_position import encode
@@ -34,6 +34,7 @@ from tests.peers.custom_timings import start_with_timings
 from tests.peers.http_client import HttpClient
 from tests.peers.ports import free_endpoint, free_port
 from tests.peers.processes import Process, Start
+from tests.peers.queryables import answer_queries, reply_with
 from tests.peers.zenohd import ROUTER_KINDS, start_zenohd
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
@@ -41,6 +42,7 @@ __all__ = ["clock", "pki"]
 
 Join = Callable[[str], nedbus.Bus]
 Open = Callable[[str], Session]
+NAME: Final = "VehicleLocalPosition"
 
 
 @pytest.fixture
@@ -149,6 +151,21 @@ def test_other_certificates_cannot_publish_a_vehicle(join: Join, intruder: str) 
             assert receive_timestamps(subscription, 1) == [timestamp]
         assert [sample.message.timestamp for sample in reader.latest("*")] == [3]
         assert list(reader.vehicles()) == ["1"]
+
+
+def test_vehicle_answers_schema_queries_for_itself_only(join: Join, open_as: Open) -> None:
+    """A vehicle may reply with the schema of its own messages, and for no other vehicle or session."""
+    vehicle, reader = open_as("vehicle-1"), open_as("reader")
+    keys = [f"nedbus/@schema/{each}/{NAME}" for each in ("2", "peer", "1")]
+    with ExitStack() as answering:
+        for key in keys:
+            answering.enter_context(answer_queries(vehicle, key, reply_with({key: b"{}"})))
+
+        def replies() -> list[str]:
+            return [str(each.key_expr) for each in query(reader, f"nedbus/@schema/*/{NAME}", timeout=DEADLINE)]
+
+        wait_for(replies, what="the reply of vehicle 1, which is declared last")
+        assert replies() == keys[2:]
 
 
 @pytest.mark.parametrize("name", ["reader", "operator", "stranger"])
@@ -446,6 +463,25 @@ def test_vehicle_is_refused_after_three_consecutive_denials(
     refused, pause = outcome
     assert [permission.check() for _ in history][-1] == pause
     assert permission.refused == ({} if refused is None else {"1": refused})
+
+
+def test_probes_continue_after_a_panic(
+    endpoint: str, zenoh_session: Session, pki: Path, monkeypatch: pytest.MonkeyPatch, timings: Timings
+) -> None:
+    """After a panic of Zenoh the permission is probed again at the next interval."""
+    timings.probe_poll, timings.probe_first, timings.probe_pause = 0.01, (0.0, 0.0), 0.01
+    verdicts = iter(["panic", "allowed"])
+
+    def probe(*_: object, **__: object) -> dict[str, str]:
+        if (verdict := next(verdicts, "allowed")) == "panic":
+            raise BaseException(verdict)  # noqa: TRY002 - like pyo3's PanicException, it is not an Exception
+        return {"1": verdict}
+
+    monkeypatch.setattr(f"{PERMISSION}probe_writes", probe)
+    permission = permission_of(zenoh_session, endpoint, pki, "1")
+    permission.start()
+    wait_for(lambda: permission.refused == {"1": False}, what="the next probe")
+    permission.close()
 
 
 def test_embedded_router_is_checked_like_a_client(secure: str, pki: Path, timings: Timings) -> None:

@@ -27,8 +27,11 @@ class MatchingListener:
     def __init__(self, session: Session, key_expr: str) -> None:
         with translate_zenoh_errors():
             self._probe = session.declare_publisher(key_expr)
-            # The listener reports the current status first.
-            self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
+            try:  # the listener reports the current status first
+                self._listener = self._probe.declare_matching_listener(zenoh.handlers.RingChannel(1))
+            except BaseException:
+                self._probe.undeclare()
+                raise
         self._matched = False
         self._lock = threading.Lock()  # all publishers of a vehicle share one listener
         self._try_recv = self._listener.handler.try_recv

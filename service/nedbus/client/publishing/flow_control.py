@@ -39,14 +39,16 @@ class SharedWindow:
     """The window of a session, shared equally by lossless publishers; each may also use what others leave unused."""
 
     def __init__(self) -> None:
-        self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key; replaced as a whole
+        self._unread: dict[str, tuple[int, float]] = {}  # number of messages and time, by key
+        self._lock = threading.Lock()  # publishers call `share` on their own threads
 
     def share(self, key: str, unread: int, *, now: float) -> int:
         """Return the share of a publisher with `unread` messages; the entry expires after a second without a call."""
-        recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
-        self._unread = unread_by_key = recent | {key: (unread, now)}
-        others = sum(number for number, _ in unread_by_key.values()) - unread
-        return max(_MIN_WINDOW, WINDOW // len(unread_by_key), WINDOW - others)
+        with self._lock:
+            recent = {other: each for other, each in self._unread.items() if now - each[1] < _STALE_POLL}
+            self._unread = recent | {key: (unread, now)}
+            others = sum(number for number, _ in self._unread.values()) - unread
+            return max(_MIN_WINDOW, WINDOW // len(self._unread), WINDOW - others)
 
 
 class ReaderProxies:

@@ -29,8 +29,8 @@ class Publisher(AbstractContextManager["Publisher"]):
     """Publisher of the messages of one address; get one from `bus.publisher(...)`.
 
     A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
-    `publish` never waits for slow readers, unless the publisher is lossless: it then slows down to 10 messages per
-    second while a reader in mode "every" has more than 2,000 unread messages.
+    `publish` does not wait for readers: Zenoh drops what a link does not accept within 1 ms. A lossless publisher slows
+    down to 10 messages per second while a reader in mode "every" has more than 2,000 unread messages.
     Not thread-safe. A context manager.
     """
 
@@ -60,13 +60,17 @@ class Publisher(AbstractContextManager["Publisher"]):
         self._encoding = self._declared = encoding_of(definition, source)
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # of the last message with missing fields
         topic = get_topic(address.topic)
-        with translate_zenoh_errors():
-            token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
-            self._token = heartbeats.session.liveliness().declare_token(token)
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, topic, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
         self._downsampler = Downsampler(heartbeats, address, prefix=prefix, listener=listener)
+        try:
+            with translate_zenoh_errors():  # last: readers may use all of the above once they see the token
+                token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
+                self._token = heartbeats.session.liveliness().declare_token(token)
+        except BaseException:
+            self._writer.close()
+            raise
 
     @property
     def published(self) -> int:

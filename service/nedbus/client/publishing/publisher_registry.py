@@ -44,7 +44,7 @@ class PublisherRegistry:
         self._session, self._queries = session, queries
         self.publishers: dict[Address, Publisher] = {}  # open publishers
         self._definitions: dict[tuple[str, str], Definition[Any]] = {}  # by name and hash, oldest first
-        self._schema_key = partial(schema_key, session=str(session.zid()), prefix=prefix)
+        self._former = ""  # a vehicle without publishers that still answers schema queries, for messages in transit
         self._rate_listeners: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
         self._shared: set[str] = set()  # vehicles that another process also publishes
@@ -69,22 +69,17 @@ class PublisherRegistry:
         if definition is None:
             expected = f"a definition from nedbus.define_msg, or one of {', '.join(BY_TOPIC)}"
             raise AddressError("topic", address.topic, expected)
-        with self._lock:
+        with self._lock, ExitStack() as undo:
             if address in self.publishers:
                 raise AddressInUseError(address)
-            vehicle, prefix = address.vehicle, self.prefix
-            if vehicle not in self._rate_listeners:
-                selection = Selection(vehicle=vehicle)
-                rates = selection.rate_key_expr(ANY, prefix=prefix)
-                self._directories[vehicle] = VehicleDirectory(selection, prefix=prefix)
-                self._rate_listeners[vehicle] = MatchingListener(self._session, rates)
-            listener = self._rate_listeners[vehicle]
+            if address.vehicle not in self._rate_listeners:
+                undo.callback(self._forget_vehicle, address.vehicle)
+                self._add_vehicle(address.vehicle)
+            listener = self._rate_listeners[address.vehicle]
             publisher = self.publishers[address] = Publisher(
                 address, definition, registry=self, listener=listener, lossless=lossless, source=source, owner=owner
             )
-            self._queries.answer(f"{self.prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
-            # One key per session: routers need quadratic time for a key that all sessions declare.
-            self._queries.answer(self._schema_key(ANY), partial(_reply_schemas, self._schema_key, self._definitions))
+            undo.pop_all()
             self._definitions[definition.name, short_hash(definition.name, definition.types)] = definition
             if len(self._definitions) > len(self.publishers) + _MAX_UNUSED:
                 used = {each.definition for each in self.publishers.values()}
@@ -143,9 +138,29 @@ class PublisherRegistry:
         with self._lock:
             self.publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self.publishers):
-                self._queries.end(f"{self.prefix}/{address.vehicle}/**")
-                self._rate_listeners.pop(address.vehicle).close()
-                del self._directories[address.vehicle]
+                self._forget_vehicle(address.vehicle)
+
+    def _add_vehicle(self, vehicle: str) -> None:
+        prefix, selection = self.prefix, Selection(vehicle=vehicle)
+        schema = partial(schema_key, vehicle=vehicle, prefix=prefix)
+        self._directories[vehicle] = VehicleDirectory(selection, prefix=prefix)
+        self._rate_listeners[vehicle] = MatchingListener(self._session, selection.rate_key_expr(ANY, prefix=prefix))
+        self._queries.answer(f"{prefix}/{vehicle}/**", partial(_reply, weakref.ref(self), vehicle))
+        # One key per vehicle, for the access rules: a vehicle may answer for its own messages only.
+        self._queries.answer(schema(ANY), partial(_reply_schemas, schema, self._definitions))
+        if self._former != vehicle:
+            self._queries.end(schema_key(ANY, vehicle=self._former, prefix=prefix))
+        self._former = ""
+
+    def _forget_vehicle(self, vehicle: str) -> None:
+        self._queries.end(f"{self.prefix}/{vehicle}/**")
+        if (listener := self._rate_listeners.pop(vehicle, None)) is not None:
+            listener.close()
+        self._directories.pop(vehicle, None)
+        if self._rate_listeners or self._former:  # another vehicle can answer
+            self._queries.end(schema_key(ANY, vehicle=vehicle, prefix=self.prefix))
+        else:
+            self._former = vehicle
 
 
 def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:

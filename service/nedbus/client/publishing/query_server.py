@@ -10,7 +10,7 @@ from typing import Final
 import zenoh
 
 from nedbus.client.io_thread import TICK, CallThread, Job
-from nedbus.log_event import about
+from nedbus.log_event import UnexpectedErrors
 from nedbus.transport import Session, translate_zenoh_errors
 
 _log = logging.getLogger(__name__)
@@ -71,6 +71,7 @@ class _Queryable:
         self._busy_until = 0.0
         self._replying = threading.Lock()
         self._closed = False
+        self._errors = UnexpectedErrors(_log, "%s: unexpected error in a query reply (logged once)", key_expr)
         _replies.start()
         self._job = Job(self._poll)
 
@@ -90,15 +91,20 @@ class _Queryable:
         return _POLL if now < self._busy_until else TICK
 
     def _take_turn(self) -> None:
-        end = time.monotonic() + _TURN
-        with self._replying, suppress(zenoh.ZError):
-            while (query := self._query) is not None and not self._closed:
-                key_expr = str(query.key_expr)  # not available after the query has ended
-                try:
-                    with query:
-                        self._reply(query)
-                except zenoh.ZError as exc:
-                    _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
-                except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
-                    _log.exception("%s: unexpected error in a query reply", key_expr, extra=about("internal_error"))
-                self._query = self._try_recv() if time.monotonic() < end else None
+        query, end = self._query, time.monotonic() + _TURN
+        try:
+            with self._replying, suppress(zenoh.ZError):  # undeclared
+                while query is not None and not self._closed:
+                    with self._errors:
+                        self._answer(query)
+                    query = self._try_recv() if time.monotonic() < end else None
+        finally:
+            self._query = None  # from here `_poll` takes the next one
+
+    def _answer(self, query: zenoh.Query) -> None:
+        key_expr = str(query.key_expr)  # not available after the query has ended
+        try:
+            with query:
+                self._reply(query)
+        except zenoh.ZError as exc:
+            _log.debug("%s: cannot reply to a query: %s", key_expr, exc)

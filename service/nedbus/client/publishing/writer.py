@@ -34,8 +34,6 @@ class Writer:
         self.heartbeat_due = math.inf  # monotonic time of the next heartbeat, or of a check of `last_put` [s]
         self._heartbeats = heartbeats
         with translate_zenoh_errors():
-            # Interconnected routers cache the route of a message only if something is declared on its exact key.
-            self._token = self.session.liveliness().declare_token(key)
             self._publisher: zenoh.ext.AdvancedPublisher | None = zenoh.ext.declare_advanced_publisher(
                 self.session,
                 key,
@@ -46,7 +44,13 @@ class Writer:
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
             )
             self.name = entity_name(self._publisher.id)
-            heartbeats.writers.add(self)
+            try:
+                # Interconnected routers cache the route of a message only if something is declared on its exact key.
+                self._token = self.session.liveliness().declare_token(key)
+            except BaseException:
+                self._publisher = None  # the traceback references `self`
+                raise
+        heartbeats.writers.add(self)
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
         """Put a payload without waiting for readers; `encoding` overrides the writer's."""

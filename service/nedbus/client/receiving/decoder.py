@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -21,7 +21,7 @@ from nedbus.log_event import about
 from nedbus.transport import RawSample
 from nedbus_msgs import BY_TOPIC, PAYLOAD_LIMIT, RATE, Address, Codec, Provenance, codec_of, identity_of, provenance_of
 
-from .layout_lookup import LayoutLookup
+from .layout_lookup import LayoutLookup, Sender
 
 if TYPE_CHECKING:
     from .writer_proxy import WriterProxy
@@ -117,13 +117,26 @@ class Decoder:
         `wait`: wait for a lookup in progress; never do so on a receiving thread.
         Raises DecodeError if the encoding identifies no message.
         """
-        if stream.codec:
-            return stream.codec
-        encoding, info = encoding_of(stream, raw), raw.source_info
+        return stream.codec or self._find_codec(stream, raw, wait=wait)
+
+    def _find_codec(self, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool) -> Codec[Any] | None:
+        """Return the codec of the definition in the encoding, from its publisher."""
+        encoding = encoding_of(stream, raw)
         identity = identity_of(encoding)
         if identity is None:
-            raise DecodeError(f"the encoding {encoding!r:.100} has no message name and hash")
-        return self._layouts.codec(*identity, publisher=info and info.source_id.zid, wait=wait)
+            text = f"the encoding {encoding!r:.100} has no message name and hash"
+            raise DecodeError(f"unknown message or layout, and {text}")
+        sender = Sender(stream.address.vehicle, raw.source_info and raw.source_info.source_id.zid)
+        return self._layouts.codec(*identity, sender=sender, wait=wait)
+
+    def _newer(
+        self, error: UnknownLayoutError, stream: KeyState, raw: RawSample | DetachedSample, *, wait: bool = True
+    ) -> Mapping[int, Sequence[str]]:
+        """Return the fields of an unknown layout, which the hash in the encoding identifies; {} if there are none."""
+        if stream.codec is None:
+            return {}  # a definition that was looked up has a single layout
+        codec, name = self._find_codec(stream, raw, wait=wait), stream.codec.definition.name
+        return {error.layout: codec.definition.names} if codec and codec.definition.name == name else {}
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
         """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
@@ -139,8 +152,8 @@ class Decoder:
         try:
             try:
                 message = decode(payload)
-            except UnknownLayoutError:
-                message = decode(payload, newer=self._layouts.newer(codec.definition))
+            except UnknownLayoutError as exc:
+                message = decode(payload, newer=self._newer(exc, stream, raw))
         except DecodeError as exc:
             self.reject(stream.key, exc, stream)
             return None
@@ -176,7 +189,10 @@ class Decoder:
             raise DecodeError("a delete sample, which nedbus publishers never send")
         codec = self.codec(stream, raw, wait=False)  # None: decoded on read; the lookup may be done by then
         if codec and len(payload) != codec.size:
-            self._layouts.check(codec, payload)
+            try:
+                codec.decode(payload)
+            except UnknownLayoutError as exc:
+                codec.decode(payload, newer=self._newer(exc, stream, raw, wait=False))
 
 
 def detach(arrival: Arrival, *, retained: bool = False) -> Arrival:

@@ -33,7 +33,7 @@ _MAX_OVERTAKE: Final = 2_000_000_000  # ns by which a last message may overtake 
 
 
 class MaxRateQueue(PendingQueue):
-    """Queue at most `max_rate` messages per second and stream; raise ArgumentError unless it is finite and above 0.
+    """Limit each stream to `max_rate` messages per second (see RateGate); raise ArgumentError unless it is valid.
 
     Messages omitted to limit the rate count neither as lost nor as dropped.
     """

@@ -241,13 +241,14 @@ class PendingQueue:
             if self._ack_requests:
                 self.acknowledge(drained=False)
             sample = self.decoder.decode(arrival, rows=rows, lost=lost)
-            if sample is not None:
-                self._received += 1
-                return sample
-            stream.unreported += lost
+            with self._lock:
+                if sample is not None:
+                    self._received += 1
+                    return sample
+                stream.unreported += lost
 
     def pop_batch(self) -> Batch | None:
-        """Return the queued messages of one type, up to 4096, None if there are none; invalid ones are counted."""
+        """Return unread messages of one type, up to 4096 in mode `every`; None if there are none."""
         from .batch import make_batch
 
         while True:
@@ -261,10 +262,11 @@ class PendingQueue:
             if not taken:
                 return None
             batch = make_batch(taken, self.decoder, lost=lost)
-            if len(batch):
-                self._received += len(batch)
-                return batch
-            taken[0][0].unreported += lost
+            with self._lock:
+                if len(batch):
+                    self._received += len(batch)
+                    return batch
+                taken[0][0].unreported += lost
 
     def _take_batch(self) -> list[Arrival]:
         """Remove the messages of the same type as the first one; the rest stay queued in order."""

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from itertools import islice
 from typing import Final
 
 import zenoh
@@ -18,7 +19,7 @@ import zenoh
 from nedbus.client.closing import join_thread
 from nedbus.client.io_thread import TICK, Job
 from nedbus.client.protocol import CLOSED
-from nedbus.log_event import about
+from nedbus.log_event import UnexpectedErrors, about
 from nedbus.transport import Session, translate_zenoh_errors
 from nedbus_msgs import ack_key
 
@@ -50,6 +51,7 @@ class Receiver:
     def __init__(self, session: Session, pending_queue: PendingQueue, *, history: bool = True) -> None:
         self._session = session
         self._queue, key_expr = pending_queue, pending_queue.name
+        self._errors = UnexpectedErrors(_log, "%s: unexpected error, discarded a batch (logged once)", key_expr)
         self._changing = threading.Lock()
         self._closed = False
         self._receiving = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
@@ -169,11 +171,11 @@ class Receiver:
         if self._queue.ended:
             return
         self._take_events()
-        try:
+        try:  # not `with`, which costs two calls per batch
             self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
-        except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
-            extra = about("internal_error")
-            _log.exception("%s: unexpected error, discarded a batch of %d", self._queue.name, len(batch), extra=extra)
+        except BaseException as exc:
+            if not self._errors.survives(exc):
+                raise
             self._queue.decoder.count_invalid(len(batch))
 
     def _poll(self, now: float) -> float:
@@ -200,7 +202,7 @@ class Receiver:
         try:
             while self._take_link() is not None:
                 self._queue.on_link_change()
-            while (query := self._take_query()) is not None:
+            for query in islice(iter(self._take_query, None), MAX_ACK_REQUESTS):  # a flood must not hold the I/O thread
                 self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
                 key, get = str(query.key_expr), query.parameters.get
                 publisher, number = get("publisher"), get("number") or ""

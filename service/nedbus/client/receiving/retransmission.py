@@ -11,7 +11,7 @@ import zenoh
 
 from nedbus.client.io_thread import TICK
 from nedbus.errors import NedbusError
-from nedbus.log_event import about
+from nedbus.log_event import UnexpectedErrors
 from nedbus.transport import Heartbeats, RetransmitRequest, Session, follow_heartbeats
 from nedbus_msgs import PAYLOAD_LIMIT
 
@@ -35,6 +35,8 @@ class Retransmission:
     def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
         self._session = session
         self._queue = pending_queue
+        text = "%s: unexpected error, recovered messages discarded (logged once)"
+        self._errors = UnexpectedErrors(_log, text, pending_queue.name)
         self._open: dict[WriterProxy, RetransmitRequest] = {}
         self._take_heartbeats, self._undeclare = follow_heartbeats(session, pending_queue.name)
         self._heartbeats: Heartbeats = {}  # from the previous poll
@@ -80,13 +82,10 @@ class Retransmission:
             del self._open[writer]
         elif not found:
             return ""
-        try:
-            recovered = self._queue.on_retransmission(writer, found, ended=ended, now=now)
-        except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
-            _log.exception("%s: unexpected error, recovered messages discarded", key, extra=about("internal_error"))
-            self._open.pop(writer, None)
-            recovered = self._queue.on_retransmission(writer, {}, ended=True, now=float("inf"))
-        return key if recovered else ""
+        with self._errors:
+            return key if self._queue.on_retransmission(writer, found, ended=ended, now=now) else ""
+        self._open.pop(writer, None)
+        return key if self._queue.on_retransmission(writer, {}, ended=True, now=float("inf")) else ""
 
     def _may_open(self, writer: WriterProxy) -> bool:
         share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]

@@ -100,7 +100,7 @@ class LogReceiver:
     def __init__(self, reader: LinkReader, options: MavlinkOptions, send: Callable[[Any, Peer], object]) -> None:
         self._reader, self._options, self._send = reader, options, send
         self.vehicles: dict[int, _Vehicle] = {}
-        self._waiting: SimpleQueue[Received | Rejection | Exception] = SimpleQueue()
+        self._waiting: SimpleQueue[Received | Rejection | BaseException] = SimpleQueue()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-mavlink", daemon=True)
         self._thread.start()
@@ -110,7 +110,7 @@ class LogReceiver:
         with suppress(Empty):
             for number in range(_MAX_READ):
                 item = self._waiting.get_nowait() if number else self._waiting.get(timeout=timeout)
-                if isinstance(item, Exception):
+                if isinstance(item, BaseException):
                     raise item
                 yield item
 
@@ -130,7 +130,7 @@ class LogReceiver:
                 vehicle.client.status.state == "stopping" for vehicle in self.vehicles.values()
             ):
                 self._step()
-        except Exception as exc:  # noqa: BLE001 - re-raised by `read`, on the thread of the source
+        except BaseException as exc:  # noqa: BLE001 - re-raised by `read`, on the thread of the source
             self._waiting.put(exc)
 
     def _step(self) -> None:

@@ -95,7 +95,7 @@ class Px4ZenohNode:
 
     def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
         self._session, self._streams = session, streams
-        self._pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._pending: queue.SimpleQueue[zenoh.Sample | BaseException] = queue.SimpleQueue()
         self._tokens = LivelinessTokens(session, px4_publishers_key_expr(domain))
         self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
@@ -120,9 +120,11 @@ class Px4ZenohNode:
             for (where, reason), count in new.items():
                 yield Rejection(where, reason, count=count)
             self._reported += new
-            sample: zenoh.Sample | None = None
+            sample: zenoh.Sample | BaseException | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=TIMINGS.source_tick)
+            if isinstance(sample, BaseException):
+                raise sample
             for token, alive in self._tokens.poll():  # tokens are declared before the sample is sent
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
@@ -203,7 +205,7 @@ class Px4ZenohNode:
             return self._session.liveliness().declare_token(text)
 
     def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
-        with suppress(zenoh.ZError):  # undeclared
+        try:
             while True:
                 sample = handler.recv()
                 if self._pending.qsize() >= _MAX_PENDING:
@@ -212,6 +214,9 @@ class Px4ZenohNode:
                     self._dropped[_TOO_LARGE] += 1
                 else:
                     self._pending.put(sample)
+        except BaseException as exc:  # noqa: BLE001 - re-raised by `run`, on the thread of the source
+            if not isinstance(exc, zenoh.ZError):  # else it is undeclared
+                self._pending.put(exc)
 
 
 def _read_definitions(paths: str) -> Definitions:

@@ -236,11 +236,11 @@ def test_definition_with_wrong_hash_is_ignored(client: nedbus.Bus, zenoh_session
 
 
 def test_unresponsive_publisher_does_not_delay_readers(endpoint: str, bus: nedbus.Bus, zenoh_session: Session) -> None:
-    """A message is read as soon as one publisher replies with its definition, even if another does not reply."""
+    """A message is read as soon as one publisher of its vehicle replies, even if another does not."""
     held: list[zenoh.Query] = []
     publisher_of(bus, "A").publish(fields_of("A", 1))
     with (
-        answer_queries(zenoh_session, f"nedbus/@schema/peer/{NAME}", held.append),
+        answer_queries(zenoh_session, f"nedbus/@schema/A/{NAME}", held.append),
         closing(Reader(endpoint, "models").bus) as reader,
         reader.subscribe(TOPIC, mode="every") as subscription,
     ):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -13,6 +15,7 @@ from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.timings import TIMINGS, Timings
+from tests.waits import DEADLINE
 
 from .fake_readers import END, FakeSession, Reader, Stuck
 
@@ -87,6 +90,26 @@ def test_window_is_shared_by_active_publishers() -> None:
         shared.share(f"other {number}", 1000, now=0.5)
     assert shared.share("a", 100, now=0.6) == WINDOW // 10
     assert shared.share("a", 100, now=1.8) == WINDOW
+
+
+def test_shares_of_two_threads_do_not_overwrite_each_other() -> None:
+    """A publisher that asks for its share while another thread does waits, so neither entry is lost."""
+    shared = SharedWindow()
+    other = threading.Thread(target=shared.share, args=["b", 500], kwargs={"now": 0.2})
+
+    class Interrupted(dict[str, tuple[int, float]]):
+        """Entries that another thread changes while they are read, unless it has to wait."""
+
+        def items(self) -> Any:
+            if other.ident is None:
+                other.start()
+                other.join(0.05)  # ends at once if it does not wait
+            return super().items()
+
+    shared._unread = Interrupted()
+    shared.share("a", 1000, now=0.1)
+    other.join(DEADLINE)
+    assert set(shared._unread) == {"a", "b"}
 
 
 @pytest.mark.parametrize(("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)])

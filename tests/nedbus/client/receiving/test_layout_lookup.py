@@ -4,31 +4,34 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable
+from functools import partial
 
-import msgpack
 import pytest
 
-import nedbus
 from nedbus.client.receiving import LayoutLookup, layout_lookup
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
-from nedbus_msgs import DEFAULT, codec_of
 from tests.waits import DEADLINE, wait_for
 
+FIELDS = {"timestamp": "uint64", "x": "float32"}
 
-def look_up(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
-    """Look up the unknown layouts of the payloads, and wait for the replies."""
-    for payload in payloads:
-        with suppress(nedbus.errors.DecodeError):
-            lookup.check(codec_of(DEFAULT), payload)
+
+def look_up(lookup: LayoutLookup, hashes: Iterable[str], name: str = "VehicleLocalPosition") -> None:
+    """Look up the definitions with these hashes, and wait for the replies."""
+    for each in hashes:
+        lookup.codec(name, each)
     lookup.wait()
 
 
-def test_failed_layout_lookups_back_off() -> None:
-    """A failed lookup of a layout is repeated after growing intervals, because its publisher may start later."""
+def only(known: Schemas, _: Collection[SchemaId]) -> Schemas:
+    """Reply to every query with these definitions."""
+    return known
+
+
+def test_failed_lookups_back_off() -> None:
+    """A failed lookup of a definition is repeated after growing intervals, because its publisher may start later."""
     now, queried = 0.0, list[tuple[float, SchemaId]]()
-    payloads = [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
+    hashes = [str(number) for number in range(9, 40)]
 
     def find(schema_ids: Collection[SchemaId]) -> Schemas:
         queried.extend((now, each) for each in schema_ids)
@@ -36,48 +39,69 @@ def test_failed_layout_lookups_back_off() -> None:
 
     lookup = LayoutLookup(find, now=lambda: now)
     while now < 250.0:
-        look_up(lookup, payloads)
+        look_up(lookup, hashes)
         now += 0.5
     assert sorted({when for when, _ in queried}) == [0.0, 0.5, 2.5, 7.5, 17.5, 47.5, 107.5, 167.5, 227.5]
-    assert len(queried) == len(set(queried)) == 9 * len(payloads)
+    assert len(queried) == len(set(queried)) == 9 * len(hashes)
 
 
-def test_only_requested_layouts_are_stored() -> None:
-    """From a reply with thousands of layouts, only the requested ones are stored, up to a limit."""
-    fields = {"timestamp": "uint64", "x": "float32"}
-    known: Schemas = {("VehicleLocalPosition", number): fields for number in range(9, 2000)}
-    lookup = LayoutLookup(lambda _: known)
-    for layout in range(1500, 1520):
-        look_up(lookup, [msgpack.packb([layout, 1, 2.0])])
-    assert list(lookup.newer(DEFAULT)) == list(range(1500, 1516))
+def test_only_requested_definitions_are_stored() -> None:
+    """From a reply with thousands of definitions, only the requested ones are stored."""
+    known: Schemas = {("VehicleLocalPosition", str(number)): FIELDS for number in range(9, 2000)}
+    lookup = LayoutLookup(partial(only, known))
+    look_up(lookup, map(str, range(1500, 1520)))
+    assert [int(which) for _, which in lookup._known] == list(range(1500, 1520))
 
 
-def test_long_field_names_are_truncated_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    """A layout with a field name of 100,000 characters is logged as one short line."""
-    known: Schemas = {("VehicleLocalPosition", 1500): {"timestamp": "uint64", 100_000 * "x": "float32"}}
-    look_up(LayoutLookup(lambda _: known), [msgpack.packb([1500, 1, 2])])
-    [line] = caplog.messages
-    assert line.startswith("layout 1500 of VehicleLocalPosition is newer than this reader; ignored fields: xxx")
-    assert len(line) < 1000
+def test_unknown_fields_are_truncated_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    """The unknown fields of a newer layout are logged as one short line, and an invalid name is truncated."""
+    many = FIELDS | {f"x{number}_{40 * 'x'}": "uint8" for number in range(100)}
+    for fields, start in (
+        (many, "a layout of VehicleLocalPosition is newer than this reader; ignored fields: x0_xxx"),
+        (FIELDS | {100_000 * "x": "uint8"}, "ignored a peer's definition of VehicleLocalPosition: invalid field name"),
+    ):
+        caplog.clear()
+        known: Schemas = {("VehicleLocalPosition", "hash"): fields}
+        look_up(LayoutLookup(partial(only, known)), ["hash"])
+        [line] = caplog.messages
+        assert line.startswith(start)
+        assert len(line) < 1000
+
+
+def test_lookups_continue_after_an_unexpected_error(caplog: pytest.LogCaptureFixture) -> None:
+    """After a panic of Zenoh, which is a BaseException, definitions are still looked up; the error is logged once."""
+
+    def find(ids: Collection[SchemaId]) -> Schemas:
+        if ("First", "hash") in ids:
+            raise BaseException("panic")  # noqa: TRY002 - like pyo3's PanicException, it is not an Exception
+        return dict.fromkeys(ids, FIELDS)
+
+    lookup = LayoutLookup(find)
+    for name in ("First", "Second"):
+        look_up(lookup, ["hash"], name)
+    wait_for(lambda: lookup.codec("Second", "hash"), what="the definition")
+    assert [text for text in caplog.messages if "unexpected" in text] == [
+        "unexpected error in a lookup of definitions (logged once)"
+    ]
+    lookup.close()
 
 
 def test_receiving_thread_does_not_wait_for_a_lookup() -> None:
-    """A check on the receiving thread starts a lookup without waiting for the reply; closing waits for it."""
+    """A request on the receiving thread starts a lookup without waiting for the reply; closing waits for it."""
     queried, answering = threading.Event(), threading.Event()
 
     def find(_: Collection[SchemaId]) -> Schemas:
         queried.set()
         answering.wait(DEADLINE)
-        return {("VehicleLocalPosition", 9): {"timestamp": "uint64", "x": "float32"}}
+        return {("VehicleLocalPosition", "hash"): FIELDS}
 
     lookup = LayoutLookup(find)
-    with pytest.raises(nedbus.errors.UnknownLayoutError):
-        lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
+    assert lookup.codec("VehicleLocalPosition", "hash") is None
     assert queried.wait(DEADLINE)
-    assert not lookup.newer(DEFAULT)
+    assert lookup.codec("VehicleLocalPosition", "hash") is None
     answering.set()
     lookup.close()
-    lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
+    assert lookup.codec("VehicleLocalPosition", "hash")
 
 
 def test_definition_requested_during_a_lookup_is_looked_up_next() -> None:
@@ -90,7 +114,7 @@ def test_definition_requested_during_a_lookup_is_looked_up_next() -> None:
     def find(schema_ids: Collection[SchemaId]) -> Schemas:
         queried.append(set(schema_ids))
         answering.wait(DEADLINE)
-        return {each: {"timestamp": "uint64", "x": "float32"} for each in schema_ids}
+        return dict.fromkeys(schema_ids, FIELDS)
 
     lookup = LayoutLookup(find)
     for name in ("First", "First", "Second"):
@@ -139,4 +163,4 @@ def test_memory_for_definitions_is_bounded(monkeypatch: pytest.MonkeyPatch, capl
     assert lookup.codec("Honest", "0") is known[0]
     assert lookup.codec("Honest", "new", wait=True)
     assert [lookup.codec("Honest", str(number)) is known[number] for number in (0, 2)] == [True, True]
-    assert len(lookup._codecs) == len(lookup._used) == 10
+    assert len(lookup._known) == 10

@@ -55,6 +55,35 @@ def test_first_reply_of_a_publisher_is_retained(mode: Mode) -> None:
     assert seen == [True, False, False, False, False]
 
 
+class Guarded(int):
+    """A counter that may only be increased by the owner of a queue's lock."""
+
+    queue: PendingQueue
+
+    def __add__(self, other: int) -> Guarded:
+        assert self.queue._lock._is_owned()  # type: ignore[attr-defined] # not in typeshed
+        increased = Guarded(int(self) + other)
+        increased.queue = self.queue
+        return increased
+
+
+@pytest.mark.parametrize("form", ["models", "batches"])
+def test_counters_are_changed_with_the_lock(form: str) -> None:
+    """Reading valid and invalid messages changes the counters only with the lock, because several threads may read."""
+    pending_queue = make_queue("every")
+    put(pending_queue, [raw(0), raw(3, payload=INVALID), raw(4)])
+    zero = pending_queue._received = Guarded()
+    zero.queue = pending_queue
+    for stream in pending_queue._streams.values():
+        stream.unreported = zero
+    if form == "batches":
+        while pending_queue.pop_batch():
+            pass
+    else:
+        drain(pending_queue)
+    assert pending_queue.counts == Counts(received=2, lost=2, invalid=1)
+
+
 @pytest.mark.parametrize(
     ("mode", "arriving", "losses", "counts"),
     [

@@ -82,6 +82,19 @@ def test_same_first_message_begins_new_stream_after_reboot() -> None:
     assert [each.chunk.begins for each in received if each.chunk] == [True, False, True]
 
 
+def test_error_of_the_receiving_thread_is_raised_by_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error of the receiving thread, even one that is not an Exception, is raised where messages are read."""
+
+    def fail(_: LogReceiver) -> None:
+        raise BaseException("panic")  # noqa: TRY002 - like pyo3's PanicException, it is not an Exception
+
+    monkeypatch.setattr(LogReceiver, "_step", fail)
+    with closing(open_link(f"udpin:127.0.0.1:{free_port()}", baud=57600)) as link:
+        receiver = LogReceiver(LinkReader(link, name="link"), MavlinkOptions(), lambda *_: None)
+        with closing(receiver), pytest.raises(BaseException, match="panic"):
+            list(receiver.read(DEADLINE))
+
+
 def test_stream_joined_midway_has_no_definitions() -> None:
     """Without its header a stream cannot be decoded: nothing is delivered or counted as lost until the next header."""
     reassembly = CountingReassembly()

@@ -435,6 +435,25 @@ def test_oversized_samples_are_not_queued(listener: Listener, zenoh_session: Ses
     assert counts == {"size": 2, f"0/a/{name}/hash": 1, f"0/last/{name}/hash": 1}
 
 
+class Panics:
+    """A limit that panics when it is compared; like pyo3's PanicException, the error is not an Exception."""
+
+    def __lt__(self, _: int) -> bool:
+        raise BaseException("panic")  # noqa: TRY002 - see above
+
+
+def test_panic_in_the_receiving_thread_fails_the_source(
+    listener: Listener, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A panic of Zenoh on the receiving thread fails the source, which the service then restarts."""
+    key = f"0/a/{dds_type(ROS2_TYPE)}/hash"
+    wait_for_matching(zenoh_session, key)
+    monkeypatch.setattr("nedbus.sources.px4.source._MAX_PENDING_BYTES", Panics())
+    zenoh_session.put(key, bytes(300))
+    with pytest.raises(BaseException, match="panic"):
+        listener.step_until(lambda: False, what="the error")
+
+
 def test_ended_source_undeclares_its_subscriber(zenoh_session: Session, endpoint: str) -> None:
     """A source borrows the service's session, and leaves no subscriber in it."""
     probe = zenoh_session.declare_publisher(Px4(zenoh_session).key())
