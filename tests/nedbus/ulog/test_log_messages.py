@@ -125,7 +125,7 @@ CHECKS = {
     "Navigation error: No valid global position estimate", "No valid mission available", "No manual control input",
     "No connection to the ground control station", "Offboard requires local position", "Home position not set",
     "No valid attitude estimate", "Attitude failure detected", "Horizontal position unstable",
-    "No valid global position estimate", "No valid local position estimate",
+    "No valid global position estimate", "No valid local position estimate", "No valid data from barometer 0",
 }  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import random
 import re
 import struct
 import time
+import tracemalloc
 from collections import defaultdict
 from pathlib import Path
 
@@ -157,6 +158,94 @@ def test_nested_format_bomb_is_rejected_quickly() -> None:
     assert time.process_time() - begin < 1
     assert not data_of(records)
     assert len([each for each in records if isinstance(each, Damage)]) == 2
+
+
+def test_data_that_is_not_readable_raises_once() -> None:
+    """After the error, the parser discards all data: its memory stays constant."""
+    log = small_log(0)
+    log = log[:27] + b"\2" + log[28:]  # an unknown incompatible flag
+    parser = UlogParser(verify=False)
+    assert parser.feed(log[:30]) == []
+    with pytest.raises(UlogError, match="unknown incompatible flags 0x2"):
+        parser.feed(log[30:])
+    assert held_memory(parser, small_log(1000), 249) < 2**12
+    assert parser.close() == []
+
+
+def held_memory(parser: UlogParser, data: bytes, chunk: int) -> int:
+    """Return the largest memory [bytes] held between the chunks of a log that yields no record."""
+    tracemalloc.start()
+    try:
+        start, most = tracemalloc.get_traced_memory()[0], 0
+        for at in range(0, len(data), chunk):
+            assert parser.feed(data[at : at + chunk]) == []
+            most = max(most, tracemalloc.get_traced_memory()[0] - start)
+    finally:
+        tracemalloc.stop()
+    return most
+
+
+@pytest.mark.parametrize(
+    ("verify", "limit"), [(True, 257 * 2**10), (False, 65 * 2**10)], ids=["with verification", "without"]
+)
+@pytest.mark.parametrize("size", [60_000, 65_535])
+def test_held_data_is_bounded(verify: bool, limit: int, size: int) -> None:
+    """Neither damage followed by long records of unknown types nor a partial record grows the buffer."""
+    writer = UlogWriter()
+    parser = UlogParser(verify=verify)
+    parser.feed(bytes(writer.data))
+    writer.data.clear()
+    if verify:
+        writer.data += b"\0" * 3 + b"\1" * 131_000
+        writer.put("P", b"\x09float A_B" + bytes(4))
+    for _ in range(10 if verify else 1):
+        writer.put("Z", bytes(size))
+    held = held_memory(parser, bytes(writer.data[:-1]), 2**12)
+    assert limit // 4 < held < limit
+
+
+def test_topic_that_is_subscribed_again_continues() -> None:
+    """A subscription after an unsubscription continues the first one that has ended, with any message id."""
+    writer = UlogWriter()
+    writer.put("F", b"a:uint64_t timestamp;uint8_t[4] _padding0;")
+    writer.put("F", b"b:uint64_t timestamp;")
+    steps = (
+        ("A", 1, b"a"), ("A", 2, b"b"), ("A", 3, b"a"),  # a topic is subscribed twice
+        ("D", 1, b""), ("D", 3, b""), ("A", 1, b"a"), ("D", 1, b""),
+        ("R", 1, b""), ("R", 9, b""), ("D", 1, b""), ("D", 2, b""),
+        ("A", 1, b"a"), ("D", 1, b"\0\0\0\0"), ("R", 1, b""), ("R", 3, b""),
+        ("A", 2, b"a"), ("R", 2, b""),  # the id belongs to b
+        ("A", 2, b"a"), ("D", 2, b""), ("A", 3, b"b"), ("D", 3, b""),
+    )  # fmt: skip
+    for number, (kind, message_id, rest) in enumerate(steps):
+        content = {"A": b"\0", "D": b"", "R": b""}[kind] + struct.pack("<H", message_id)
+        writer.put(kind, content + (struct.pack("<Q", number) if kind == "D" else b"") + rest)
+    parser = UlogParser(verify=False)
+    records = parser.feed(bytes(writer.data))
+    subscriptions = [each for each in records if isinstance(each, Subscription)]
+    assert [(each.message_id, each.name) for each in subscriptions] == [(1, "a"), (2, "b"), (3, "a")]
+    found = [
+        (subscriptions.index(each.subscription), each.payload[0]) for each in records if isinstance(each, Data)
+    ]  # fmt: skip
+    assert found == [(0, 3), (2, 4), (0, 6), (1, 10), (0, 12), (0, 18), (1, 20)]
+    assert [each.reason for each in records if isinstance(each, Damage)] == [
+        "a is ignored, because its message id belongs to b"
+    ]
+    assert parser.undecodable == 1
+
+
+def test_number_of_subscriptions_is_limited() -> None:
+    """Beyond 1000, only subscriptions that continue an earlier one are accepted."""
+    writer = UlogWriter()
+    writer.put("F", b"a:uint64_t timestamp;")
+    for number in range(1003):
+        writer.put("A", struct.pack("<BH", number % 256, number) + b"a")
+        writer.put("R", struct.pack("<H", number))
+    for number in range(1003):
+        writer.put("A", struct.pack("<BH", number % 256, number) + b"a")
+    records = parse(bytes(writer.data), verify=False)
+    assert sum(isinstance(each, Subscription) for each in records) == 1000
+    assert len({each.reason for each in records if isinstance(each, Damage)}) == 1
 
 
 @pytest.mark.parametrize(
