@@ -84,7 +84,7 @@ class LogStream:
             return
         self._received += len(chunk.data)
         self._window_bytes += len(chunk.data)
-        undecodable, omitted = self._parser.undecodable, self._texts.limit.omitted
+        undecodable, omitted, problem = self._parser.undecodable, self._texts.limit.omitted, self._texts.problem
         try:
             records = self._parser.feed(chunk.data)
         except ulog.UlogError as exc:  # raised once for each stream
@@ -109,6 +109,7 @@ class LogStream:
                 yield Rejection(f"{self._name} ULog stream", record.reason)
         count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
         yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
+        yield from [Rejection(where, self._texts.problem, count=0)] * (self._texts.problem != problem)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
         """Use the answer to a TIMESYNC request if its round trip is the shortest so far, or the last offset is old."""

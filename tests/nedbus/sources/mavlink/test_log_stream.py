@@ -260,6 +260,24 @@ def test_topic_that_is_subscribed_in_turns_is_one_stream() -> None:
     assert [each.where for each in found if isinstance(each, Rejection)] == ["1 bad/topic"]
 
 
+def test_unreadable_event_metadata_is_rejected_once() -> None:
+    """A stream whose event metadata is damaged reports it with its first event."""
+    stream = LogStream("1", MavlinkOptions(topics=("*",)), cast("Any", None))
+    writer = UlogWriter()
+    writer.put("M", b"\0\x1auint8_t[6] metadata_eventsnot xz")
+    writer.put(
+        "F", b"event:uint64_t timestamp;uint32_t id;uint16_t event_sequence;uint8_t[25] arguments;uint8_t log_levels;"
+    )
+    writer.put("A", struct.pack("<BH", 0, 1) + b"event")
+    found = [*stream.add(Chunk("delivered", bytes(writer.data), begins=True), 0.0)]
+    for number in range(3):
+        record = struct.pack("<HBHQIH26x", 42, ord("D"), 1, number, 1, number)
+        found += stream.add(Chunk("delivered", record), 0.0)
+    [rejection] = [each for each in found if isinstance(each, Rejection)]
+    assert (rejection.where, rejection.count) == ("1 log_message", 0)
+    assert "the event metadata cannot be read" in rejection.reason
+
+
 HOSTILE: Final = [
     b"\0" * 249,
     b"ULog\x01\x12\x35\x01" + bytes(8) + b"".join(
