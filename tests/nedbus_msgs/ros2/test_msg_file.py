@@ -131,6 +131,14 @@ def test_malformed_range_raises(annotation: str) -> None:
         define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # [m] {annotation}\n")
 
 
+@pytest.mark.parametrize(("annotation", "limits"), [("5, 0", "5 to 0"), ("inf, 1.5 @invalid 3", "inf to 1.5")])
+def test_empty_range_raises(annotation: str, limits: str) -> None:
+    """Limits in the wrong order, which would reject every message, are an error of the file; equal ones are not."""
+    with pytest.raises(MsgError, match=f"line 2, column 1: no number is in the @range of x, from {limits}"):
+        define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # @range {annotation}\n")
+    assert define_msg("Right", "uint64 timestamp\nfloat32 x  # @range 1, 1\n").rules
+
+
 @pytest.mark.parametrize("length", ["[x]", "[0]", "[-1]", "[1_0]", "[", "[2000]", "[<=3]"])
 def test_invalid_length_of_an_array_of_messages_raises(length: str) -> None:
     text = f"uint64 timestamp\nPart{length} parts\n===\nMSG: px4_msgs/Part\nbool flag\n"
