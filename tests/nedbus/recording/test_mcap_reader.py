@@ -323,7 +323,7 @@ def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
         nedbus.read(tmp_path)
 
 
-def test_compressed_recording_is_read(tmp_path: Path) -> None:
+def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file from `ros2 bag record --compression-mode file` is read up to the first damage or a size limit."""
     path = tmp_path / "a.mcap.zstd"
     data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
@@ -332,7 +332,8 @@ def test_compressed_recording_is_read(tmp_path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
         nedbus.read(path)
-    path.write_bytes(zstandard.compress(bytes(2**28)))
+    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_SMALL_CHUNK", 2**20)
+    path.write_bytes(zstandard.compress(bytes(2**21)))
     with pytest.raises(SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"):
         nedbus.read(path)
 

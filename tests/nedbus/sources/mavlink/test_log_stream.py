@@ -283,10 +283,11 @@ HOSTILE: Final = [
     b"ULog\x01\x12\x35\x01" + bytes(8) + b"".join(
         struct.pack("<HB", len(body), ord(kind)) + body
         for kind, body in (
-            ("F", b"loop:uint64_t timestamp;loop inner;"),
-            ("F", b"wide:" + b"uint8_t[999999999] a;"),
+            ("F", b"deep:uint64_t timestamp;a a;"),
+            *(("F", f"{name}:{name}a a;".encode()) for name in ("a", "aa", "aaa", "aaaa")),
+            ("F", b"wide:" + b"uint8_t[65534] a;"),
             ("F", b"vehicle_status:uint64_t timestamp;float timestamp;"),
-            ("A", struct.pack("<BH", 0, 1) + b"loop"),
+            ("A", struct.pack("<BH", 0, 1) + b"deep"),
             ("A", struct.pack("<BH", 0, 2) + b"wide"),
             ("A", struct.pack("<BH", 0, 3) + b"vehicle_status"),
             ("A", struct.pack("<BH", 0, 4) + b"unknown"),
@@ -332,7 +333,7 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
     reasons = {(each.where, each.reason) for each in received.rejections}
     assert sent[str(START)]
     assert any("not requested" in reason for _, reason in reasons)
-    assert any("loop cannot be decoded" in reason for _, reason in reasons), reasons
+    assert any("deep cannot be decoded" in reason for _, reason in reasons), reasons
     assert any("two fields are called timestamp" in reason for _, reason in reasons), reasons
     assert len(reasons) < 110
 
