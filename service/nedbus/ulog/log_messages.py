@@ -90,23 +90,12 @@ class _ArgumentType(NamedTuple):
         return (self.separator or "").join(names)[:_MAX_TEXT]
 
 
-class _EventDefinition(NamedTuple):
-    """An event of the metadata; `mode_argument`: index of `modes`; `listed`: `lists_checks_of` by custom mode."""
-
-    group: str
-    template: str
-    arguments: Sequence[_ArgumentType]
-    unpack: Callable[[bytes], tuple[Any, ...]]
-    mode_argument: int | None
-    listed: Mapping[int, int]
-
-
 class _EventMetadata:
     """Valid event definitions of one firmware; raises ValueError if the metadata is damaged or oversized."""
 
     def __init__(self, packed: bytes) -> None:
         self._types = {name: _ArgumentType(kind.form) for name, kind in BASIC_TYPES.items()}
-        self._events: dict[tuple[str, str], _EventDefinition] = {}  # by component and id
+        self._decoders: dict[tuple[str, str], Callable[[bytes], _Event]] = {}  # by component and id
         try:
             xz = lzma.LZMADecompressor(memlimit=_MAX_MEMORY)
             unpacked = xz.decompress(packed, _MAX_UNPACKED)
@@ -123,12 +112,12 @@ class _EventMetadata:
                 for name, enum in content.items():
                     self._add_enum(f"{component['namespace']}::{name}", enum)
             for number, component in components.items():
-                listed = _modes(component)
+                states = _states(component)
                 for group, part in component["event_groups"].items():
                     for key, event in part["events"].items():
                         with suppress(*_DAMAGED):
-                            definition = self._define(event, group, component["namespace"], listed)
-                            self._events.setdefault((number, key), definition)
+                            decoder = self._decoder(event, group, component["namespace"], states)
+                            self._decoders.setdefault((number, key), decoder)
         except _DAMAGED as exc:
             reason = str(exc) if isinstance(exc, ValueError | lzma.LZMAError) else "unexpected structure"
             raise ValueError(f"the event metadata cannot be read ({reason})") from exc
@@ -136,13 +125,7 @@ class _EventMetadata:
     def decode(self, number: int, arguments: bytes) -> _Event | None:
         """Return the event with this id; None if the id is unknown, or the arguments do not match."""
         with suppress(*_DAMAGED):
-            group, template, types, unpack, mode_argument, listed = self._events[
-                str(number >> 24), str(number & 0xFFFFFF)
-            ]
-            values = unpack(arguments)
-            shown = [each.show(value) for each, value in zip(types, values, strict=True)]
-            modes = None if mode_argument is None else values[mode_argument]
-            return _Event(group, _fill(template, shown), modes, listed.get(values[0], 0) if listed else 0)
+            return self._decoders[str(number >> 24), str(number & 0xFFFFFF)](arguments)
         return None
 
     def _add_enum(self, name: str, enum: Mapping[str, Any]) -> None:
@@ -151,33 +134,33 @@ class _EventMetadata:
             separator = enum.get("separator", "|")[:_MAX_SEPARATOR] if enum.get("is_bitfield") else None
             self._types.setdefault(name, _ArgumentType(BASIC_TYPES[enum["type"]].form, names, separator))
 
-    def _define(
-        self, event: Mapping[str, Any], group: str, namespace: str, listed: Mapping[int, int]
-    ) -> _EventDefinition:
-        arguments = event.get("arguments", [])
-        if len(arguments) > _MAX_ARGUMENTS:
+    def _decoder(
+        self, event: Mapping[str, Any], group: str, namespace: str, states: Mapping[Any, int]
+    ) -> Callable[[bytes], _Event]:
+        """Return the function that decodes the arguments of an event."""
+        names = [each["type"] for each in event.get("arguments", [])[: _MAX_ARGUMENTS + 1]]
+        if len(names) > _MAX_ARGUMENTS:
             raise ValueError
-        names = [each["type"] for each in arguments]
         types = [self._types.get(name) or self._types[f"{namespace}::{name}"] for name in names]
-        modes = next((index for index, name in enumerate(names) if "navigation_mode_group_t" in name), None)
-        return _EventDefinition(
-            group,
-            event["message"][:_MAX_TEXT],
-            types,
-            struct.Struct("<" + "".join(each.code for each in types)).unpack_from,
-            modes if group in _CHECKS else None,
-            listed if event.get("type") == "append_health_and_arming_messages" else {},
-        )
+        unpack = struct.Struct("<" + "".join(each.code for each in types)).unpack_from
+        masks = [index for index, name in enumerate(names) if "navigation_mode_group_t" in name and group in _CHECKS]
+        lists_checks, template = event.get("type") == "append_health_and_arming_messages", event["message"][:_MAX_TEXT]
+
+        def decode(data: bytes) -> _Event:
+            values = unpack(data)
+            text = _fill(template, [each.show(value) for each, value in zip(types, values, strict=True)])
+            listed = states.get(values[0], 0) if lists_checks else 0
+            return _Event(group, text, values[masks[0]] if masks else None, listed)
+
+        return decode
 
 
-def _modes(component: Mapping[str, Any]) -> Mapping[int, int]:
-    """Return the bit of the navigation state of each custom mode."""
-    modes: dict[int, int] = {}
+def _states(component: Mapping[str, Any]) -> Mapping[int, int]:
+    """Return the bit mask of the navigation state of each custom mode."""
     with suppress(*_DAMAGED):
-        for bit, customs in islice(component["navigation_mode_groups"]["groups"].items(), _MAX_PARTS):
-            for custom in customs[:_MAX_PARTS]:
-                modes.setdefault(custom, 1 << int(bit) % 32)
-    return modes
+        groups = component["navigation_mode_groups"]["groups"].items()
+        return {mode: 1 << int(bit) % 32 for bit, modes in islice(groups, _MAX_PARTS) for mode in modes[:_MAX_PARTS]}
+    return {}
 
 
 def _fill(template: str, values: Sequence[Any]) -> str:

@@ -2,7 +2,6 @@
 
 import re
 import struct
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -67,9 +66,8 @@ class UlogParser:
         self._is_readable = True
         self._formats = Formats()
         self.subscriptions: dict[int, Subscription] = {}
-        self._firsts: dict[tuple[str, int], Subscription] = {}  # by topic and instance
-        self._ended: dict[tuple[str, int], deque[Subscription]] = {}  # without current messages, the first at the end
-        self._count = 0  # of subscriptions that do not continue another
+        self._ended: dict[tuple[str, int], list[Subscription]] = {}  # by topic and instance
+        self._count = 0  # of subscriptions that do not continue an ended one
         self._known: dict[bytes, tuple[Subscription, int, int]] = {}
         """By the first five bytes of a data message: its subscription, its length, and the length without padding."""
         self._buffer = b""
@@ -278,7 +276,7 @@ class UlogParser:
         kind, reason = self._buffer[at + 2], ""
         if inspected.record is not None:
             try:
-                self._records.extend(self._apply(inspected.record))
+                self._apply(inspected.record)
             except ValueError as exc:
                 reason = str(exc)
         elif inspected.validity == "valid":
@@ -292,25 +290,27 @@ class UlogParser:
             self._records.append(Damage(reason))
         return inspected.stop
 
-    def _apply(self, record: Record) -> list[Record]:
-        """Store a definition; return it if it is new; raise ValueError if it is unusable."""
+    def _apply(self, record: Record) -> None:
+        """Add a record to the result, and store a definition; raise ValueError if it is unusable."""
         if isinstance(record, Subscription):
-            return self._subscribe(record)
+            self._subscribe(record)
+            return
         if isinstance(record, Format):
             self._formats.add(record.name, record.fields)
         elif isinstance(record, Unsubscription):
             self._unsubscribe(record.message_id)
-        return [record]
+        self._records.append(record)
 
-    def _subscribe(self, new: Subscription) -> list[Record]:
-        """Start to decode the data messages of an id; return the subscription unless it continues an earlier one."""
-        old, topic = self.subscriptions.get(new.message_id), (new.name, new.multi_id)
+    def _subscribe(self, new: Subscription) -> None:
+        """Decode the data messages of an id; add its subscription to the result unless it continues another."""
+        topic, old = (new.name, new.multi_id), self.subscriptions.get(new.message_id)
         if old is not None:
             if (old.name, old.multi_id) != topic:
                 raise ValueError(f"{new.name} is ignored, because its message id belongs to {old.name}")
-            return []
-        is_new = not self._ended.get(topic)
-        if is_new:
+            return
+        if ended := self._ended.get(topic):
+            subscription = ended.pop(0)
+        else:
             try:
                 if self._count == _MAX_SUBSCRIPTIONS:
                     raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
@@ -318,23 +318,18 @@ class UlogParser:
             except ValueError as exc:
                 raise ValueError(f"{new.name} cannot be decoded, because {exc}") from exc
             self._count += 1
-            self._firsts.setdefault(topic, subscription)
-        else:
-            subscription = self._ended[topic].pop()
+            self._records.append(subscription)
         self.subscriptions[new.message_id] = subscription
         used = subscription.layout.size + _DATA_HEADER
         for length, head in _heads(new.message_id, subscription.layout):
             self._known[head] = subscription, length, used
-        return [subscription] if is_new else []
 
     def _unsubscribe(self, message_id: int) -> None:
         old = self.subscriptions.pop(message_id, None)
         if old is not None:
             for _, head in _heads(message_id, old.layout):
                 del self._known[head]
-            topic = old.name, old.multi_id
-            ended = self._ended.setdefault(topic, deque())
-            (ended.append if old is self._firsts[topic] else ended.appendleft)(old)
+            self._ended.setdefault((old.name, old.multi_id), []).append(old)
 
 
 def _heads(message_id: int, layout: PayloadLayout) -> Iterator[tuple[int, bytes]]:

@@ -215,16 +215,16 @@ def test_data_that_is_not_readable_raises_once() -> None:
     with pytest.raises(UlogError, match="unknown incompatible flags 0x2"):
         parser.feed(log[30:])
     assert held_memory(parser, small_log(1000), 249) < 2**12
-    assert parser.close() == []
+    assert parser.feed(small_log()) == parser.close() == []
 
 
 def held_memory(parser: UlogParser, data: bytes, chunk: int) -> int:
-    """Return the largest memory [bytes] held between the chunks of a log that yields no record."""
+    """Return the largest memory [bytes] held between the chunks of a log, without the records."""
     tracemalloc.start()
     try:
         start, most = tracemalloc.get_traced_memory()[0], 0
         for at in range(0, len(data), chunk):
-            assert parser.feed(data[at : at + chunk]) == []
+            parser.feed(data[at : at + chunk])
             most = max(most, tracemalloc.get_traced_memory()[0] - start)
     finally:
         tracemalloc.stop()
@@ -248,6 +248,20 @@ def test_held_data_is_bounded(verify: bool, limit: int, size: int) -> None:
         writer.put("Z", bytes(size))
     held = held_memory(parser, bytes(writer.data[:-1]), 2**12)
     assert limit // 4 < held < limit
+
+
+def test_subscriptions_hold_constant_memory() -> None:
+    """Neither subscriptions that end, nor those to unknown topics, grow a table."""
+    writer = UlogWriter()
+    writer.put("F", b"a:uint64_t timestamp;")
+    parser = UlogParser(verify=False)
+    parser.feed(bytes(writer.data))
+    writer.data.clear()
+    for number in range(3000):
+        writer.put("A", struct.pack("<BH", 0, number) + b"a")
+        writer.put("A", struct.pack("<BH", number % 256, number + 1) + b"unknown%d" % number)
+        writer.put("R", struct.pack("<H", number))
+    assert held_memory(parser, bytes(writer.data), 249) < 2**14
 
 
 def test_topic_that_is_subscribed_again_continues() -> None:
