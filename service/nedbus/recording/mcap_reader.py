@@ -17,6 +17,7 @@ from nedbus_msgs import (
     Definition,
     FieldType,
     Layout,
+    MsgError,
     define_msg,
     is_vehicle_input,
     read_msg,
@@ -213,7 +214,12 @@ class _RecordedFile:
             text = schema.data.decode(errors="replace")
             types = {field.name: field.type for field in read_msg(text)}
             self._definition_budget -= 32 + len(types)
-            definition = ros2_types().get(schema.name) or define_msg(schema.name.rpartition("/")[2], text)
+            name = schema.name.rpartition("/")[2]
+            try:
+                definition = ros2_types().get(schema.name) or define_msg(name, text)
+            except MsgError as exc:
+                definition = define_msg(name, text.replace("@range", "range"))
+                self.chunks.warn(f"ignored the ranges in the definition of {topic} ({exc})")
             same = (each for each in definition.layouts.values() if [*each.types.items()] == [*types.items()])
             self._layouts[schema.id] = definition, next(same, None) or self._own_layout(definition, types, topic)
         return self._layouts[schema.id]

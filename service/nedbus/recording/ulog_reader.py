@@ -34,7 +34,7 @@ class UlogReader:
         self._parser, self._texts = ulog.UlogParser(verify=True), ulog.LogMessageBuilder()
         self._damages = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
-        self._by_id: dict[int, ulog.LoggedStream | None] = {}
+        self._opened: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
         # PX4 can log a topic twice. `_checksums`: of the messages of such topics; `_firsts`: first stream by duplicate.
         self._checksums: dict[ulog.LoggedStream, int] = {}
@@ -60,7 +60,7 @@ class UlogReader:
 
         Raises SourceError if the file is not a ULog file, or has none of the topics.
         """
-        streams, checksums, firsts, data = self._by_id, self._checksums, self._firsts, ulog.Data
+        streams, checksums, firsts, data = self._opened, self._checksums, self._firsts, ulog.Data
         for records in self._records():
             for record in self._texts.merge(records):
                 if not isinstance(record, data):
@@ -68,9 +68,9 @@ class UlogReader:
                     continue
                 subscription, payload = record
                 try:
-                    stream = streams[subscription.message_id]
+                    stream = streams[subscription]
                 except KeyError:
-                    stream = streams[subscription.message_id] = self._open(subscription)
+                    stream = streams[subscription] = self._open(subscription)
                 if stream is not None:
                     if stream in checksums:
                         checksums[stream] = crc32(payload, checksums[stream])
@@ -115,8 +115,6 @@ class UlogReader:
             self._system_id = str(record.value)
         elif isinstance(record, ulog.Subscription):
             self._subscribed[record.name] += 1
-        elif isinstance(record, ulog.Unsubscription):
-            self._by_id.pop(record.message_id, None)
         elif isinstance(record, ulog.Damage):
             self._damages += not record.is_end
             self.damaged |= not record.is_end

@@ -14,5 +14,4 @@ from .records import (
     Record,
     Subscription,
     UlogError,
-    Unsubscription,
 )

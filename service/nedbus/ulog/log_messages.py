@@ -9,7 +9,7 @@ import lzma
 import re
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from typing import Any, Final, NamedTuple
@@ -38,7 +38,10 @@ _PREFIX = re.compile(r"\[[\w-]+\] |preflight(?: fail)?: ", re.IGNORECASE)
 _MAX_PACKED: Final = 2**18  # bytes; PX4's take 17,000
 _MAX_UNPACKED: Final = 2**21  # bytes; PX4's take 170,000
 _MAX_MEMORY: Final = 2**27  # bytes for the xz dictionary
-_MAX_PARTS: Final = 64  # components, event groups, mode groups, and modes per group; PX4 has 30
+_MAX_PARTS: Final = 64  # components, event groups, enums, mode groups, and modes per group; PX4 has 30
+_MAX_EVENTS: Final = 5000  # of all components; PX4 has 400
+_MAX_ARGUMENTS: Final = 25  # of an event; PX4's have up to 6, in 25 bytes
+_MAX_SEPARATOR: Final = 10  # characters between the names of a bit field
 _MAX_TEXT: Final = 200  # characters of a template, or of an argument; PX4's longest template has 120
 _CHECKS: Final = ("arming_check", "health")
 _MARKUP = re.compile(
@@ -71,62 +74,93 @@ class _Event(NamedTuple):
     lists_checks_of: int
 
 
+class _ArgumentType(NamedTuple):
+    """Type of an argument; `code`: struct format; `names`: of an enum; `separator`: of the names of a bit field."""
+
+    code: str
+    names: Mapping[str, str] | None = None
+    separator: str | None = None
+
+    def show(self, value: Any) -> Any:
+        """Return a number as it is, and the name of an enum's value, or of each bit set."""
+        if self.names is None:
+            return value
+        bits = [value] if self.separator is None else [1 << bit for bit in range(64) if value >> bit & 1]
+        names = (self.names.get(str(each), f"(unknown: {value})") for each in bits)
+        return (self.separator or "").join(names)[:_MAX_TEXT]
+
+
 class _EventMetadata:
-    """Event definitions of one firmware; raises ValueError for damaged or oversized metadata."""
+    """Valid event definitions of one firmware; raises ValueError if the metadata is damaged or oversized."""
 
     def __init__(self, packed: bytes) -> None:
+        self._types = {name: _ArgumentType(kind.form) for name, kind in BASIC_TYPES.items()}
+        self._decoders: dict[tuple[str, str], Callable[[bytes], _Event]] = {}  # by component and id
         try:
             xz = lzma.LZMADecompressor(memlimit=_MAX_MEMORY)
             unpacked = xz.decompress(packed, _MAX_UNPACKED)
             if not xz.eof:
                 raise ValueError(f"incomplete, or more than {_MAX_UNPACKED} bytes")
-            self._components: Mapping[str, Any] = json.loads(unpacked)["components"]
-            parts = [self._components, *(each["event_groups"] for each in self._components.values())]
-            if max(map(len, parts)) > _MAX_PARTS:
-                raise ValueError(f"more than {_MAX_PARTS} components or event groups")
+            components: Mapping[str, Any] = json.loads(unpacked)["components"]
+            groups = [each["event_groups"] for each in components.values()]
+            enums = [each.get("enums", {}) for each in components.values()]
+            if max(map(len, [components, *groups, *enums])) > _MAX_PARTS:
+                raise ValueError(f"more than {_MAX_PARTS} components, event groups or enums")
+            if sum(len(part["events"]) for group in groups for part in group.values()) > _MAX_EVENTS:
+                raise ValueError(f"more than {_MAX_EVENTS} events")
+            for component, content in zip(components.values(), enums, strict=True):
+                for name, enum in content.items():
+                    self._add_enum(f"{component['namespace']}::{name}", enum)
+            for number, component in components.items():
+                states = _states(component)
+                for group, part in component["event_groups"].items():
+                    for key, event in part["events"].items():
+                        with suppress(*_DAMAGED):
+                            decoder = self._decoder(event, group, component["namespace"], states)
+                            self._decoders.setdefault((number, key), decoder)
         except _DAMAGED as exc:
-            raise ValueError(f"the event metadata cannot be read ({str(exc) or type(exc).__name__})") from exc
+            reason = str(exc) if isinstance(exc, ValueError | lzma.LZMAError) else "unexpected structure"
+            raise ValueError(f"the event metadata cannot be read ({reason})") from exc
 
     def decode(self, number: int, arguments: bytes) -> _Event | None:
         """Return the event with this id; None if the id is unknown, or the arguments do not match."""
-        try:
-            component, key = self._components[str(number >> 24)], str(number & 0xFFFFFF)
-            group = next(name for name, each in component["event_groups"].items() if key in each["events"])
-            event = component["event_groups"][group]["events"][key]
-            types = [each["type"] for each in event.get("arguments", ())]
-            values, shown = self._read(types, component["namespace"], arguments)
-            masks = [value for name, value in zip(types, values, strict=True) if "navigation_mode_group_t" in name]
-            modes = masks[0] if masks and group in _CHECKS else None
-            listed = 0
-            if event.get("type") == "append_health_and_arming_messages":
-                of_modes = islice(component["navigation_mode_groups"]["groups"].items(), _MAX_PARTS)
-                listed = next((1 << int(bit) % 32 for bit, custom in of_modes if values[0] in custom[:_MAX_PARTS]), 0)
-            return _Event(group, _fill(event["message"][:_MAX_TEXT], shown), modes, listed)
-        except (StopIteration, *_DAMAGED):
-            return None
+        with suppress(*_DAMAGED):
+            return self._decoders[str(number >> 24), str(number & 0xFFFFFF)](arguments)
+        return None
 
-    def _read(self, types: Sequence[str], namespace: str, data: bytes) -> tuple[list[Any], list[Any]]:
-        """Return the arguments as numbers, and formatted for display."""
-        values: list[Any] = []
-        shown: list[Any] = []
-        offset = 0
-        for name in types:
-            space, _, base = name.rpartition("::")
-            parts = (part for part in self._components.values() if part["namespace"] == (space or namespace))
-            enum = None if name in BASIC_TYPES else next(parts)["enums"][base]
-            code = f"<{BASIC_TYPES[enum['type'] if enum else name].form}"
-            values += struct.unpack_from(code, data, offset)
-            offset += struct.calcsize(code)
-            shown.append(_describe(enum, values[-1]) if enum else values[-1])
-        return values, shown
+    def _add_enum(self, name: str, enum: Mapping[str, Any]) -> None:
+        with suppress(*_DAMAGED):
+            names = {key: entry["description"][:_MAX_TEXT] for key, entry in enum["entries"].items()}
+            separator = enum.get("separator", "|")[:_MAX_SEPARATOR] if enum.get("is_bitfield") else None
+            self._types.setdefault(name, _ArgumentType(BASIC_TYPES[enum["type"]].form, names, separator))
+
+    def _decoder(
+        self, event: Mapping[str, Any], group: str, namespace: str, states: Mapping[Any, int]
+    ) -> Callable[[bytes], _Event]:
+        """Return the function that decodes the arguments of an event."""
+        names = [each["type"] for each in event.get("arguments", [])[: _MAX_ARGUMENTS + 1]]
+        if len(names) > _MAX_ARGUMENTS:
+            raise ValueError
+        types = [self._types.get(name) or self._types[f"{namespace}::{name}"] for name in names]
+        unpack = struct.Struct("<" + "".join(each.code for each in types)).unpack_from
+        masks = [index for index, name in enumerate(names) if "navigation_mode_group_t" in name and group in _CHECKS]
+        lists_checks, template = event.get("type") == "append_health_and_arming_messages", event["message"][:_MAX_TEXT]
+
+        def decode(data: bytes) -> _Event:
+            values = unpack(data)
+            text = _fill(template, [each.show(value) for each, value in zip(types, values, strict=True)])
+            listed = states.get(values[0], 0) if lists_checks else 0
+            return _Event(group, text, values[masks[0]] if masks else None, listed)
+
+        return decode
 
 
-def _describe(enum: Mapping[str, Any], value: int) -> str:
-    """Return the name of an enum value, or of each bit set."""
-    bits = [1 << bit for bit in range(64) if value >> bit & 1] if enum.get("is_bitfield") else [value]
-    entries = enum["entries"]
-    names = (entries[str(each)]["description"] if str(each) in entries else f"(unknown: {value})" for each in bits)
-    return str(enum.get("separator", "|")).join(names)[:_MAX_TEXT]
+def _states(component: Mapping[str, Any]) -> Mapping[int, int]:
+    """Return the bit mask of the navigation state of each custom mode."""
+    with suppress(*_DAMAGED):
+        groups = component["navigation_mode_groups"]["groups"].items()
+        return {mode: 1 << int(bit) % 32 for bit, modes in islice(groups, _MAX_PARTS) for mode in modes[:_MAX_PARTS]}
+    return {}
 
 
 def _fill(template: str, values: Sequence[Any]) -> str:

@@ -2,10 +2,12 @@
 
 import re
 import struct
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from typing import Final, Literal, NamedTuple
 
-from .layout import Formats
+from .layout import Formats, PayloadLayout
 from .records import (
     EXACT_SIZES,
     READERS,
@@ -16,6 +18,7 @@ from .records import (
     Record,
     Subscription,
     Sync,
+    UlogError,
     Unsubscription,
     read_flags,
     read_header,
@@ -25,8 +28,9 @@ _START: Final = 16  # bytes before the first record
 _HEADER: Final = 3  # bytes of a record: size and type
 _DATA_HEADER: Final = 5  # bytes: size, type and message id
 _MAX_PADDING: Final = 8  # bytes of trailing padding in a message; PX4 aligns to 8
-_MAX_SUBSCRIPTIONS: Final = 1000  # simultaneous subscriptions; a real log has 170
+_MAX_SUBSCRIPTIONS: Final = 1000  # not counting those that continue an earlier one; a real log has 170
 _MAX_SKIPPED: Final = 16  # consecutive records of unknown content
+_MAX_CHAIN: Final = 2**16  # bytes of a chain of records before its last one; a record has up to 65,538
 _WINDOW: Final = 2**16  # bytes; damage of up to twice this length is searched completely
 _SAMPLE: Final = 2**12  # bytes searched of each further window
 _MIN_DISTANCE: Final = 64  # bytes per candidate, on average; denser data is searched only in part
@@ -48,30 +52,38 @@ class _Inspection(NamedTuple):
 
 
 class UlogParser:
-    """Parse a ULog in chunks of any size; memory is limited to one chunk, the definitions, and 256 KiB.
+    """Parse a ULog in chunks of any size; between chunks, hold the definitions and less than 257 KiB of data.
 
     `verify`: return a message only if a valid record follows it, and resynchronise after damage; for files, which have
-    no checksums. Without it, the lengths are trusted; for transports with checksums.
-    `subscriptions`: those with a decodable format, by message id.
+    no checksums. Without it, the lengths are trusted, and less than 65 KiB held; for transports with checksums.
+    `subscriptions`: the current ones with a decodable format, by message id.
     `undecodable`: number of data messages without a matching subscription.
     """
 
     def __init__(self, *, verify: bool) -> None:
         self.undecodable = 0
         self._verify = verify
+        self._is_readable = True
         self._formats = Formats()
         self.subscriptions: dict[int, Subscription] = {}
+        self._ended: dict[tuple[str, int], list[Subscription]] = {}  # by topic and instance
+        self._count = 0  # of subscriptions that do not continue an ended one
         self._known: dict[bytes, tuple[Subscription, int, int]] = {}
         """By the first five bytes of a data message: its subscription, its length, and the length without padding."""
         self._buffer = b""
+        self._sync = -1  # position in the buffer of the next sync, or the end; before the current record if unknown
         self._offset = 0  # offset of the buffer in the log
         self._boundaries: list[int] | None = None  # offsets of appended data; None before the first record
         self._damage: int | None = None  # offset at which the search for records began
         self._records: list[Record] = []
 
     def feed(self, data: bytes) -> list[Record]:
-        """Return the records that these bytes complete; raise UlogError if the data is not a readable ULog."""
-        self._buffer += data
+        """Return the records that these bytes complete.
+
+        Raises UlogError if the data is not a readable ULog; after that, all data is discarded.
+        """
+        if self._is_readable:
+            self._buffer += data
         return self._parse(is_end=False)
 
     def gap(self) -> None:
@@ -84,7 +96,11 @@ class UlogParser:
 
     def _parse(self, *, is_end: bool) -> list[Record]:
         if self._boundaries is None:
-            self._begin(is_end=is_end)
+            try:
+                self._begin(is_end=is_end)
+            except UlogError:
+                self._is_readable, self._boundaries, self._buffer, self._records = False, [], b"", []
+                raise
         while self._boundaries and self._boundaries[0] <= self._offset + len(self._buffer):
             boundary = self._boundaries.pop(0) - self._offset
             rest, self._buffer = self._buffer[boundary:], self._buffer[:boundary]
@@ -114,7 +130,7 @@ class UlogParser:
         self._offset += count
 
     def _parse_buffer(self, *, is_end: bool) -> None:
-        at = 0
+        at, self._sync = 0, -1
         after: int | None = 0
         while after is not None and after < len(self._buffer):
             at = after
@@ -132,7 +148,11 @@ class UlogParser:
         buffer, known, records = self._buffer, self._known, self._records
         make = tuple.__new__  # needs half the time of a NamedTuple's constructor
         found = known.get(buffer[at : at + _DATA_HEADER])
-        mark = buffer.find(SYNC, at) if found else -1
+        if found and self._sync < at:
+            self._sync = buffer.find(SYNC, at)
+            if self._sync < 0:
+                self._sync = len(buffer)
+        mark = self._sync
         while found is not None:
             subscription, length, used = found
             stop = at + length
@@ -214,6 +234,8 @@ class UlogParser:
                 return "valid" if self._is_tail(place) else "invalid"
             if inspected.validity != "unknown":
                 return inspected.validity
+            if inspected.stop > at + _MAX_CHAIN:
+                break
         return "invalid"
 
     def _inspect(self, at: int) -> _Inspection:
@@ -254,7 +276,7 @@ class UlogParser:
         kind, reason = self._buffer[at + 2], ""
         if inspected.record is not None:
             try:
-                self._records.extend(self._apply(inspected.record))
+                self._apply(inspected.record)
             except ValueError as exc:
                 reason = str(exc)
         elif inspected.validity == "valid":
@@ -268,28 +290,49 @@ class UlogParser:
             self._records.append(Damage(reason))
         return inspected.stop
 
-    def _apply(self, record: Record) -> list[Record]:
-        """Store a definition; return it if it is new; raise ValueError if it is unusable."""
+    def _apply(self, record: Record) -> None:
+        """Add a record to the result, and store a definition; raise ValueError if it is unusable."""
         if isinstance(record, Subscription):
-            old = self.subscriptions.get(record.message_id)
-            if old is not None:
-                if (old.multi_id, old.name) != (record.multi_id, record.name):
-                    raise ValueError(f"{record.name} is ignored, because its message id belongs to {old.name}")
-                return []
-            try:
-                if len(self.subscriptions) == _MAX_SUBSCRIPTIONS:
-                    raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
-                record = record._replace(layout=self._formats.layout(record.name))
-            except ValueError as exc:
-                raise ValueError(f"{record.name} cannot be decoded, because {exc}") from exc
-            self.subscriptions[record.message_id] = record
-            used = record.layout.size
-            for size in range(used, used + min(record.layout.padding, _MAX_PADDING) + 1):
-                head = struct.pack("<HBH", size + 2, ord("D"), record.message_id)
-                self._known[head] = record, size + _DATA_HEADER, used + _DATA_HEADER
-        elif isinstance(record, Format):
+            self._subscribe(record)
+            return
+        if isinstance(record, Format):
             self._formats.add(record.name, record.fields)
         elif isinstance(record, Unsubscription):
-            old = self.subscriptions.pop(record.message_id, None)
-            self._known = {head: known for head, known in self._known.items() if known[0] is not old}
-        return [record]
+            self._unsubscribe(record.message_id)
+        self._records.append(record)
+
+    def _subscribe(self, new: Subscription) -> None:
+        """Decode the data messages of an id; add its subscription to the result unless it continues another."""
+        topic, old = (new.name, new.multi_id), self.subscriptions.get(new.message_id)
+        if old is not None:
+            if (old.name, old.multi_id) != topic:
+                raise ValueError(f"{new.name} is ignored, because its message id belongs to {old.name}")
+            return
+        if ended := self._ended.get(topic):
+            subscription = ended.pop(0)
+        else:
+            try:
+                if self._count == _MAX_SUBSCRIPTIONS:
+                    raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
+                subscription = replace(new, layout=self._formats.layout(new.name))
+            except ValueError as exc:
+                raise ValueError(f"{new.name} cannot be decoded, because {exc}") from exc
+            self._count += 1
+            self._records.append(subscription)
+        self.subscriptions[new.message_id] = subscription
+        used = subscription.layout.size + _DATA_HEADER
+        for length, head in _heads(new.message_id, subscription.layout):
+            self._known[head] = subscription, length, used
+
+    def _unsubscribe(self, message_id: int) -> None:
+        old = self.subscriptions.pop(message_id, None)
+        if old is not None:
+            for _, head in _heads(message_id, old.layout):
+                del self._known[head]
+            self._ended.setdefault((old.name, old.multi_id), []).append(old)
+
+
+def _heads(message_id: int, layout: PayloadLayout) -> Iterator[tuple[int, bytes]]:
+    """Yield the possible lengths of a data message, which may include padding, and its first five bytes."""
+    for size in range(layout.size, layout.size + min(layout.padding, _MAX_PADDING) + 1):
+        yield size + _DATA_HEADER, struct.pack("<HBH", size + 2, ord("D"), message_id)

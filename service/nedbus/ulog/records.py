@@ -3,6 +3,7 @@
 import re
 import struct
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -53,8 +54,12 @@ class Parameter(NamedTuple):
     value: Value
 
 
-class Subscription(NamedTuple):
-    """Subscription to one instance of a topic; nested fields are flattened, `esc[0].rpm` to `esc_0_rpm`."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Subscription:
+    """Subscription to one instance of a topic; nested fields are flattened, `esc[0].rpm` to `esc_0_rpm`.
+
+    After an unsubscription, the next one to the same topic and instance continues it, even if `message_id` differs.
+    """
 
     message_id: int
     multi_id: int

@@ -104,6 +104,23 @@ def test_message_whose_timestamp_is_not_first_is_read(tmp_path: Path) -> None:
     assert nedbus.read(path, "wind").tolist() == [(7, 3.5)]
 
 
+@pytest.mark.parametrize("annotation", ["@range 5, 0", "@range 0; 9"])
+def test_definition_with_invalid_range_is_read_without_it(tmp_path: Path, annotation: str) -> None:
+    """An annotation that would be an error in a .msg file costs only its rule, with a warning, not the topic."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        text = f"uint64 timestamp\nfloat32 north # {annotation}\n"
+        schema = writer.register_schema("px4_msgs/msg/Wind", "ros2msg", text.encode())
+        channel = writer.register_channel("/fmu/out/wind", "cdr", schema)
+        writer.add_message(channel, 1, b"\x00\x01\x00\x00" + (7).to_bytes(8, "little") + WIND, 1)
+        writer.finish()
+    run = open_replay(f"mcap:{path}?topics=*")
+    assert [each.fields["north"] for each in run.messages] == [3.5]
+    assert "ignored the ranges in the definition of /fmu/out/wind (line 2, column 1" in run.warnings[0]
+
+
 FLAGS = {
     "repeat_schemas": (True, False), "repeat_channels": (True, False), "use_statistics": (True, False),
     "use_summary_offsets": (True, False), "enable_crcs": (True, False), "has_extras": (True, False),
@@ -272,8 +289,8 @@ def test_bag_with_compressed_messages_is_read(tmp_path: Path) -> None:
 
 
 def test_message_that_expands_above_the_limit_is_rejected(tmp_path: Path) -> None:
-    """A message of 64 MiB in a few kilobytes is rejected without decompressing it."""
-    path = write_bag(tmp_path / "a.mcap", change=lambda _: zstandard.compress(bytes(2**26)))
+    """A message that expands to more than 64 KiB is rejected without decompressing it."""
+    path = write_bag(tmp_path / "a.mcap", change=lambda _: zstandard.compress(bytes(2**16 + 1)))
     assert [bool(each.error) for each in open_replay(f"mcap:{path}").messages] == [True] * 10
 
 
@@ -306,7 +323,7 @@ def test_folder_without_mcap_files_raises(tmp_path: Path) -> None:
         nedbus.read(tmp_path)
 
 
-def test_compressed_recording_is_read(tmp_path: Path) -> None:
+def test_compressed_recording_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file from `ros2 bag record --compression-mode file` is read up to the first damage or a size limit."""
     path = tmp_path / "a.mcap.zstd"
     data = zstandard.compress(write_bag(tmp_path / "a.mcap").read_bytes())
@@ -315,7 +332,8 @@ def test_compressed_recording_is_read(tmp_path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(SourceError, match=r"no message can be read|not a readable MCAP file"):
         nedbus.read(path)
-    path.write_bytes(zstandard.compress(bytes(2**28)))
+    monkeypatch.setattr("nedbus.recording.mcap_chunks._MAX_SMALL_CHUNK", 2**20)
+    path.write_bytes(zstandard.compress(bytes(2**21)))
     with pytest.raises(SourceError, match=r"not a readable MCAP file; the compressed file is damaged \(more than"):
         nedbus.read(path)
 

@@ -171,6 +171,20 @@ def test_bool_other_than_0_or_1_is_rejected(tmp_path: Path) -> None:
     assert upgrade(second.fields).timestamp == 2
 
 
+def test_topic_that_is_subscribed_again_is_one_stream(tmp_path: Path) -> None:
+    """All messages of a topic are read without a warning, however often the logger subscribes to it."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for number in range(500):
+        if number:
+            writer.put("A", struct.pack("<BH", 0, 0) + VLP.encode())
+        writer.add(VLP, message(1 + number))
+        writer.put("R", struct.pack("<H", 0))
+    run = open_log(writer.write(tmp_path / "a.ulg"))
+    assert [read.timestamp for _, read in read_all(run)] == [*range(1, 501)]
+    assert run.warnings == ()
+
+
 def test_second_instance_of_single_instance_topic_is_skipped(tmp_path: Path) -> None:
     """A topic without instances has one stream per vehicle: a second instance is skipped, with a warning."""
     writer = UlogWriter()

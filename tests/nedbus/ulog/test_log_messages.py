@@ -125,7 +125,7 @@ CHECKS = {
     "Navigation error: No valid global position estimate", "No valid mission available", "No manual control input",
     "No connection to the ground control station", "Offboard requires local position", "Home position not set",
     "No valid attitude estimate", "Attitude failure detected", "Horizontal position unstable",
-    "No valid global position estimate", "No valid local position estimate",
+    "No valid global position estimate", "No valid local position estimate", "No valid data from barometer 0",
 }  # fmt: skip
 
 
@@ -184,8 +184,8 @@ def changed(change: Callable[[dict[str, Any]], object]) -> bytes:
 @pytest.mark.parametrize(
     "metadata",
     [
-        b"", b"not xz", lzma.compress(b"{"), lzma.compress(b"[" * 100_000), lzma.compress(b'{"components": []}'),
-        lzma.compress(bytes(2**27), preset=1), lzma.compress(json.dumps(METADATA).encode())[:-9],
+        b"", b"not xz", lzma.compress(b"{"), lzma.compress(b"[" * 2000), lzma.compress(b'{"components": []}'),
+        lzma.compress(b" " * 2**21 + json.dumps(METADATA).encode()), lzma.compress(json.dumps(METADATA).encode())[:-9],
         lzma.compress(b'{"components": {"1": ' + b"[" * 900 + b"]" * 900 + b"}}"),
         changed(lambda px4: px4["event_groups"]["default"]["events"]["1"].update(message=5)),
         changed(lambda px4: px4["event_groups"]["default"]["events"]["1"].update(arguments=[{"type": "uint64_t"}] * 4)),
@@ -193,9 +193,13 @@ def changed(change: Callable[[dict[str, Any]], object]) -> bytes:
         changed(lambda px4: px4["enums"]["by_t"].update(entries=7)),
         changed(lambda px4: px4["enums"]["by_t"].update(type="by_t")),
         changed(lambda px4: px4.update(event_groups=[])),
-        changed(lambda px4: px4["event_groups"].update({f"group{number}": {} for number in range(99)})),
+        changed(lambda px4: px4["event_groups"].update({f"group{number}": {"events": {}} for number in range(63)})),
+        changed(lambda px4: px4["enums"].update({f"enum{number}": {} for number in range(62)})),
+        changed(lambda px4: px4["event_groups"]["default"].update(events=["1"])),
+        changed(lambda px4: px4["event_groups"]["default"]["events"].update({str(n): {} for n in range(9, 5010)})),
+        changed(lambda px4: px4["event_groups"]["default"]["events"]["1"].update(arguments=[{"type": "by_t"}] * 26)),
     ],
-    ids=map(str, range(15)),
+    ids=map(str, range(19)),
 )  # fmt: skip
 def test_invalid_event_metadata_loses_only_events(metadata: bytes) -> None:
     """Metadata that is too large or deep, incomplete or of wrong types disables events, but no logged strings."""
@@ -203,6 +207,33 @@ def test_invalid_event_metadata_loses_only_events(metadata: bytes) -> None:
     log.event(1, 1, b"\2")
     log.text(2, b"still here")
     assert log.log_messages() == [(2, 6, "still here")]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "reason"),
+    [
+        (b"not xz", "Input format not supported by decoder"),
+        (lzma.compress(b" " * (2**21 + 1)), "incomplete, or more than 2097152 bytes"),
+        (changed(lambda px4: px4.update(event_groups=[])), "unexpected structure"),
+        (changed(lambda px4: px4["enums"].update(dict.fromkeys("abcdefghij" * 7))), ""),
+        (changed(lambda px4: px4["enums"].update(dict.fromkeys(map(str, range(62))))), "more than 64 components"),
+        (changed(lambda px4: px4["event_groups"].update(x={"events": dict.fromkeys(range(5000))})), "more than 5000 e"),
+    ],
+)
+def test_unreadable_event_metadata_has_reason(metadata: bytes, reason: str) -> None:
+    """Metadata that cannot be used at all is reported; an enum or event that is invalid does not affect others."""
+    texts, log = LogMessageBuilder(), Log(metadata)
+    log.event(1, 1, b"\2")
+    messages = log.log_messages(texts)
+    assert (texts.problem == "") == (reason == "") == bool(messages)
+    assert reason in texts.problem
+
+
+def test_long_texts_of_event_metadata_are_cut() -> None:
+    """A separator has up to 10 characters, and an argument up to 200."""
+    log = Log(changed(lambda px4: px4["enums"]["bits_t"].update(separator="+" * 1000)))
+    log.event(1, 2, struct.pack("<fB", 1.0, 5))
+    assert [text for *_, text in log.log_messages()] == ["At 1.0 m/s {one++++++++++fourb}"]
 
 
 def test_only_first_event_metadata_is_used() -> None:

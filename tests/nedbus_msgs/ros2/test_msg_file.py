@@ -91,7 +91,7 @@ def test_annotations_become_rules() -> None:
         ("uint64 timestamp\nfloat32 copy\n", r"line 2, column 1: invalid field name 'copy', which is a member of"),
         (f"uint64 timestamp\nfloat32 a_b\nBar a{NESTED}Bar\nfloat32 b\n", r"duplicate field 'a_b'"),
         (
-            f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nC[999] c{NESTED}C\n",
+            f"uint64 timestamp\nA[20] a{NESTED}A\nB[20] b{NESTED}B\nC[20] c{NESTED}C\n",
             r"line 8, .* 'C' is not a type",
         ),
         (f"uint64 timestamp\n{MANY}", r"301 fields, more than the limit of 256"),
@@ -131,6 +131,14 @@ def test_malformed_range_raises(annotation: str) -> None:
         define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # [m] {annotation}\n")
 
 
+@pytest.mark.parametrize(("annotation", "limits"), [("5, 0", "5 to 0"), ("inf, 1.5 @invalid 3", "inf to 1.5")])
+def test_empty_range_raises(annotation: str, limits: str) -> None:
+    """Limits in the wrong order, which would reject every message, are an error of the file; equal ones are not."""
+    with pytest.raises(MsgError, match=f"line 2, column 1: no number is in the @range of x, from {limits}"):
+        define_msg("Wrong", f"uint64 timestamp\nfloat32 x  # @range {annotation}\n")
+    assert define_msg("Right", "uint64 timestamp\nfloat32 x  # @range 1, 1\n").rules
+
+
 @pytest.mark.parametrize("length", ["[x]", "[0]", "[-1]", "[1_0]", "[", "[2000]", "[<=3]"])
 def test_invalid_length_of_an_array_of_messages_raises(length: str) -> None:
     text = f"uint64 timestamp\nPart{length} parts\n===\nMSG: px4_msgs/Part\nbool flag\n"
@@ -140,8 +148,8 @@ def test_invalid_length_of_an_array_of_messages_raises(length: str) -> None:
 
 
 def test_too_many_nested_fields_raise() -> None:
-    """A short text that expands to a million fields is rejected."""
-    text = f"uint64 timestamp\nA[999] a{NESTED}A\nB[999] b{NESTED}B\nuint8 c\n"
+    """A short text that expands to more than 1000 fields is rejected."""
+    text = f"uint64 timestamp\nA[20] a{NESTED}A\nB[20] b{NESTED}B\nC[20] c{NESTED}C\nuint8 d\n"
     with pytest.raises(MsgError, match="more than 1000 fields"):
         define_msg("Large", text)
 
@@ -164,14 +172,14 @@ def test_ros_2_syntax_is_accepted(line: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "".join(f"uint8 f{number}\n" for number in range(19_000)),
+        "".join(f"uint8 f{number}\n" for number in range(1001)),
         "uint8 a # @range" + " " * 200_000,
         "uint8 a # @range " + "9" * 200_000,
         "uint8 a [" + "1, " * 80_000,
         "uint8 a" + " " * 200_000 + "b",
-        f"A[999] a{NESTED}A\nuint8 b #" + "@range " * 30_000,
-        f"A[999] a{NESTED}A\nB[999] b{NESTED}B\n" + "".join(f"C[0] c{i}\n" for i in range(9000)) + f"{NESTED}C\nbool d",
-        "A[999] " + "a" * 200_000 + f"{NESTED}A\nuint8 b",
+        f"A[20] a{NESTED}A\nuint8 b #" + "@range " * 30_000,
+        f"A[20] a{NESTED}A\nB[20] b{NESTED}B\n" + "".join(f"C[0] c{i}\n" for i in range(20)) + f"{NESTED}C\nbool d",
+        "A[20] " + "a" * 20_000 + f"{NESTED}A\nuint8 b",
     ],
     ids=["fields", "spaces", "digits", "list", "default", "comment", "empty arrays", "long name"],
 )

@@ -19,7 +19,7 @@ _DECAY: Final = 0.98  # decay of the longest interval between messages, per mess
 
 LogReason = Literal[
     "not_px4", "armed", "taken", "bandwidth", "unsupported", "failed", "no_answer", "no_data", "slow_link", "stalled",
-    "silent", "stopped_elsewhere", "link_lost",
+    "silent", "stopped_elsewhere", "link_lost", "unreadable",
 ]  # fmt: skip
 _TEXTS: Final[Mapping[LogReason, str]] = {
     "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
@@ -40,6 +40,7 @@ _TEXTS: Final[Mapping[LogReason, str]] = {
     "silent": "the ULog stream seems to have ended; no data arrived for {:.1f} s",
     "stopped_elsewhere": "PX4 stopped the ULog stream, probably because another client requested it",
     "link_lost": "no message arrived from the vehicle for {:.1f} s; the link seems to be lost",
+    "unreadable": "the ULog stream cannot be read, because {}",
 }
 _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_TEMPORARILY_REJECTED: "taken",
@@ -91,6 +92,7 @@ class LogStreamClient:
 
     def _reset(self) -> None:
         self.status = LogStatus("idle")
+        self._unreadable = ""  # reason given to `reject`, until the next `tick`
         self._awaited: Literal["start", "stop", "data"] | None = None
         self._due = 0.0  # deadline of the awaited event, or else time of the next START
         self._tries = self._restarts = 0
@@ -133,12 +135,14 @@ class LogStreamClient:
         self._last_data = now
         self._acked_in_row = self._acked_in_row + is_new if acked else 0
         # During the header PX4 obeys STOP only if an acknowledgement is missing.
-        is_aborted = self._awaited == "stop" and reason == "slow_link"
+        is_aborted = self._awaited == "stop" and reason in ("slow_link", "unreadable")
         commands = [Command("acknowledge", sequence)] if acked and not is_aborted else []
-        if self._awaited == "stop" or state in ("stopping", "stopped"):
+        is_rejected = reason == "unreadable" and self._awaited is None
+        if self._awaited == "stop" or is_rejected or state in ("stopping", "stopped"):
             pass
         elif begins:
             self._awaited, self._has_header, self._restarts, self.header_seconds = None, True, 0, None
+            self._unreadable = ""
             self._enter("header", None, now)
             self._header_start, self._last_acked, self._header_messages = now, now, 1
             self._header_pause = self._interval = 0.0
@@ -172,6 +176,11 @@ class LogStreamClient:
 
     def tick(self, now: float) -> list[Command]:
         """Return the commands that are due."""
+        if self._unreadable and self.status.state in ("header", "streaming"):
+            self._has_header = False
+            self._enter("refused", "unreadable", now, self._unreadable)
+            self._unreadable = ""
+            return self._send("stop", now)
         state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
         is_lost = silence > TIMINGS.log_link
         if is_lost and state in ("header", "streaming"):
@@ -191,6 +200,10 @@ class LogStreamClient:
             self._enter("waiting_for_disarm", "armed", now)
         return []
 
+    def reject(self, reason: str) -> None:
+        """Stop the current stream, which cannot be read; unlike all other methods, may be called on any thread."""
+        self._unreadable = reason
+
     def stop(self, now: float) -> list[Command]:
         """End this client's stream; call `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
         is_ours = self.status.state in ("header", "streaming") or self._awaited == "data"
@@ -206,7 +219,7 @@ class LogStreamClient:
             values = (self._owner,) if reason == "taken" else values
             self.status = LogStatus(state, reason, _TEXTS[reason].format(*values) if reason else "")
         if self._awaited is None:
-            is_slow = reason in ("bandwidth", "unsupported", "slow_link")
+            is_slow = reason in ("bandwidth", "unsupported", "slow_link", "unreadable")
             is_over = state in ("refused", "ended")
             self._due = now + (TIMINGS.log_slow_retry if is_slow else TIMINGS.log_retry if is_over else 0.0)
 

@@ -3,7 +3,7 @@
 import logging
 import math
 import struct
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -56,7 +56,7 @@ class LogStream:
     def _restart(self) -> None:
         """Discard the definitions, which may differ in the next stream."""
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
-        self._streams: dict[int, ulog.LoggedStream | None] = {}
+        self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
 
@@ -84,18 +84,18 @@ class LogStream:
             return
         self._received += len(chunk.data)
         self._window_bytes += len(chunk.data)
-        undecodable, omitted = self._parser.undecodable, self._texts.limit.omitted
+        undecodable, omitted, problem = self._parser.undecodable, self._texts.limit.omitted, self._texts.problem
         try:
             records = self._parser.feed(chunk.data)
-        except ulog.UlogError as exc:
-            yield Rejection(f"{self._name} ULog stream", str(exc))
+        except ulog.UlogError as exc:  # raised once for each stream
+            self._client.reject(str(exc))
             return
         self._undecodable += self._parser.undecodable - undecodable
         for record in self._texts.merge(records):
             if isinstance(record, ulog.Data):
-                stream = self._streams.get(record.subscription.message_id)
-                if stream is None or stream.subscription is not record.subscription:
-                    stream = yield from self._open_stream(record.subscription)
+                if record.subscription not in self._streams:
+                    yield from self._open_stream(record.subscription)
+                stream = self._streams[record.subscription]
                 if stream is not None:
                     reported = len(stream.omitted)
                     fields = stream.decode(record.payload)
@@ -109,6 +109,7 @@ class LogStream:
                 yield Rejection(f"{self._name} ULog stream", record.reason)
         count, where = self._texts.limit.omitted - omitted, f"{self._name} {ulog.LOG_MESSAGE.name}"
         yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
+        yield from [Rejection(where, self._texts.problem, count=0)] * (self._texts.problem != problem)
 
     def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
         """Use the answer to a TIMESYNC request if its round trip is the shortest so far, or the last offset is old."""
@@ -155,16 +156,15 @@ class LogStream:
             self._file.close()
             self._file = None
 
-    def _open_stream(self, subscription: ulog.Subscription) -> Generator[Rejection, None, ulog.LoggedStream | None]:
-        """Return the stream of a subscription; None if it is not selected or not publishable."""
+    def _open_stream(self, subscription: ulog.Subscription) -> Iterator[Rejection]:
+        """Add the stream of a subscription; None if it is not selected or not publishable."""
         stream: ulog.LoggedStream | None = None
         if self._topics is None or subscription.name in self._topics:
             try:
                 stream = ulog.LoggedStream(self._name, subscription)
             except ValueError as exc:  # such as AddressError
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
-        self._streams[subscription.message_id] = stream
-        return stream
+        self._streams[subscription] = stream
 
     def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
         timestamp = fields.get("timestamp")

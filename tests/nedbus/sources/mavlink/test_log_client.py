@@ -381,6 +381,30 @@ class TestHeader:
         assert session.commands.count("start") == 1
         assert session.states[-1] == ("refused", "slow_link")
 
+    @pytest.mark.parametrize("messages", [1, 274])
+    def test_unreadable_stream_is_stopped_once(self, session: Session, messages: int) -> None:
+        """A rejected stream is stopped, and requested again after the longest delay, even if data still arrives."""
+        session.wait(0.1)
+        session.answer(START, ACCEPTED)
+        session.header(messages)
+        session.client.reject("it has a flag")
+        session.wait(0.1)
+        assert session.states[-1] == ("refused", "unreadable")
+        assert session.texts[-1] == "the ULog stream cannot be read, because it has a flag"
+        session.receive(acked=True, sequence=400)
+        assert 400 not in session.acknowledged
+        session.answer(STOP, ACCEPTED)
+        session.receive()
+        session.receive(begins=True)
+        session.wait(TIMINGS.log_slow_retry - 10)
+        assert session.states[-1] == ("refused", "unreadable")
+        assert session.commands == ["start", "stop"]
+        session.wait(20)
+        session.answer(START, ACCEPTED)
+        session.header()
+        session.stream()
+        assert session.client.status.state == "streaming"
+
     def test_lost_messages_do_not_abort_header(self, session: Session) -> None:
         """A lost message delays the header by 50 ms; one loss in twenty does not count as a long round trip."""
         session.wait(0.1)

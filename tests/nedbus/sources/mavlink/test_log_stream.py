@@ -8,6 +8,7 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import closing, suppress
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,9 +27,9 @@ from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings
 from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
-from tests.flights.ulogs import log_messages_in, write_raw_log
+from tests.flights.ulogs import UlogWriter, log_messages_in, write_raw_log
 from tests.peers.ports import free_port
-from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
+from tests.peers.px4_log_stream import SHORT, START, STOP, STREAMS, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
 from .test_log_reassembly import compare as compare_records
@@ -62,7 +63,7 @@ class Received:
     """Messages that a source yields until the recording has ended and nothing more arrives."""
 
     def __init__(
-        self, options: str, recording: Path = SHORT, *, attack: Attack | None = None, **peer: Any
+        self, options: str, recording: Path | Recording = SHORT, *, attack: Attack | None = None, **peer: Any
     ) -> None:  # fmt: skip
         port = free_port()
         if attack:
@@ -71,10 +72,11 @@ class Received:
         self.messages: list[SourceMessage] = []
         self.status = LogStreamStatus()
         self.reasons: set[str] = set()
+        recording = read_recording(recording) if isinstance(recording, Path) else recording
         source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?{options}").open_source(vehicle="1"))
         with (
             closing(cast("Any", source.listen(None))) as items,
-            Px4LogStream(read_recording(recording), port, speed=None, deadline=300, **peer) as self.peer,
+            Px4LogStream(recording, port, speed=None, deadline=300, **peer) as self.peer,
         ):
             for item in items:
                 if isinstance(item, SourceMessage):
@@ -225,15 +227,67 @@ def test_rejected_stream_reports_reason(peer: dict[str, Any], reason: str) -> No
     assert any(reason in each for each in received.reasons), received.reasons
 
 
+def test_unreadable_stream_is_stopped_with_reason() -> None:
+    """A stream with an unknown incompatible flag is stopped once; the status names the flag."""
+    recording = read_recording(SHORT)
+    first = recording.header[0]
+    flags = 16 + 3 + 8  # after the file header, the record's header and the compatible flags
+    header = [first._replace(data=first.data[:flags] + b"\x02" + first.data[flags + 1 :]), *recording.header[1:]]
+    received = Received("log=1", replace(recording, header=header))
+    assert not received.stream
+    assert len(received.converted) > 500
+    assert received.status.state == "refused"
+    reason = "the ULog stream cannot be read, because it has the unknown incompatible flags 0x2; update nedbus"
+    assert received.status.reason == reason
+    assert not received.rejections
+    assert [each for each in received.peer.commands if each in (START, STOP)] == [START, STOP]
+
+
+def test_topic_that_is_subscribed_in_turns_is_one_stream() -> None:
+    """Unsubscriptions neither restart a stream nor repeat its rejection; topics that are not selected stay unread."""
+    stream = LogStream("1", MavlinkOptions(topics=("vehicle_attitude", "bad/topic")), cast("Any", None))
+    writer = UlogWriter()
+    for name, fields in (("vehicle_attitude", ""), ("bad/topic", "float x;"), ("other", "")):
+        writer.put("F", f"{name}:uint64_t timestamp;{fields}".encode())
+    for number in range(6):
+        for message_id, topic in enumerate((b"vehicle_attitude", b"bad/topic", b"other"), number):
+            writer.put("A", struct.pack("<BH", 0, message_id) + topic)
+            writer.put("D", struct.pack("<HQ", message_id, number) + bytes(4 if topic == b"bad/topic" else 0))
+            writer.put("R", struct.pack("<H", message_id))
+    found = [*stream.add(Chunk("delivered", bytes(writer.data), begins=True), 0.0)]
+    messages = [each.fields["timestamp"] for each in found if isinstance(each, SourceMessage)]
+    assert messages == [0, 1, 2, 3, 4, 5]
+    assert [each.where for each in found if isinstance(each, Rejection)] == ["1 bad/topic"]
+
+
+def test_unreadable_event_metadata_is_rejected_once() -> None:
+    """A stream whose event metadata is damaged reports it with its first event."""
+    stream = LogStream("1", MavlinkOptions(topics=("*",)), cast("Any", None))
+    writer = UlogWriter()
+    writer.put("M", b"\0\x1auint8_t[6] metadata_eventsnot xz")
+    writer.put(
+        "F", b"event:uint64_t timestamp;uint32_t id;uint16_t event_sequence;uint8_t[25] arguments;uint8_t log_levels;"
+    )
+    writer.put("A", struct.pack("<BH", 0, 1) + b"event")
+    found = [*stream.add(Chunk("delivered", bytes(writer.data), begins=True), 0.0)]
+    for number in range(3):
+        record = struct.pack("<HBHQIH26x", 42, ord("D"), 1, number, 1, number)
+        found += stream.add(Chunk("delivered", record), 0.0)
+    [rejection] = [each for each in found if isinstance(each, Rejection)]
+    assert (rejection.where, rejection.count) == ("1 log_message", 0)
+    assert "the event metadata cannot be read" in rejection.reason
+
+
 HOSTILE: Final = [
     b"\0" * 249,
     b"ULog\x01\x12\x35\x01" + bytes(8) + b"".join(
         struct.pack("<HB", len(body), ord(kind)) + body
         for kind, body in (
-            ("F", b"loop:uint64_t timestamp;loop inner;"),
-            ("F", b"wide:" + b"uint8_t[999999999] a;"),
+            ("F", b"deep:uint64_t timestamp;a a;"),
+            *(("F", f"{name}:{name}a a;".encode()) for name in ("a", "aa", "aaa", "aaaa")),
+            ("F", b"wide:" + b"uint8_t[65534] a;"),
             ("F", b"vehicle_status:uint64_t timestamp;float timestamp;"),
-            ("A", struct.pack("<BH", 0, 1) + b"loop"),
+            ("A", struct.pack("<BH", 0, 1) + b"deep"),
             ("A", struct.pack("<BH", 0, 2) + b"wide"),
             ("A", struct.pack("<BH", 0, 3) + b"vehicle_status"),
             ("A", struct.pack("<BH", 0, 4) + b"unknown"),
@@ -279,7 +333,7 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
     reasons = {(each.where, each.reason) for each in received.rejections}
     assert sent[str(START)]
     assert any("not requested" in reason for _, reason in reasons)
-    assert any("loop cannot be decoded" in reason for _, reason in reasons), reasons
+    assert any("deep cannot be decoded" in reason for _, reason in reasons), reasons
     assert any("two fields are called timestamp" in reason for _, reason in reasons), reasons
     assert len(reasons) < 110
 
