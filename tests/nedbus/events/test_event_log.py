@@ -526,6 +526,7 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
         (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
         (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
+        (0.1, {"vz": -3.0, "vz_reset_counter": 1, "delta_vz": -3.0}, "vz by 3.0 m/s"),
         (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
         (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
     ],

@@ -241,6 +241,15 @@ def test_last_message_of_a_newer_layout_is_decoded(client: nedbus.Bus, zenoh_ses
         assert [(each.message.timestamp, each.message.x) for each in client.latest()] == [(4, 2.5)]
 
 
+def test_layout_with_a_repeated_field_is_ignored(client: nedbus.Bus, zenoh_session: Session) -> None:
+    """A peer's layout that names a field twice is ambiguous: no message is decoded with it."""
+    fields = [{"name": name, "type": "any"} for name in ("timestamp", "x", "x")]
+    schema = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
+    last = reply_with({KEY: msgpack.packb([9, 4, 2.5])}, attachment=LIVE)
+    with answer_queries(zenoh_session, SCHEMA, schema), answer_queries(zenoh_session, KEY, last):
+        assert client.latest() == []
+
+
 @pytest.mark.parametrize(
     "answer", [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}']
 )
@@ -276,18 +285,18 @@ def test_peer_that_never_replies_does_not_delay_other_streams(
     assert len(queries) <= 1
 
 
-def test_sample_is_counted_and_requested_again_after_an_unexpected_error(
+def test_samples_are_counted_and_requested_again_after_an_unexpected_error(
     bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An unexpected error while a sample is queued is logged; the sample is counted as invalid and requested again."""
+    """An unexpected error while samples are queued is logged; each counts as invalid and is requested again."""
     subscription = bus.subscribe(mode="every")
     assert receive_timestamps(subscription, 1) == [1]
     with monkeypatch.context() as patched:
         patched.setattr(PendingQueue, "_admit", lambda *_: 1 / 0)
-        publish(publisher, 2)
-        wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
-    publish(publisher, 3)
-    assert receive_timestamps(subscription, 2) == [2, 3]
+        publish(publisher, *range(2, 22))
+        wait_for(lambda: subscription.counts.invalid == 20, what="all samples to be counted")
+    publish(publisher, 22)
+    assert receive_timestamps(subscription, 21) == [*range(2, 23)]
     assert any("unexpected error, " in text and "discarded" in text for text in caplog.messages)
 
 
