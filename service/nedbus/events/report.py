@@ -94,8 +94,7 @@ def report_of(
         vehicles[name] = VehicleReport(
             state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
             tuple(sorted(vehicle.topics, key=lambda each: (each not in TOPICS, each)))[:_MAX_TOPICS],
-            vehicle.main is not None,
-            tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
+            vehicle.main is not None, tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
         )  # fmt: skip
     return AccountReport(service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events))
 
