@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from nedbus.timings import TIMINGS
-from nedbus_msgs import check_vehicle
+from nedbus_msgs import TOPICS, check_vehicle
 
 from .event import Condition, Event, Seconds
 from .event_log import KEPT, MAX_VEHICLES, EventLog
@@ -18,7 +18,7 @@ from .kinds import KINDS, rank_vehicle
 ACCOUNT_PARAMETER: Final = "events"
 """Parameter of a status query that requests this report instead of the status; its value is the period [s]."""
 
-_MAX_TOPICS: Final = 30  # per vehicle
+_MAX_TOPICS: Final = 30  # per vehicle; those that nedbus defines come first, because verdicts depend on them
 _Name = Annotated[str, AfterValidator(check_vehicle)]
 
 
@@ -93,8 +93,8 @@ def report_of(
         unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))
         vehicles[name] = VehicleReport(
             state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
-            tuple(sorted(vehicle.topics))[:_MAX_TOPICS], vehicle.main is not None,
-            tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
+            tuple(sorted(vehicle.topics, key=lambda each: (each not in TOPICS, each)))[:_MAX_TOPICS],
+            vehicle.main is not None, tuple(each.later(to_utc) for each in unreported), vehicle.unknown,
         )  # fmt: skip
     return AccountReport(service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events))
 

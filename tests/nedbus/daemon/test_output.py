@@ -1,14 +1,16 @@
-"""Output of a live source: topics without a rate, and the limit of addresses; with a fake clock."""
+"""Output of a live source: topics without a rate, rejections, and the limit of addresses; with a fake clock."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
-from nedbus.sources import SourceMessage
+from nedbus.sources import Rejection, SourceMessage
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VLP
 
@@ -17,13 +19,15 @@ ATTITUDE = Address("1", "vehicle_attitude")
 
 
 class FakeOutput:
-    """The output of a live source without a session; records address and timestamp of each published message."""
+    """The output of a live source without a session; records the published messages and the rejection reports."""
 
     def __init__(self) -> None:
-        self.now, self.published = 0.0, list[tuple[Address, int]]()
-        registry = SimpleNamespace(publisher=self._open)
+        self.now, self.published = 0.0, list[tuple[Address, int]]()  # address and timestamp
+        self.reports = list[dict[str, object]]()
+        self.event_log = EventLog()
+        registry = SimpleNamespace(publisher=self._open, reject=lambda _, report: self.reports.append(report))
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, EventLog()
+            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, self.event_log
         )
 
     def receive(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:
@@ -111,3 +115,14 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses
     assert present[0] not in fake.output.stale
+
+
+def test_text_of_a_rejection_is_limited(caplog: pytest.LogCaptureFixture) -> None:
+    """Sender and reason of a rejection, which a peer may choose, are cut to 300 characters wherever they appear."""
+    fake = FakeOutput()
+    fake.output.reject(Rejection("w" * 1000, "r" * 1000, POSITION))
+    where, reason = "w" * 300, "r" * 300
+    assert fake.output.warnings == (f"{where}: {reason}",)
+    assert caplog.messages == [f"px4: {where} rejected: {reason}"]
+    assert fake.reports == [{"source": "px4-zenoh:", "where": where, "reason": reason}]
+    assert [event.text for event in fake.event_log.events] == [f"{VLP} rejected: {reason}"]

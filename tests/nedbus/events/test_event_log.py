@@ -251,6 +251,16 @@ def test_overload_ends_after_5_s_without_drops(flight: Flight) -> None:
     assert ended[0].lasted == pytest.approx(2.0)
 
 
+def test_vehicle_is_not_silent_right_after_an_overload(flight: Flight) -> None:
+    """A vehicle without messages is silent only once the reader has kept up for 3 s: they may be in its backlog."""
+    flight.fly(1)
+    for seconds in (0.0, 4.0, 1.5):  # the overload ends at the last update
+        flight.wait(seconds).update(None, dropped=10)
+    assert flight.event_log.overload is None
+    assert flight.wait(1.4).update(None, dropped=10) == []
+    assert [each.kind for each in flight.wait(0.2).update(None, dropped=10)] == ["silent"]
+
+
 def test_overload_is_evidence_for_loss(flight: Flight) -> None:
     """An active condition of all vehicles is evidence for an event of one vehicle, however long ago it began."""
     for dropped in range(1, 31):
@@ -479,6 +489,14 @@ def test_motion_unexplained_by_velocity_is_a_jump(flight: Flight) -> None:
     )
 
 
+@pytest.mark.parametrize(("before", "after"), [(12.0, 0.0), (0.0, 12.0)])
+def test_motion_at_the_mean_velocity_is_not_a_jump(flight: Flight, before: float, after: float) -> None:
+    """A vehicle that brakes or accelerates hard between two messages moves at the mean of both velocities."""
+    flight.wait(0.1).send(vx=before, vy=-before)
+    assert flight.wait(0.5).send(x=3.0, y=-3.0, vx=after, vy=-after) == []
+    assert flight.wait(0.1).send(x=3.0, y=-3.0, vx=after, vy=-after) == []
+
+
 def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
     """A jump with a change of the reset counter is reported as a reset with its size, not as a jump."""
     reported = flight.wait(0.1).send(
@@ -508,6 +526,7 @@ def test_jump_with_reset_counter_is_a_reset(flight: Flight) -> None:
         (0.1, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by 5.0 m (3.0 north, 4.0 east)"),
         (2.0, {"x": 3.0, "y": 4.0, "xy_reset_counter": 2, "delta_xy": (1.0, 0.0)}, "xy by an unknown amount"),
         (2.0, {"x": 8.0, "xy_reset_counter": 1, "delta_xy": (3.0, 0.0)}, "xy by 3.0 m (3.0 north, 0.0 east)"),
+        (0.1, {"vz": -3.0, "vz_reset_counter": 1, "delta_vz": -3.0}, "vz by 3.0 m/s"),
         (0.1, {"heading": 3.0, "heading_reset_counter": 1, "delta_heading": 1.0}, "heading by 172 deg"),
         (0.1, {"xy_valid": False, "x": math.nan, "xy_reset_counter": 2}, "xy by an unknown amount"),
     ],
@@ -521,6 +540,13 @@ def test_reset_size_is_delta_or_observed_step(
     """
     reset = next(each for each in flight.wait(seconds).send(**fields) if each.kind == "reset")
     assert reset.text == f"reset of {size}"
+
+
+def test_reset_counter_wraps_from_255_to_0(flight: Flight) -> None:
+    """PX4's reset counters are uint8: a step from 255 to 0 is one reset, whose size is its delta."""
+    flight.wait(0.1).send(xy_reset_counter=255)
+    wrapped = flight.wait(2.0).send(x=8.0, xy_reset_counter=0, delta_xy=(3.0, 0.0))
+    assert [each.text for each in wrapped] == ["reset of xy by 3.0 m (3.0 north, 0.0 east)"]
 
 
 def test_flapping_flag_is_reported_after_it_settles(flight: Flight) -> None:

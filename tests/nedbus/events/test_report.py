@@ -98,6 +98,20 @@ def test_report_has_all_events_of_its_period() -> None:
     assert report(flight, within=math.nan).events == ()
 
 
+def test_topics_of_a_vehicle_are_limited_to_those_of_a_verdict() -> None:
+    """A report names at most 30 topics, first those that decide whether evidence and position are missing."""
+    flight = flying(xy_valid=False)
+    for number in range(100):
+        flight.send(f"a_{number}", x=1)
+    flight.gps()
+    flight.status(ARMED)
+    topics = report(flight).vehicles["1"].topics
+    assert len(topics) == 30
+    assert {VLP, "vehicle_gps_position", "vehicle_status"} <= {*topics}
+    [story] = stories_of(flight.event_log.events, topics=topics)
+    assert story.lacking == ("estimator_status_flags", "failsafe_flags")
+
+
 def test_large_report_is_sent_in_parts() -> None:
     """A report of 1,000 vehicles is split into parts below the size limit, which join to the same report."""
     flight = Flight()

@@ -151,17 +151,22 @@ def test_rows_at_a_fixed_rate_span_the_flight() -> None:
 
 @pytest.mark.parametrize("form", ["ULG", "MCAP"])
 def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
-    """A slow topic's last message, which PX4 logs with its old timestamp, adds no empty rows at the start."""
+    """A slow topic's last message, which PX4 logs with its old timestamp, adds no empty rows at the start.
+
+    A topic that begins later removes no rows.
+    """
     log = tmp_path / "a.ULG"
     times = range(300_000_000, 310_000_000, 20_000)
-    writer = UlogWriter()
-    writer.define([VLP])
+    writer, late = UlogWriter(), "vehicle_local_position_groundtruth"
+    writer.define([VLP, late])
     struct.pack_into("<Q", writer.data, 8, times.start)  # the start of logging
     writer.put("F", b"home_position:uint64_t timestamp;float x;")
     writer.put("A", struct.pack("<BH", 0, 99) + b"home_position")
     writer.put("D", struct.pack("<HQf", 99, 250_000_000, 7.0))
     for time in times:
         writer.add(VLP, message(time))
+        if time > 305_000_000:
+            writer.add(late, message(time))
     writer.write(log)
     path = log if form == "ULG" else tmp_path / "a.MCAP"
     if form == "MCAP":
@@ -170,6 +175,31 @@ def test_rows_begin_when_recording_began(tmp_path: Path, form: str) -> None:
     assert table["timestamp"].tolist() == list(times)
     assert table["home_position.age"][[0, -1]].tolist() == pytest.approx([50.0, 59.98])
     assert set(table["home_position.x"]) == {7.0}
+
+
+@pytest.mark.parametrize(("start", "first"), [
+    (300_900_000, 300_000_000),  # up to a second of older messages: logging had begun before the header was written
+    (301_100_000, 301_100_000),
+    (400_000_000, 300_000_000),  # a damaged start, after the last message
+])  # fmt: skip
+def test_rows_begin_with_recent_messages(tmp_path: Path, start: int, first: int) -> None:
+    """Rows begin with the first message, unless it is over a second older than the start of the recording."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    struct.pack_into("<Q", writer.data, 8, start)
+    for time in range(300_000_000, 305_000_000, 100_000):
+        writer.add(VLP, message(time))
+    writer.write(tmp_path / "a.ulg")
+    assert nedbus.align(tmp_path / "a.ulg", on=10)["timestamp"][0] == first
+
+
+@pytest.mark.parametrize("damaged", [2**40, 1])
+def test_single_damaged_timestamp_is_no_restart(damaged: int) -> None:
+    """A timestamp that is far ahead or behind does not count as a restart of the vehicle."""
+    positions = array_of(VLP, *({"timestamp": 1_000_000 + number} for number in range(100)))
+    positions["timestamp"][50] = damaged
+    table = nedbus.align({VLP: positions}, on=[1_000_000, 1_000_099])
+    assert table[f"{VLP}.timestamp"].tolist() == [1_000_000, 1_000_099]
 
 
 def test_streams_on_different_clocks_raise() -> None:
@@ -282,6 +312,16 @@ def test_utc_comes_from_gnss_then_companion_clock() -> None:
     assert nedbus.utc_of({}) is None
     without = [name for name in gnss.dtype.names or () if name != "timestamp_time_relative"]
     assert nedbus.utc_of({"sensor_gnss_relative": gnss[without]}) is not None
+
+
+@pytest.mark.parametrize(("off", "is_known"), [(1, True), (2, False)])
+def test_utc_requires_that_nine_of_ten_messages_agree(off: int, is_known: bool) -> None:
+    """UTC is unknown if over 10 % of the messages are more than a second off their median."""
+    times = range(1_000_000, 11_000_000, 1_000_000)
+    gnss = array_of("sensor_gps", *({"timestamp": t, "time_utc_usec": BOOT + t} for t in times))
+    gnss["time_utc_usec"][:off] -= 1_000_001
+    found = nedbus.utc_of({"sensor_gps/0": gnss})
+    assert found == (nedbus.UtcOffset("sensor_gps/0", BOOT, 10 - off, 0) if is_known else None)
 
 
 def test_utc_is_derived_from_live_samples(bus: nedbus.Bus) -> None:

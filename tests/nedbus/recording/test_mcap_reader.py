@@ -227,6 +227,20 @@ def test_bit_flip_outside_chunks_does_not_create_messages(tmp_path: Path, every:
             assert reader.damaged or read == original, (place, bit)
 
 
+def test_damaged_summary_is_not_used(tmp_path: Path) -> None:
+    """The summary has a CRC: after a bit flip in a vehicle's name there, the name comes from the chunks."""
+    path, address = tmp_path / "a.mcap", Address("alpha", VLP)
+    with RecordingWriter(path) as writer:
+        writer.write(to_array([message(1)]), DEFAULT, [(address, Provenance())], logged=[1], published=[1])
+    data = bytearray(path.read_bytes())
+    data[data.rindex(b"alpha")] ^= 1
+    path.write_bytes(data)
+    with RecordingReader(path, vehicle="1") as reader:
+        assert [each.address for each in reader.messages()] == [address]
+        assert reader.warnings == ["the index is damaged; reading without it"]
+        assert not reader.damaged
+
+
 def git_lfs_pointer(path: Path) -> None:
     path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:12\n")
 

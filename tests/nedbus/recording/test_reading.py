@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import sys
 import tracemalloc
 from collections.abc import Iterator
@@ -322,6 +323,18 @@ def test_messages_of_another_type_are_skipped(tmp_path: Path, caplog: pytest.Log
     assert nedbus.addresses_of(path) == addresses[1:]
     nedbus.read(path)
     assert "its messages are VehicleLocalPosition, but vehicle_attitude has VehicleAttitude" in caplog.text
+
+
+def test_message_id_of_a_log_can_be_reused(tmp_path: Path) -> None:
+    """After an unsubscription, a log may give the message id to another topic."""
+    writer, other = UlogWriter(), "vehicle_local_position_groundtruth"
+    writer.define([VLP, other])
+    writer.add(VLP, message(1))
+    writer.put("R", struct.pack("<H", 0))
+    writer.put("A", struct.pack("<BH", 0, 0) + other.encode())
+    writer.add(VLP, message(2))  # with message id 0
+    streams = nedbus.read(writer.write(tmp_path / "a.ulg"), [VLP, other])
+    assert {name: own["timestamp"].tolist() for name, own in streams.items()} == {VLP: [1], other: [2]}
 
 
 def test_reading_several_topics_reads_the_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

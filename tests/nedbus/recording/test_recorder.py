@@ -75,6 +75,16 @@ def test_independent_reader_decodes_every_field(tmp_path: Path) -> None:
         assert repr(there) == repr(value), name
 
 
+def test_sequence_numbers_of_publishers_are_recorded(tmp_path: Path) -> None:
+    """A message has the sequence number of its publisher, 0 without one; MCAP's field has 32 bits."""
+    path, numbers = tmp_path / "a.mcap", [-1, 0, 7, 2**32 - 1]
+    with RecordingWriter(path) as writer:
+        rows, times = to_array([message(1)] * len(numbers)), range(len(numbers))
+        writer.write(rows, DEFAULT, repeat((ADDRESS, Provenance())), logged=times, published=times, sequence=numbers)
+    with path.open("rb") as file:
+        assert [each.sequence for _, _, each in make_reader(file).iter_messages()] == [0, 0, 7, 2**32 - 1]
+
+
 def test_replay_of_a_recording_is_bit_exact(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
 ) -> None:
@@ -295,34 +305,6 @@ def test_full_disk_leaves_no_partial_file(size: int, arguments: list[str], reaso
     assert ended.exit_code == 1, ended.err
     assert reason in ended.err
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
-
-
-def due_times(path: Path, *logged: float) -> list[float]:
-    """Return the replay times of messages recorded at these times [s], with unrelated publish times."""
-    with RecordingWriter(path) as writer:
-        for number, time in enumerate(logged):
-            address = Address(str(number % 2), VLP)
-            published = number % 2 * 3600 * 10**9 + (10**19 if number == 3 else number)
-            rows = to_array([message(number)])
-            writer.write(rows, DEFAULT, [(address, Provenance())], logged=[round(time * 1e9)], published=[published])
-    return [round(each.due, 6) for each in open_replay(f"mcap:{path}").messages]
-
-
-@pytest.mark.parametrize(
-    ("logged", "due"),
-    [
-        ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour
-        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # a retained message that is three hours old
-        ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 1, 2]),  # an outlier
-        ([5, 6, 5.5, 7], [0, 0.5, 1, 2]),  # a message that was written late
-        ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set back
-    ],
-)
-def test_replay_is_paced_by_recording_times(tmp_path: Path, logged: list[float], due: list[float]) -> None:
-    """Recording times pace a replay, not publishers' clocks; gaps above a minute are skipped, even after conversion."""
-    assert due_times(tmp_path / "a.mcap", *logged) == due
-    convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
-    assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == due
 
 
 def test_ctrl_c_finishes_the_recording(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 import nedbus
+from nedbus.recording import RecordingWriter
 from nedbus.sources import read_file_events
-from nedbus_msgs import DEFAULT_TOPIC, is_unix_time
+from nedbus_msgs import DEFAULT_TOPIC, Address, Provenance, is_unix_time
+from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 
 DATA: Final = Path(__file__).parents[2] / "data"
 UNIX: Final = DATA / "uxrce_unix_time.mcap"
 BOOT: Final = DATA / "boot_time_utc_us.ulg"
+BOOT_UTC: Final = 1_700_000_000_000_000  # us
 INPUTS: Final = DATA / "fmu_in_topics.mcap"
 
 
@@ -39,6 +42,17 @@ def test_conversion_keeps_the_boot_time(tmp_path: Path) -> None:
     """A recording converted from a log keeps the UTC of the log's metadata."""
     convert_replay(f"ulog:{BOOT}", tmp_path / "a.mcap")
     assert nedbus.utc_of(tmp_path / "a.mcap") == nedbus.utc_of(BOOT)
+
+
+@pytest.mark.parametrize("boots", [(BOOT_UTC, BOOT_UTC), (BOOT_UTC, BOOT_UTC + 1), (BOOT_UTC, 0)])
+def test_files_of_a_bag_share_one_boot(tmp_path: Path, boots: tuple[int, int]) -> None:
+    """The UTC of a bag comes from the boot time in its files, unless two files name different boots."""
+    for number, boot in enumerate(boots):
+        with RecordingWriter(tmp_path / f"a_{number}.mcap", boot_utc=boot) as writer:
+            writer.write_messages([(message(number + 1), Address("1", VLP), Provenance(), 1)])
+    is_known = 0 in boots or boots[0] == boots[1]
+    expected = nedbus.UtcOffset("boot_time_utc_us", BOOT_UTC, 1, 0) if is_known else None
+    assert nedbus.utc_of(tmp_path) == expected
 
 
 def test_mixed_clocks_are_distinguished_per_timestamp() -> None:

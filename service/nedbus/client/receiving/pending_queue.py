@@ -142,8 +142,9 @@ class PendingQueue:
         """Handle a link that broke or came back."""
         with self._lock:
             self._settling_until = self._clock() + _SETTLING
-            for writer in self.counters.requesting:
-                writer.unresponsive = False  # perhaps the link was down
+            for stream in self._streams.values():
+                for writer in stream.writers.values():
+                    writer.unresponsive = False  # perhaps the link was down
 
     def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
         """Handle a heartbeat: the publisher, known or not, has sent `number`, which should have arrived by now."""

@@ -76,8 +76,6 @@ class LogStream:
             self.close()
         if chunk.lost:
             self._count_gap(chunk.lost)
-        if chunk.verdict == "unsynchronised":
-            self._at_most += math.ceil(_CHUNK_SIZE / self._record_sizes()[0])
         self._save(chunk, now)
         self._last_chunk = now
         if not chunk.data:
@@ -184,8 +182,7 @@ class LogStream:
         least = max(1, math.ceil(_CHUNK_SIZE * lost / largest))
         self._at_least += least
         self._unreported += least
-        # Include the message that ends the gap, and the record that the gap truncated.
-        self._at_most += math.ceil(_CHUNK_SIZE * (lost + 1) / smallest) + 1
+        self._at_most += math.ceil(_CHUNK_SIZE * lost / smallest) + 1  # records are cut at both ends
         self._parser.gap()
 
     def _record_sizes(self) -> tuple[int, int]:

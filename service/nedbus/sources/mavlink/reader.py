@@ -22,7 +22,6 @@ from .log_reassembly import Chunk, Reassembly
 SYSTEM: Final = 245
 COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
-_MAX_BUFFER: Final = 2**16  # bytes that the parser of a TCP or serial link may buffer
 _MAX_WAITING: Final = 16_384  # messages queued for `read`; later ones are dropped, and counted as lost
 _MAX_READ: Final = 100  # messages per call
 _TICK: Final = 0.05  # s, the longest wait of the thread
@@ -51,9 +50,12 @@ class LinkReader:
         """Yield the messages of autopilots; wait up to `timeout` seconds for the first. Raises OSError."""
         for data, peer in self._link.read(timeout):
             now = time.monotonic()
-            if not self._link.stream or len(self._parser.buf) > _MAX_BUFFER:
+            if not self._link.stream:
                 # A truncated message must not consume the next datagram, which may be from another sender.
                 self._parser = new_parser()
+            # Pymavlink frees parsed bytes only once no partial message follows them.
+            del self._parser.buf[: self._parser.buf_index]
+            self._parser.buf_index = 0
             yield from parse(self._parser, data, self.name, peer, now)
             if not self._link.stream and self._parser.buf_len():
                 yield Rejection(self.name, f"truncated message ({self._parser.buf_len()} B)")

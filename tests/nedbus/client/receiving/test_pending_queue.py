@@ -84,6 +84,59 @@ def test_counters_are_changed_with_the_lock(form: str) -> None:
     assert pending_queue.counts == Counts(received=2, lost=2, invalid=1)
 
 
+def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the limit of messages held back, here 10, the gap with the most messages behind it counts as lost."""
+    monkeypatch.setattr("nedbus.client.receiving.pending_queue.MAX_HELD", 10)
+    pending_queue = make_queue("every")
+    pending_queue.put([raw(0), raw(2, timestamp=2)])
+    pending_queue.put([raw(number, key=OTHER_KEY, publisher="b") for number in (0, *range(2, 12))])
+    assert Counter(sample.vehicle for sample in drain(pending_queue)) == {"1": 1, "2": 11}
+    pending_queue.put([raw(1)])
+    assert timestamps(pending_queue) == [1, 2]
+    assert pending_queue.counts == Counts(received=14, lost=1)
+
+
+def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
+    """The timeout of a gap begins again with each message that fills a part of it."""
+    pending_queue, now = make_queue("every"), 100.0
+    pending_queue.put([raw(0), raw(6, timestamp=6)])
+    [writer] = pending_queue.counters.requesting
+    for number in range(1, 6):
+        now += 0.9 * timings.retransmit_timeout
+        assert pending_queue.next_request(writer, now) == range(number, 6)
+        pending_queue.on_retransmission(writer, {number: raw(number, timestamp=number)}, ended=True, now=now)
+    assert timestamps(pending_queue) == [1, 1, 2, 3, 4, 5, 6]
+    assert pending_queue.counts == Counts(received=7)
+
+
+@pytest.mark.parametrize("when", ["during a gap", "after it"])
+def test_unresponsive_publisher_gets_more_than_one_request_after_a_link_change(timings: Timings, when: str) -> None:
+    """A publisher that did not answer gets one request per gap, until a link change: perhaps its link was down."""
+    pending_queue, now = make_queue("every"), 100.0
+
+    def attempt() -> int:
+        """Send the request of the gap, without an answer; return the number of messages lost so far."""
+        [writer] = pending_queue.counters.requesting
+        assert pending_queue.next_request(writer, now) is not None
+        pending_queue.on_retransmission(writer, {}, ended=True, now=now)
+        return pending_queue.counts.lost
+
+    pending_queue.put([raw(0), raw(2)])
+    assert attempt() == 0
+    now += timings.retransmit_timeout
+    assert attempt() == 1
+    pending_queue.put([raw(4)])
+    assert attempt() == 2
+    if when == "after it":
+        pending_queue.on_link_change()
+    pending_queue.put([raw(6)])
+    if when == "during a gap":
+        pending_queue.on_link_change()
+    assert attempt() == 2
+    now += timings.retransmit_timeout
+    assert attempt() == 3
+
+
 @pytest.mark.parametrize(
     ("mode", "arriving", "losses", "counts"),
     [

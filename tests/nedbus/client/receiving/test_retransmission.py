@@ -222,6 +222,22 @@ def test_unanswered_requests_do_not_delay_others(lossy: Lossy, zenoh_session: Se
         taken.clear()
 
 
+def test_requests_to_publishers_without_a_message_are_bounded(lossy: Lossy, zenoh_session: Session) -> None:
+    """At most 16 requests to publishers that have delivered no message are open: others need the remaining slots."""
+    taken: list[zenoh.Query] = []
+    keys = [f"nedbus/evil{number}/{VLP}" for number in range(40)]
+    with answer_queries(zenoh_session, "nedbus/*/*/@adv/pub/ab/1/**", taken.append):
+        for key in keys:
+            zenoh_session.put(f"{key}/@adv/pub/ab/1/_", b"\x05\x00\x00\x00")
+        wait_for(lambda: len(lossy.queue.counters.requesting) == len(keys), what="the gaps of all forged publishers")
+        lossy.queue.missing = {1}
+        lossy.publish(0, 1, 2)
+        assert lossy.receive(3) == [0, 1, 2]
+        assert len(taken) > 1
+        assert lossy.max_open <= 17
+        taken.clear()
+
+
 def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Simultaneous gaps of 60 vehicles are requested a few at a time, and all are filled."""
     monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)

@@ -22,7 +22,7 @@ from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import reader
 from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient
-from nedbus.sources.mavlink.log_reassembly import Chunk
+from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly
 from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.options import MavlinkOptions
 from nedbus.timings import Timings
@@ -33,7 +33,7 @@ from tests.peers.px4_log_stream import SHORT, START, STOP, STREAMS, Px4LogStream
 from tests.waits import DEADLINE
 
 from .test_log_reassembly import compare as compare_records
-from .test_log_reassembly import deliver, recorded
+from .test_log_reassembly import deliver, recorded, to_messages
 
 MESSAGES: Final = 47_708
 """Number of messages of all topics in the stream of the flight."""
@@ -214,6 +214,35 @@ def test_losses_are_within_bounds(name: str, messages: int, lost: int, gaps: int
         assert status.lost == received.peer.dropped + received.peer.late > gaps
     else:
         assert (status.lost, len(received.stream)) == (gaps, messages)
+
+
+@pytest.mark.parametrize(("size", "lost"), [(20, 1), (20, 3), (250, 1), (900, 1)])
+def test_bounds_of_gaps_are_exact_for_records_of_one_size(size: int, lost: int) -> None:
+    """Wherever a gap begins, it loses a number of records within the bounds of the status; some gap loses the most."""
+    bodies = [
+        ("F", f"noise:uint64_t timestamp;uint8_t[{size - 13}] data;".encode()), ("A", bytes(3) + b"noise"),
+        *(("D", struct.pack(f"<HQ{size - 13}x", 0, number)) for number in range(200_000 // size)),
+    ]  # fmt: skip
+    sent = to_messages(struct.pack("<HB", len(body), ord(kind)) + body for kind, body in bodies)
+    period = lost + 5 + 2 * (size // 249)
+    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None))
+    reassembly, stream = Reassembly(), LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
+    last, before, surplus = -1, (0, 0), set[int]()
+    for each in sent:
+        if each.sequence % period >= period - lost:
+            continue
+        chunk = reassembly.add(each.sequence, len(each.data), each.offset, each.data)
+        for message in stream.add(chunk, 0.0):
+            assert isinstance(message, SourceMessage)
+            number = cast("int", message.fields["timestamp"])
+            missing, last = number - last - 1, number
+            if missing:
+                status = stream.status(0.0)
+                least, most = status.lost_at_least - before[0], status.lost_at_most - before[1]
+                before = status.lost_at_least, status.lost_at_most
+                assert least <= missing <= most
+                surplus.add(most - missing)
+    assert min(surplus) == 0
 
 
 @pytest.mark.parametrize(("peer", "reason"), [

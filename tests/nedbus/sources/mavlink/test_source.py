@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import parse_source
-from nedbus.sources.mavlink.link import open_link
+from nedbus.sources.mavlink.link import DuplicateIds, open_link
 from nedbus.sources.mavlink.vehicle import ORIGIN
 from nedbus.timings import Timings
 from tests.flights.local_position import upgrade
@@ -316,6 +316,16 @@ def test_duplicate_system_id_is_logged(listener: Listener, port: int, caplog: py
         ports = {each._socket.getsockname()[1] for each in (other, third)}
         assert {int(each) for each in re.findall(r"127\.0\.0\.1:(\d+) ?", record.getMessage())[1:]} == ports
         assert "both send as system 9, and their messages are mixed" in record.getMessage()
+
+
+@pytest.mark.parametrize(("interval", "is_reported"), [(1.25, True), (1.3, False)])
+def test_two_senders_alternate_within_seconds(interval: float, is_reported: bool) -> None:
+    """Two senders change the address five times within 5 s; a sender that reconnects now and then is not reported."""
+    senders = DuplicateIds()
+    peers = [("10.0.0.1", 14550), ("10.0.0.2", 14550)] * 10
+    reported = [senders.add(9, peer, interval * number) for number, peer in enumerate(peers)]
+    text = "10.0.0.2:14550 and 10.0.0.1:14550 both send as system 9, and their messages are mixed"
+    assert [each.partition(";")[0] for each in reported] == ["", "", "", "", text * is_reported, *[""] * 15]
 
 
 def test_closed_tcp_link_raises_and_can_be_reopened() -> None:

@@ -67,6 +67,20 @@ def test_tlog_is_read_by_all_commands(tmp_path: Path, form: dict[str, Any]) -> N
     assert nedbus.missing_of(nedbus.read(tmp_path / "a.mcap")) == nedbus.missing_of(positions)
 
 
+@pytest.mark.parametrize(("seconds", "kept"), [(60.0, 60.0), (60.2, 0.0), (-3600.0, 0.0)])
+def test_pauses_of_over_a_minute_are_skipped(tmp_path: Path, seconds: float, kept: float) -> None:
+    """A replay keeps pauses of up to a minute; longer ones and backward steps of the host's clock take no time."""
+    path = tmp_path / "flight.tlog"
+    records = list(frames(7, 20))
+    middle = len(records) // 2
+    for index in range(middle, len(records)):
+        (stamp,) = struct.unpack_from(">Q", records[index])
+        records[index] = struct.pack(">Q", stamp + round((seconds - 0.1) * 1e6)) + records[index][8:]
+    path.write_bytes(b"".join(records))
+    due = [each.due for each in open_replay(f"tlog:{path}").messages if each.address.topic == VLP]
+    np.testing.assert_allclose(np.diff(due), [*[0.1] * 9, kept, *[0.1] * 9], atol=1e-6)
+
+
 def test_autopilots_in_tlog_are_separate_vehicles(tmp_path: Path) -> None:
     """Each autopilot is a vehicle named by its system id; the ground station is not a vehicle."""
     path = tmp_path / "flight.tlog"

@@ -1,0 +1,130 @@
+"""Readers of a TCP link: reassembly of partial reads, memory, and the limit of messages that wait for the source."""
+
+from __future__ import annotations
+
+import socket
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any, Self
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from nedbus.sources.mavlink.link import open_link
+from nedbus.sources.mavlink.reader import LinkReader, Received
+from nedbus.timings import Timings
+from tests.peers.live_source import Listener
+from tests.waits import DEADLINE, wait_for
+
+WAITING = 16_384  # messages
+
+
+class Autopilot:
+    """TCP server of a vehicle: accepts one connection, sends messages, and counts the received STARTs."""
+
+    def __init__(self) -> None:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.link = f"tcp:127.0.0.1:{self._server.getsockname()[1]}"
+        self._mav, self._parser = dialect.MAVLink(None, 9, 1), dialect.MAVLink(None)
+        self._connection: socket.socket | None = None
+        self._starts = 0
+
+    def pack(self, *messages: Any) -> list[bytes]:
+        """Return the messages as bytes, with consecutive sequence numbers."""
+        packed = []
+        for each in messages:
+            packed.append(each.pack(self._mav))
+            self._mav.seq = (self._mav.seq + 1) % 256
+        return packed
+
+    def send(self, *parts: bytes) -> None:
+        if self._connection is None:
+            self._connection, _ = self._server.accept()
+        self._connection.settimeout(DEADLINE)
+        self._connection.sendall(b"".join(parts))
+
+    @property
+    def starts(self) -> int:
+        """Number of requests for the ULog stream so far."""
+        assert self._connection is not None
+        self._connection.setblocking(False)
+        try:
+            data = self._connection.recv(65535)
+        except BlockingIOError:
+            return self._starts
+        for each in self._parser.parse_buffer(data) or []:
+            is_command = each.get_type() == "COMMAND_LONG"
+            self._starts += is_command and each.command == dialect.MAV_CMD_LOGGING_START
+        return self._starts
+
+    def close(self) -> None:
+        self._server.close()
+        if self._connection is not None:
+            self._connection.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@pytest.fixture
+def autopilot() -> Iterator[Autopilot]:
+    with Autopilot() as autopilot:
+        yield autopilot
+
+
+def heartbeat() -> Any:
+    return dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+
+
+def position(ms: int) -> Any:
+    return dialect.MAVLink_local_position_ned_message(ms, *range(6))
+
+
+def test_reads_that_end_within_a_message_lose_nothing(autopilot: Autopilot) -> None:
+    """If no read of a stream ends with a message, all messages arrive, and the parsed ones are freed."""
+    file_part = dialect.MAVLink_file_transfer_protocol_message(0, 245, 191, [1] * 251)
+    data = b"".join(autopilot.pack(*[file_part] * 1536))
+    size = 4 * len(data) // 1536 + 1  # no divisor of the length
+    received: list[object] = []
+    with closing(open_link(autopilot.link, baud=57600)) as link:
+        reader = LinkReader(link, name="tcp")
+        tracemalloc.start()
+        try:
+            for begin in range(0, len(data), size):
+                autopilot.send(data[begin : begin + size])
+                received += (each.sequence if isinstance(each, Received) else each for each in reader.read(DEADLINE))
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+    assert received == [*range(256)] * 6
+    assert peak < len(data) / 2
+
+
+def test_messages_that_wait_for_the_source_are_limited(autopilot: Autopilot) -> None:
+    """While the source does not read, 16,384 messages wait; later ones are dropped, and counted as lost."""
+    with Listener(f"mavlink:{autopilot.link}?log=1&topics=vehicle_local_position") as listener:
+        cycle = autopilot.pack(*[position(1000)] * 256)
+        late = autopilot.pack(*[position(1000)] * 99, heartbeat())
+        autopilot.send(*cycle * (WAITING // 256), *late)
+        wait_for(lambda: autopilot.starts, what="START, the answer to the heartbeat")
+        assert sum(each.lost for each in listener.receive(WAITING)) == 0
+        autopilot.send(*autopilot.pack(position(1000)))
+        assert listener.receive()[0].lost == len(late)
+    assert not listener.rejections
+
+
+def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopilot) -> None:
+    """After messages that arrived late, the vehicle has rebooted if its time is a second below the newest one.
+
+    After a reboot, its ULog stream is requested again.
+    """
+    timings.log_answer = DEADLINE  # no retransmission of START
+    with Listener(f"mavlink:{autopilot.link}?log=1"):
+        autopilot.send(*autopilot.pack(heartbeat(), position(5000), position(4200)))
+        wait_for(lambda: autopilot.starts == 1, what="the first START")
+        autopilot.send(*autopilot.pack(position(3900), heartbeat()))
+        wait_for(lambda: autopilot.starts == 2, what="START after the reboot")
