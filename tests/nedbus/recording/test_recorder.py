@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-import resource
+import re
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from itertools import repeat
 from pathlib import Path
@@ -22,7 +20,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import nedbus
 from nedbus.cli.follow import write_notice
 from nedbus.client import Subscription
-from nedbus.errors import OutputError, SourceError
+from nedbus.errors import SourceError
 from nedbus.recording import Recorder, RecordingReader, RecordingWriter
 from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.timings import Timings
@@ -35,7 +33,7 @@ from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
-from tests.peers.processes import Start
+from tests.peers.processes import ForkServer, Start, without_coverage
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 ADDRESS = Address("7", VLP)
@@ -246,37 +244,65 @@ def test_existing_file_is_not_replaced(endpoint: str, arguments: list[str]) -> N
     assert list(path.parent.iterdir()) == [path]
 
 
-@contextmanager
-def file_size_limit(size: int) -> Iterator[None]:
-    """Limit the size of all files, to simulate a full disk."""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
+LIMITED = """
+import resource, sys
+sys.dont_write_bytecode = True  # the interpreter would leave truncated bytecode in the checkout, without an error
+if "plot" in sys.argv:
+    import nedbus.recording.plot  # may write a cache of fonts
+size = int(sys.argv.pop(1))
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+"""
+
+COMMAND = """
+from nedbus.cli import main
+main()
+"""
+
+FILL = """
+import math
+from pathlib import Path
+from nedbus.recording import RecordingWriter
+from tests.flights.messages import message
+from tests.nedbus.recording.test_recorder import write
+
+with RecordingWriter(Path(sys.argv[1])) as writer:
+    for count in range(0, 100_000, 100):
+        write(writer, *(message(each, x=math.sin(each), z=math.tan(each)) for each in range(count, count + 100)))
+        writer.flush()
+        print(f"flushed {count + 100}", flush=True)
+"""
+
+
+def run_limited(fork_server: ForkServer, script: str, size: int, *arguments: str) -> tuple[int, str]:
+    """Run a script in a process with a limit of the size of all files, as on a full disk.
+
+    Return its exit code and output, which is a pipe and therefore not limited.
+    """
+    read_end, write_end = os.pipe()
+    with open(os.devnull, "rb") as null, open(write_end, "wb") as out:  # noqa: PTH123 - a file descriptor
+        streams = null.fileno(), out.fileno(), out.fileno()
+        command = "-c", LIMITED + script, str(size), *arguments
+        process = fork_server.start(command, cwd=Path.cwd(), environment=without_coverage(), streams=streams)
     try:
-        yield
+        exit_code = process.wait(DEADLINE)
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        process.kill()
+    with open(read_end, encoding="utf-8") as output:  # noqa: PTH123 - a file descriptor
+        return exit_code, output.read()
 
 
-def test_full_disk_raises_and_keeps_flushed_messages(tmp_path: Path) -> None:
+@pytest.mark.process
+def test_full_disk_raises_and_keeps_flushed_messages(fork_server: ForkServer, tmp_path: Path) -> None:
     """A full disk raises OutputError; all flushed messages can be read."""
     path = tmp_path / "full.mcap"
-    flushed = 0
-
-    def fill() -> None:
-        nonlocal flushed
-        with RecordingWriter(path) as writer:
-            for count in range(0, 100_000, 100):
-                noise = (message(each, x=math.sin(each), z=math.tan(each)) for each in range(count, count + 100))
-                write(writer, *noise)
-                writer.flush()
-                flushed = count + 100
-
-    with file_size_limit(50_000), pytest.raises(OutputError, match=r"full\.mcap cannot be written \(file too large\)"):
-        fill()
-    assert flushed
+    exit_code, output = run_limited(fork_server, FILL, 50_000, str(path))
+    assert exit_code == 1
+    assert output.splitlines()[-1].startswith(f"nedbus.errors.OutputError: {path} cannot be written (file too large)")
+    flushed = int(re.findall(r"flushed (\d+)", output)[-1])
     assert len(read_independently(path)) == flushed
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("size", "arguments", "reason"),
     [
@@ -286,14 +312,15 @@ def test_full_disk_raises_and_keeps_flushed_messages(tmp_path: Path) -> None:
         (300, ["pki", "ca", "full/new"], "new/ca cannot be written: file too large"),
     ],
 )
-def test_full_disk_leaves_no_partial_file(size: int, arguments: list[str], reason: str) -> None:
+def test_full_disk_leaves_no_partial_file(
+    fork_server: ForkServer, size: int, arguments: list[str], reason: str
+) -> None:
     """On a full disk convert, plot and pki exit with 1, name the file, and leave no partial file or key."""
     convert_replay("sim:?duration=2", Path("flight.mcap"))
     Path("full").mkdir()
-    with file_size_limit(size):
-        ended = run_command(*arguments)
-    assert ended.exit_code == 1, ended.err
-    assert reason in ended.err
+    exit_code, output = run_limited(fork_server, COMMAND, size, *arguments)
+    assert exit_code == 1, output
+    assert reason in output
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
 
 
