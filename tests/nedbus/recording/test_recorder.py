@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import nedbus
 from nedbus.cli.follow import write_notice
-from nedbus.client import Subscription
-from nedbus.errors import SourceError
+from nedbus.client import Batch, Subscription
+from nedbus.errors import NoDataError, SourceError
 from nedbus.recording import Recorder, RecordingReader, RecordingWriter
 from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.timings import Timings
@@ -400,31 +400,41 @@ def test_recording_without_messages_warns_and_removes_the_file(
 ) -> None:
     """Without messages a notice is printed after 2 s; at the end the empty file is removed, with exit code 1.
 
-    The recorder starts after the notice, because its duration might otherwise end before the notice.
+    The recorder receives after the notice, because its duration might otherwise end before the notice.
     """
-    path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
+    path, noticed, receive = tmp_path / "a.mcap", threading.Event(), Subscription.receive_batch
 
-    def record_after_notice(recorder: Recorder, stop: threading.Event, *, duration: float | None) -> None:
+    def receive_after_notice(subscription: Subscription, timeout: float) -> Batch:
         assert noticed.wait(DEADLINE)
-        record(recorder, stop, duration=duration)
+        return receive(subscription, timeout)
 
     def end_after_notice(subscription: Subscription) -> None:
         write_notice(subscription)
-        existed.append(path.exists())
+        wait_for(path.exists, what="the file")
         noticed.set()
         if ended == "by Ctrl-C":
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Recorder, "run", record_after_notice)
+    monkeypatch.setattr(Subscription, "receive_batch", receive_after_notice)
     monkeypatch.setattr("nedbus.cli.commands.recordings.write_notice", end_after_notice)
     timings.first_sample = 0.1
     duration = ["-d", "0.1"] if ended == "by its duration" else []
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1
-    assert existed == [True]
     assert "no message on nedbus/9/** yet, still waiting; 'nedbus list' shows" in recorder.err
     assert f"{path}: 0 messages, removed the empty file" in recorder.err
     assert "nothing arrived on nedbus/9/** within" in recorder.err
+    assert not path.exists()
+
+
+def test_file_is_created_once_recording_has_started(bus: nedbus.Bus, tmp_path: Path) -> None:
+    """A recorder that is interrupted before it runs leaves no file, and neither does one that stops at once."""
+    path, stop = tmp_path / "a.mcap", threading.Event()
+    stop.set()
+    recorder = Recorder(bus.subscribe(ANY, mode="every"), path)
+    assert (path.exists(), recorder.status) == (False, "0 messages")
+    with pytest.raises(NoDataError):
+        recorder.run(stop)
     assert not path.exists()
 
 
