@@ -13,8 +13,8 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run `nedbus`."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the imports
+    # No traceback for Ctrl-C during the imports; background jobs of scripts inherit SIGINT as ignored.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass  # otherwise a socket could get the descriptor of a closed standard stream, and receive the output
     os.close(descriptor)
