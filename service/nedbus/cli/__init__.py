@@ -23,12 +23,23 @@ def main() -> None:
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # before the slow imports below
         return
+    sys.unraisablehook = _repeat_interrupt
     atexit.register(_discard_broken_stderr)
     gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
     from .app import app
 
     gc.enable()
     app()
+
+
+def _repeat_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Report an exception that Python ignores; repeat Ctrl-C, which Python ignores inside destructors and callbacks."""
+    if unraisable.exc_type is not KeyboardInterrupt:
+        sys.__unraisablehook__(unraisable)
+        return
+    import threading
+
+    threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
 
 
 def _discard_broken_stderr() -> None:

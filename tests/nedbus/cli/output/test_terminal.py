@@ -445,6 +445,30 @@ def test_interrupt_during_imports_prints_no_traceback(
     assert "Traceback" not in rest
 
 
+IGNORED = """
+import signal, time
+from nedbus.cli import main, options
+
+class Interrupted:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def load(*_, **__):
+    Interrupted()
+    time.sleep(100)
+
+options.load_settings = load
+main()
+"""
+
+
+def test_interrupt_inside_a_destructor_is_repeated(start: Start) -> None:
+    """Ctrl-C ends a command even if it arrives inside a destructor or callback, where Python ignores it."""
+    health = start("-c", IGNORED, "health", coverage=False)
+    assert health.wait() == 130
+    assert not health.err
+
+
 STUCK = """
 import time
 from nedbus.cli import run
