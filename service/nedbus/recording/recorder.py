@@ -13,7 +13,7 @@ from nedbus.errors import ClosedError, NoDataError
 from .flight_files import check_recording
 from .mcap_writer import RecordingWriter
 
-_FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs at most the messages of this interval
+_FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
 
 

@@ -110,8 +110,8 @@ def test_replay_of_a_recording_is_bit_exact(
 
 
 @pytest.mark.slow
-def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """After kill -9 an independent reader can read the file, which lacks at most the last second.
+def test_kill_loses_about_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """After kill -9 an independent reader can read the file, which lacks about the last second.
 
     A busy host may delay the recorder for longer, but is unlikely to do so in all of five attempts.
     """
