@@ -13,8 +13,7 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run `nedbus`."""
-    # No traceback for Ctrl-C during the imports; background jobs of scripts inherit SIGINT as ignored.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback during the imports; a script's `&` sets SIG_IGN
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass  # otherwise a socket could get the descriptor of a closed standard stream, and receive the output
     os.close(descriptor)
@@ -34,12 +33,12 @@ def main() -> None:
 
 def _repeat_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
     """Report an exception that Python ignores; repeat Ctrl-C, which Python ignores inside destructors and callbacks."""
-    if unraisable.exc_type is not KeyboardInterrupt:
-        sys.__unraisablehook__(unraisable)
-        return
-    import threading
+    if unraisable.exc_type is KeyboardInterrupt:
+        import threading
 
-    threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _discard_broken_stderr() -> None:

@@ -107,8 +107,7 @@ def _exit_on_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except BrokenPipeError:
-        # The reader of the pipe has gone (`| head`): the flush at exit would also fail.
-        discard_stdout()
+        discard_stdout()  # the reader of the pipe has gone (`| head`): the flush at exit would also fail
         raise typer.Exit(0) from None
     except EOFError as exc:  # Typer prints "Aborted." alone
         hint = "if a full disk truncated Python's bytecode, delete all __pycache__ folders; --debug shows the traceback"

@@ -43,8 +43,7 @@ def run_until_stopped(
     """
     stop, closing = threading.Event(), closing or threading.Event()
     outcome: Future[object] = Future()
-    signals: list[int] = []
-    hangups: list[int] = []
+    signals, hangups = list[int](), list[int]()
     changed: queue.SimpleQueue[None] = queue.SimpleQueue()  # `put` is reentrant
 
     def run() -> None:
