@@ -44,7 +44,7 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from other hosts
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## run the tests without routers or processes: under half a minute
+quick: $(DEV)  ## run the tests without routers or processes: under a minute on two cores
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
 test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two cores

@@ -11,7 +11,7 @@ from tests.release.ci_summary import KNOWN, NEWEST, summarize
 ROOT = Path(__file__).parents[2]
 PASSED = '<testcase classname="tests.test_a" name="test_one"/>'
 FAILED = '<testcase classname="tests.test_a" name="test_one"><failure message="assert 1"/></testcase>'
-SKIPPED = '<testcase classname="tests.test_a" name="test_two[1]"><skipped message="no such log"/></testcase>'
+SKIPPED = '<testcase classname="tests.test_a" name="test_two[1]"><skipped message="no such&#10;log"/></testcase>'
 ENTRY = "tests.test_a::test_two"
 
 
@@ -22,17 +22,17 @@ ENTRY = "tests.test_a::test_two"
         ([PASSED, PASSED], (), ["1 passed, 0 failed, 0 skipped"], True),
         ([PASSED, FAILED], (), ["0 passed, 1 failed, 0 skipped"], False),
         ([], (), ["0 passed, 0 failed, 0 skipped"], False),
-        ([PASSED + SKIPPED], (ENTRY,), [f"skipped: {ENTRY}[1]: no such log", "1 passed, 0 failed, 1 skipped"], True),
+        ([PASSED + SKIPPED], (ENTRY,), [f"skipped: {ENTRY}: no such log", "1 passed, 0 failed, 1 skipped"], True),
         (
             [PASSED + SKIPPED],
             (f"{ENTRY}[1]",),
-            [f"skipped: {ENTRY}[1]: no such log", "1 passed, 0 failed, 1 skipped"],
+            [f"skipped: {ENTRY}: no such log", "1 passed, 0 failed, 1 skipped"],
             True,
         ),
         (
             [PASSED + SKIPPED],
             (f"{ENTRY}[2]",),
-            [f"skipped, which fails this run: {ENTRY}[1]: no such log", "1 passed, 0 failed, 1 skipped"],
+            [f"skipped, which fails this run: {ENTRY}: no such log", "1 passed, 0 failed, 1 skipped"],
             False,
         ),
     ],
