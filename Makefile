@@ -44,7 +44,7 @@ docs: $(DEV)  ## build the site with its reference in build/site; a broken link 
 	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # the site loads nothing from other hosts
 	@echo "build/site/index.html is the site; to serve it: $(BIN)/python -m http.server --directory build/site"
 
-quick: $(DEV)  ## run the tests without routers or processes: under half a minute
+quick: $(DEV)  ## run the tests without routers or processes: under a minute on two cores
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
 test: check behaviour  ## run `make check` and all tests of behaviour: under three minutes on two cores
@@ -88,7 +88,7 @@ lock: $(DEV)  ## update the pinned dependencies of the image to the newest versi
 	$(BIN)/uv pip compile $(LOCK) $(IMAGE_EXTRAS:%=--extra %) pyproject.toml -o packaging/requirements-image.txt
 	$(BIN)/uv pip compile $(LOCK) --group sbom -o packaging/requirements-build.txt
 
-bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow readers, replay pacing, idle load
+bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow readers, replay pacing, idle load, Ctrl-C
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
 	$(BIN)/python -m benchmarks.compare.picture
@@ -100,6 +100,7 @@ bench: $(DEV)  ## run the benchmarks: comparison with alternatives, fleets, slow
 	$(BIN)/python -m benchmarks.events
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
+	$(BIN)/python -m benchmarks.interrupts --count 10
 	$(BIN)/python -m benchmarks.restart
 	$(BIN)/python -m benchmarks.soak --names 10000
 	$(BIN)/python -m benchmarks.ulog.files

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 import signal
 import sys
 from collections.abc import Iterator
@@ -50,12 +51,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 _may_start = True
 
 
-def _watch_processes(event: str, arguments: tuple[object, ...]) -> None:
+def _watch_tests(event: str, arguments: tuple[object, ...]) -> None:
+    if event == "resource.setrlimit" and arguments[0] != resource.RLIMIT_NOFILE:  # a router raises that one
+        raise AssertionError("this would limit pytest, too, and truncate its bytecode: limit a child process instead")
     if event == "subprocess.Popen" and not _may_start and "fc-list" not in arguments:  # Matplotlib runs fc-list once
         raise AssertionError("this test starts a process: mark it with pytest.mark.process")
 
 
-sys.addaudithook(_watch_processes)
+sys.addaudithook(_watch_tests)
 
 
 @pytest.fixture(autouse=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import resource
 from functools import cache
 from pathlib import Path
 
@@ -74,6 +75,13 @@ def test_only_clock_module_reads_wall_clock() -> None:
     for path in PRODUCT:
         found = re.search(r"\btime\.time(_ns)?\(|datetime\.(now|utcnow|today)\(|date\.today\(", path.read_text())
         assert not found or path.name == "clock.py", f"{path}: use nedbus.clock"
+
+
+def test_tests_cannot_limit_their_own_process() -> None:
+    """A test must not set a resource limit of pytest's process, not even for a moment."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with pytest.raises(AssertionError, match="limit a child process instead"):
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
 
 
 def test_mutants_and_their_tests_exist() -> None:

@@ -13,8 +13,7 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run `nedbus`."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the imports
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback during the imports; a script's `&` sets SIG_IGN
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass  # otherwise a socket could get the descriptor of a closed standard stream, and receive the output
     os.close(descriptor)
@@ -23,12 +22,23 @@ def main() -> None:
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # before the slow imports below
         return
+    sys.unraisablehook = _repeat_interrupt
     atexit.register(_discard_broken_stderr)
     gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
     from .app import app
 
     gc.enable()
     app()
+
+
+def _repeat_interrupt(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Report an exception that Python ignores; repeat Ctrl-C, which Python ignores inside destructors and callbacks."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        import threading
+
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _discard_broken_stderr() -> None:

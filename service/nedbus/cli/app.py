@@ -42,6 +42,7 @@ def _show_version(requested: bool) -> None:
 
 
 @app.callback()
+@command
 def _set_up(
     *,
     version: Annotated[

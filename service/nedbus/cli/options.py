@@ -107,9 +107,11 @@ def _exit_on_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except BrokenPipeError:
-        # The reader of the pipe has gone (`| head`): the flush at exit would also fail.
-        discard_stdout()
+        discard_stdout()  # the reader of the pipe has gone (`| head`): the flush at exit would also fail
         raise typer.Exit(0) from None
+    except EOFError as exc:  # Typer prints "Aborted." alone
+        hint = "if a full disk truncated Python's bytecode, delete all __pycache__ folders; --debug shows the traceback"
+        raise _exit_with(NedbusError(f"unexpected end of data ({exc}): {hint}"), 1) from exc
     except OSError as exc:
         where = f"{exc.filename}: " if exc.filename else ""
         raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
@@ -119,8 +121,7 @@ def _exit_on_errors() -> Iterator[None]:
         hint = "check the system clock, free memory and the limit of open files ('ulimit -n')"
         raise _exit_with(NedbusError(f"Zenoh failed ({exc}): {hint}"), 1) from exc
     finally:
-        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the exit
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the exit
 
 
 def _read_settings(

@@ -37,14 +37,13 @@ def run_until_stopped(
     `on_stop` is called from the signal handler, `on_tick` twice a second from the main thread. `on_hangup` is called
     instead of stopping after a SIGHUP that does not come from a closed terminal. `nohup` keeps SIGHUP ignored.
     `body` sets `closing` when only its session is left to close, which has a shorter timeout.
-    The main thread does nothing else, so it handles signals at once even while Zenoh blocks.
+    The main thread does not call Zenoh, so it handles signals at once even while Zenoh blocks.
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
     stop, closing = threading.Event(), closing or threading.Event()
     outcome: Future[object] = Future()
-    signals: list[int] = []
-    hangups: list[int] = []
+    signals, hangups = list[int](), list[int]()
     changed: queue.SimpleQueue[None] = queue.SimpleQueue()  # `put` is reentrant
 
     def run() -> None:

@@ -29,12 +29,12 @@ def notify(address: str, **fields: object) -> bool:
     whether a datagram was accepted.
     """
     where = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), where)
-        except OSError as exc:  # no reader, or a full queue: READY and STATUS are sent again
-            _log.debug("cannot notify systemd: %s", exc)
-            return False
+    except OSError as exc:  # no reader, a full queue or no file descriptor left: READY and STATUS are sent again
+        _log.debug("cannot notify systemd: %s", exc)
+        return False
     return True
 
 

@@ -13,25 +13,25 @@ from nedbus.errors import ClosedError, NoDataError
 from .flight_files import check_recording
 from .mcap_writer import RecordingWriter
 
-_FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs at most the messages of this interval
+_FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs the messages since the last flush
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
 
 
 class Recorder:
     """Write every message of a subscription in mode "every" to a new MCAP file.
 
-    Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
+    Raises ConfigError for a suffix other than .mcap.
     """
 
     def __init__(self, subscription: Subscription[Any], path: Path) -> None:
         check_recording(path)
-        self._subscription = subscription
-        self._writer = RecordingWriter(path)
+        self._subscription, self._path = subscription, path
+        self._writer: RecordingWriter | None = None
 
     @property
     def messages(self) -> int:
         """The number of messages recorded so far."""
-        return self._writer.messages
+        return 0 if self._writer is None else self._writer.messages
 
     @property
     def status(self) -> str:
@@ -43,15 +43,16 @@ class Recorder:
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
         """Record until `stop` is set, for `duration` seconds, or until the subscription is closed.
 
-        Raises NoDataError, and removes the file, if no message arrived.
+        Raises OutputError if the file exists or cannot be written. Raises NoDataError, and removes the file, if no
+        message arrived.
         """
         start = now = time.monotonic()
         end = float("inf") if duration is None else now + duration
         next_flush = now + _FLUSH_INTERVAL
-        with self._writer:
+        with RecordingWriter(self._path) as self._writer:
             while not stop.is_set() and now < end:
                 try:
-                    self._write(self._subscription.receive_batch(min(_POLL_INTERVAL, end - now)))
+                    _write(self._writer, self._subscription.receive_batch(min(_POLL_INTERVAL, end - now)))
                 except NoDataError:
                     pass
                 except ClosedError:
@@ -61,17 +62,18 @@ class Recorder:
                     self._writer.flush()
                     next_flush = now + _FLUSH_INTERVAL
         if not self.messages:
-            self._writer.path.unlink(missing_ok=True)
+            self._path.unlink(missing_ok=True)
             raise NoDataError(self._subscription.name, time.monotonic() - start)
 
-    def _write(self, batch: Batch) -> None:
-        now = clock.utc_ns()  # log times in order of arrival, also for recovered messages
-        addresses = (batch.addresses[index] for index in batch.address_index.tolist())
-        self._writer.write(
-            batch.messages,
-            batch.message.DEFINITION,
-            zip(addresses, batch.provenances, strict=True),
-            logged=repeat(now),
-            published=[time if time > 0 else now for time in batch.sent.tolist()],
-            sequence=batch.sequence.tolist(),
-        )
+
+def _write(writer: RecordingWriter, batch: Batch) -> None:
+    now = clock.utc_ns()  # log times in order of arrival, also for recovered messages
+    addresses = (batch.addresses[index] for index in batch.address_index.tolist())
+    writer.write(
+        batch.messages,
+        batch.message.DEFINITION,
+        zip(addresses, batch.provenances, strict=True),
+        logged=repeat(now),
+        published=[time if time > 0 else now for time in batch.sent.tolist()],
+        sequence=batch.sequence.tolist(),
+    )

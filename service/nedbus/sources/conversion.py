@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 _MAX_START: Final = 2**63  # ns; leaves room for later times in 64 bits
 _CHUNK: Final = 1024  # messages per write
-_CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses only a few seconds of flight
+_CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses a few seconds of a typical flight
 _MAX_LOGGED: Final = 5  # rejected messages logged per file
 
 

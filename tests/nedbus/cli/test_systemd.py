@@ -299,6 +299,21 @@ def test_notify_returns_false_if_queue_is_full(systemd: Systemd) -> None:
     assert not notify(systemd.address, READY=1)
 
 
+NO_DESCRIPTORS = """
+import resource
+from nedbus.cli.systemd import notify
+resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+print(notify("@nedbus-test", READY=1))
+"""
+
+
+def test_notify_returns_false_without_a_file_descriptor(start: Start) -> None:
+    """At the limit of open files `notify` does not raise: its thread continues, and sends again."""
+    process = start("-c", NO_DESCRIPTORS, coverage=False)
+    assert process.wait() == 0, process.err
+    assert process.out == "False\n"
+
+
 def test_ready_is_repeated_until_accepted(systemd: Systemd) -> None:
     """A READY that systemd's full queue did not accept is sent again."""
     filled = sum(1 for _ in iter(lambda: notify(systemd.address, FILLED=1), False))

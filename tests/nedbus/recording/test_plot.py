@@ -56,7 +56,8 @@ def event_of(kind: str, change: Any, severity: Any, boot: float, **fields: Any) 
 def events_of(path: Path) -> list[Event]:
     """Return the events of a log, including the start of its initial conditions."""
     event_log = cached_events(path).event_log
-    held = [each.begin for each in event_log.vehicles["1"].conditions.values() if each.initial]
+    known = (each for vehicle in event_log.vehicles.values() for each in vehicle.conditions.values())
+    held = [each.begin for each in known if each.initial]
     return [*held, *event_log.events_since(0)[0]]
 
 
@@ -238,7 +239,8 @@ def test_plot_command_marks_events(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", [*SMALL, *LARGE], ids=lambda path: path.stem)
 def test_labels_of_real_flights_do_not_overlap(path: Path) -> None:
     """In each row of events, labels and marks neither overlap nor extend beyond the axes."""
-    streams = [(Address("1", VLP), nedbus.read(path))]
+    [vehicle] = cached_events(path).event_log.vehicles
+    streams = [(Address(vehicle, VLP), nedbus.read(path))]
     events = events_of(path)
     parts = drawn(streams, events)
     axes = parts["events"]

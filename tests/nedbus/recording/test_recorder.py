@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-import resource
+import re
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from itertools import repeat
 from pathlib import Path
@@ -21,8 +19,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import nedbus
 from nedbus.cli.follow import write_notice
-from nedbus.client import Subscription
-from nedbus.errors import OutputError, SourceError
+from nedbus.client import Batch, Subscription
+from nedbus.errors import NoDataError, SourceError
 from nedbus.recording import Recorder, RecordingReader, RecordingWriter
 from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.timings import Timings
@@ -35,7 +33,7 @@ from tests.flights.messages import VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import UlogWriter, write_log
 from tests.peers.command_line import run_command
-from tests.peers.processes import Start
+from tests.peers.processes import ForkServer, Start, without_coverage
 from tests.waits import DEADLINE, wait_for, wait_for_matching
 
 ADDRESS = Address("7", VLP)
@@ -122,8 +120,8 @@ def test_replay_of_a_recording_is_bit_exact(
 
 
 @pytest.mark.slow
-def test_kill_loses_at_most_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """After kill -9 an independent reader can read the file, which lacks at most the last second.
+def test_kill_loses_about_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """After kill -9 an independent reader can read the file, which lacks about the last second.
 
     A busy host may delay the recorder for longer, but is unlikely to do so in all of five attempts.
     """
@@ -256,37 +254,65 @@ def test_existing_file_is_not_replaced(endpoint: str, arguments: list[str]) -> N
     assert list(path.parent.iterdir()) == [path]
 
 
-@contextmanager
-def file_size_limit(size: int) -> Iterator[None]:
-    """Limit the size of all files, to simulate a full disk."""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
+LIMITED = """
+import resource, sys
+sys.dont_write_bytecode = True  # the interpreter would leave truncated bytecode in the checkout, without an error
+if "plot" in sys.argv:
+    import nedbus.recording.plot  # may write a cache of fonts
+size = int(sys.argv.pop(1))
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+"""
+
+COMMAND = """
+from nedbus.cli import main
+main()
+"""
+
+FILL = """
+import math
+from pathlib import Path
+from nedbus.recording import RecordingWriter
+from tests.flights.messages import message
+from tests.nedbus.recording.test_recorder import write
+
+with RecordingWriter(Path(sys.argv[1])) as writer:
+    for count in range(0, 100_000, 100):
+        write(writer, *(message(each, x=math.sin(each), z=math.tan(each)) for each in range(count, count + 100)))
+        writer.flush()
+        print(f"flushed {count + 100}", flush=True)
+"""
+
+
+def run_limited(fork_server: ForkServer, script: str, size: int, *arguments: str) -> tuple[int, str]:
+    """Run a script in a process with a limit of the size of all files, as on a full disk.
+
+    Return its exit code and output, which is a pipe and therefore not limited.
+    """
+    read_end, write_end = os.pipe()
+    with open(os.devnull, "rb") as null, open(write_end, "wb") as out:  # noqa: PTH123 - a file descriptor
+        streams = null.fileno(), out.fileno(), out.fileno()
+        command = "-c", LIMITED + script, str(size), *arguments
+        process = fork_server.start(command, cwd=Path.cwd(), environment=without_coverage(), streams=streams)
     try:
-        yield
+        exit_code = process.wait(DEADLINE)
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        process.kill()
+    with open(read_end, encoding="utf-8") as output:  # noqa: PTH123 - a file descriptor
+        return exit_code, output.read()
 
 
-def test_full_disk_raises_and_keeps_flushed_messages(tmp_path: Path) -> None:
+@pytest.mark.process
+def test_full_disk_raises_and_keeps_flushed_messages(fork_server: ForkServer, tmp_path: Path) -> None:
     """A full disk raises OutputError; all flushed messages can be read."""
     path = tmp_path / "full.mcap"
-    flushed = 0
-
-    def fill() -> None:
-        nonlocal flushed
-        with RecordingWriter(path) as writer:
-            for count in range(0, 100_000, 100):
-                noise = (message(each, x=math.sin(each), z=math.tan(each)) for each in range(count, count + 100))
-                write(writer, *noise)
-                writer.flush()
-                flushed = count + 100
-
-    with file_size_limit(50_000), pytest.raises(OutputError, match=r"full\.mcap cannot be written \(file too large\)"):
-        fill()
-    assert flushed
+    exit_code, output = run_limited(fork_server, FILL, 50_000, str(path))
+    assert exit_code == 1
+    assert output.splitlines()[-1].startswith(f"nedbus.errors.OutputError: {path} cannot be written (file too large)")
+    flushed = int(re.findall(r"flushed (\d+)", output)[-1])
     assert len(read_independently(path)) == flushed
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("size", "arguments", "reason"),
     [
@@ -296,14 +322,15 @@ def test_full_disk_raises_and_keeps_flushed_messages(tmp_path: Path) -> None:
         (300, ["pki", "ca", "full/new"], "new/ca cannot be written: file too large"),
     ],
 )
-def test_full_disk_leaves_no_partial_file(size: int, arguments: list[str], reason: str) -> None:
+def test_full_disk_leaves_no_partial_file(
+    fork_server: ForkServer, size: int, arguments: list[str], reason: str
+) -> None:
     """On a full disk convert, plot and pki exit with 1, name the file, and leave no partial file or key."""
     convert_replay("sim:?duration=2", Path("flight.mcap"))
     Path("full").mkdir()
-    with file_size_limit(size):
-        ended = run_command(*arguments)
-    assert ended.exit_code == 1, ended.err
-    assert reason in ended.err
+    exit_code, output = run_limited(fork_server, COMMAND, size, *arguments)
+    assert exit_code == 1, output
+    assert reason in output
     assert not [path for path in Path("full").rglob("*") if path.is_file()]
 
 
@@ -355,31 +382,41 @@ def test_recording_without_messages_warns_and_removes_the_file(
 ) -> None:
     """Without messages a notice is printed after 2 s; at the end the empty file is removed, with exit code 1.
 
-    The recorder starts after the notice, because its duration might otherwise end before the notice.
+    The recorder receives after the notice, because its duration might otherwise end before the notice.
     """
-    path, existed, noticed, record = tmp_path / "a.mcap", [], threading.Event(), Recorder.run
+    path, noticed, receive = tmp_path / "a.mcap", threading.Event(), Subscription.receive_batch
 
-    def record_after_notice(recorder: Recorder, stop: threading.Event, *, duration: float | None) -> None:
+    def receive_after_notice(subscription: Subscription, timeout: float) -> Batch:
         assert noticed.wait(DEADLINE)
-        record(recorder, stop, duration=duration)
+        return receive(subscription, timeout)
 
     def end_after_notice(subscription: Subscription) -> None:
         write_notice(subscription)
-        existed.append(path.exists())
+        wait_for(path.exists, what="the file")
         noticed.set()
         if ended == "by Ctrl-C":
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Recorder, "run", record_after_notice)
+    monkeypatch.setattr(Subscription, "receive_batch", receive_after_notice)
     monkeypatch.setattr("nedbus.cli.commands.recordings.write_notice", end_after_notice)
     timings.first_sample = 0.1
     duration = ["-d", "0.1"] if ended == "by its duration" else []
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1
-    assert existed == [True]
     assert "no message on nedbus/9/** yet, still waiting; 'nedbus list' shows" in recorder.err
     assert f"{path}: 0 messages, removed the empty file" in recorder.err
     assert "nothing arrived on nedbus/9/** within" in recorder.err
+    assert not path.exists()
+
+
+def test_file_is_created_once_recording_has_started(bus: nedbus.Bus, tmp_path: Path) -> None:
+    """A recorder that is interrupted before it runs leaves no file, and neither does one that stops at once."""
+    path, stop = tmp_path / "a.mcap", threading.Event()
+    stop.set()
+    recorder = Recorder(bus.subscribe(ANY, mode="every"), path)
+    assert (path.exists(), recorder.status) == (False, "0 messages")
+    with pytest.raises(NoDataError):
+        recorder.run(stop)
     assert not path.exists()
 
 

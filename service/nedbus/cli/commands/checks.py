@@ -53,16 +53,13 @@ def health(
     other hosts. --vehicle queries the vehicle's publisher, as any client would. --valid and --within use the event
     history of the services. A vehicle that has been silent for an hour is considered switched off, not faulty.
     """
-    if vehicle is not None:
-        check_vehicle(vehicle)
-    names = _parse_names("--expect", expect)
-    for name in names:
+    required = dict.fromkeys([*_parse_names("--expect", expect), *([] if vehicle is None else [vehicle])])
+    for name in required:
         check_vehicle(name)
     estimates = _parse_names("--valid", valid)
     if unknown := [each for each in estimates if each not in VALID]:
         raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
-    required = tuple(dict.fromkeys([*names, *([vehicle] if vehicle is not None else [])]))
-    check = _Check(bus, vehicle, services, max_age, Expectation(required, vehicles, estimates, within))
+    check = _Check(bus, vehicle, services, max_age, Expectation(tuple(required), vehicles, estimates, within))
     faults = [*check.service_faults(), *check.vehicle_faults()]
     if json_output:
         counts = {"services": len(check.services), "sources": len(check.sources), "vehicles": check.ages}

@@ -36,7 +36,7 @@ def record(
 ) -> None:
     """Record messages to an MCAP file until Ctrl-C.
 
-    A crash loses at most the last second.
+    A crash loses about the last second.
     """
     notice = time.monotonic() + TIMINGS.first_sample
     with bus.subscribe_to(selection, mode="every") as subscription:

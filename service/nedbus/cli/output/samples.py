@@ -126,15 +126,8 @@ def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
 
 def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     """Format a sample as one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
-    head = {
-        **asdict(sample.address),
-        "received": sample.received,
-        "sent": sample.sent,
-        "lost": sample.lost,
-        "source": sample.source,
-        "missing": sorted(sample.missing),
-        **({"stored": True} if sample.stored else {}),
-    }
+    head = asdict(sample.address) | {name: getattr(sample, name) for name in ("received", "sent", "lost", "source")}
+    head |= {"missing": sorted(sample.missing)} | ({"stored": True} if sample.stored else {})
     message = sample.message.model_dump_json(include=set(fields) or None)
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 

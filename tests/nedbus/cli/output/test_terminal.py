@@ -409,16 +409,27 @@ def test_closed_stdout_is_a_one_line_error(
     assert result == expected
 
 
-MOMENTS = [pytest.param("echo", imports) for imports in (1, 50, 150, 300, 10_000)]
-MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz", "list", "serve -s sim:", "router")]
+IN_BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")  # a script's `&` starts a job with SIGINT ignored
+MOMENTS = [pytest.param("echo", imports, (), id=f"echo-{imports}") for imports in (1, 50, 150, 300, 10_000)]
+MOMENTS += [pytest.param("echo", imports, IN_BACKGROUND, id=f"background-{imports}") for imports in (1, 10_000)]
+MOMENTS += [
+    pytest.param(each, 10_000, (), marks=pytest.mark.slow) for each in ("hz", "list", "serve -s sim:", "router")
+]
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports between nedbus.cli and the signal; 10,000: all
-def test_interrupt_during_imports_prints_no_traceback(endpoint: str, command: str, imports: int) -> None:
-    """Ctrl-C at any time after `main` has started ends a command without a traceback; a shell sees exit code 130."""
+@pytest.mark.parametrize(
+    ("command", "imports", "prefix"), MOMENTS
+)  # imports between nedbus.cli and the signal; 10,000: all
+def test_interrupt_during_imports_prints_no_traceback(
+    endpoint: str, command: str, imports: int, prefix: tuple[str, ...]
+) -> None:
+    """Ctrl-C at any time after `main` has started ends a command without a traceback; a shell sees exit code 130.
+
+    This includes a background job of a shell script, which inherits SIGINT as ignored.
+    """
     environment = without_coverage() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
-    arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
+    arguments = [*prefix, sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
     with subprocess.Popen(arguments, stdout=null, stderr=pipe, text=True, env=environment) as process:
         assert process.stderr is not None
@@ -432,6 +443,30 @@ def test_interrupt_during_imports_prints_no_traceback(endpoint: str, command: st
         rest = process.stderr.read()
         assert process.wait(DEADLINE) in {-signal.SIGINT, 130, 0}
     assert "Traceback" not in rest
+
+
+IGNORED = """
+import signal, time
+from nedbus.cli import main, options
+
+class Interrupted:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def load(*_, **__):
+    Interrupted()
+    time.sleep(100)
+
+options.load_settings = load
+main()
+"""
+
+
+def test_interrupt_inside_a_destructor_is_repeated(start: Start) -> None:
+    """Ctrl-C ends a command even if it arrives inside a destructor or callback, where Python ignores it."""
+    health = start("-c", IGNORED, "health", coverage=False)
+    assert health.wait() == 130
+    assert not health.err
 
 
 STUCK = """
