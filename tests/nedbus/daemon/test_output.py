@@ -5,10 +5,12 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
-from nedbus.sources import SourceMessage
+from nedbus.sources import SourceMessage, UnavailableTopics
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VLP
 
@@ -111,3 +113,14 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses
     assert present[0] not in fake.output.stale
+
+
+def test_silent_addresses_are_logged_once_up_to_the_limit(caplog: pytest.LogCaptureFixture) -> None:
+    """A silent address is logged once, and only the first 1,000, because a peer may announce any number."""
+    fake = FakeOutput()
+    for start in (0, 600, 1200, 0):
+        names = tuple(f"v{number}/{VLP}" for number in range(start, start + 600))
+        fake.output.note(UnavailableTopics(silent=names))
+        assert fake.output.unavailable.silent == names
+    text = "".join(record.getMessage() for record in caplog.records)
+    assert [text.count(f"v{number}/") for number in (0, 599, 999, 1000, 1799)] == [1, 1, 1, 0, 0]

@@ -99,11 +99,9 @@ class PublisherRegistry:
 
     def shared_vehicles(self) -> set[str]:
         """Return the vehicles that another process also publishes; log new ones."""
-        with self._lock:
-            directories = list(self._directories.items())
-        counts = {name: each.publishers(self._session, timeout=0).values() for name, each in directories}
-        shared = {name for name, numbers in counts.items() if max(numbers, default=0) > 1}
-        with self._lock:  # several threads call this
+        with self._lock:  # several threads call this, and `forget` closes directories
+            counts = {name: each.publishers(self._session, timeout=0) for name, each in self._directories.items()}
+            shared = {name for name, numbers in counts.items() if max(numbers.values(), default=0) > 1}
             known, self._shared = self._shared, shared
         for name in shared - known:
             text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
@@ -145,7 +143,7 @@ class PublisherRegistry:
             if not any(each.vehicle == address.vehicle for each in self.publishers):
                 self._queries.end(f"{self.prefix}/{address.vehicle}/**")
                 self._rate_listeners.pop(address.vehicle).close()
-                del self._directories[address.vehicle]
+                self._directories.pop(address.vehicle).close()
 
 
 def _reply(registry: weakref.ref[PublisherRegistry], vehicle: str, query: zenoh.Query) -> None:
