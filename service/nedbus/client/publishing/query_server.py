@@ -99,6 +99,6 @@ class _Queryable:
                         self._reply(query)
                 except zenoh.ZError as exc:
                     _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
-                except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
+                except BaseException:  # noqa: BLE001 - includes Zenoh's panics; a fault in a reply must not end the server
                     _log.exception("%s: unexpected error in a query reply", key_expr, extra=about("internal_error"))
                 self._query = self._try_recv() if time.monotonic() < end else None
