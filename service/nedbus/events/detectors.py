@@ -78,7 +78,7 @@ read_fields: Final = cache(FieldReader)
 
 
 class ChangeDetector:
-    """Detector for one stream; calls `detect` only when one of the `compared` fields changes.
+    """Detector for one stream; calls `detect` only when one of the `compared` fields or `missing` changes.
 
     `detect` receives None for fields that were not provided. `context`: other fields passed to it.
     `last`, `missing`: the last message, and the names of its fields that were not provided.

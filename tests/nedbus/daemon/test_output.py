@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+import nedbus
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
@@ -23,7 +24,8 @@ class FakeOutput:
 
     def __init__(self) -> None:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
-        registry = SimpleNamespace(publisher=self._open)
+        self.failure: nedbus.InvalidMessageError | None = None
+        registry = SimpleNamespace(publisher=self._open, reject=lambda *_: None)
         self.output = SourceOutput(
             "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, EventLog()
         )
@@ -38,6 +40,8 @@ class FakeOutput:
 
     def _open(self, address: Address, definition: Any, **_: object) -> SimpleNamespace:
         def publish(fields: dict[str, int]) -> None:
+            if self.failure is not None:
+                raise self.failure
             self.published.append((address, fields["timestamp"]))
 
         return SimpleNamespace(
@@ -113,6 +117,17 @@ def test_address_beyond_the_limit_is_rejected_until_another_is_stale() -> None:
     fake.receive(1, OTHER)
     assert OTHER in fake.output.addresses
     assert present[0] not in fake.output.stale
+
+
+def test_number_of_rules_and_of_logged_invalid_messages_is_limited(caplog: pytest.LogCaptureFixture) -> None:
+    """Invalid messages are counted by rule, from the 51st rule on as "other", and the first five are logged."""
+    fake = FakeOutput()
+    for number in range(60):
+        rule = f"field{number}", "must be finite"
+        fake.failure = nedbus.InvalidMessageError(": ".join(rule), [rule], message="VehicleLocalPosition")
+        fake.receive(0, POSITION)
+    assert (fake.output.rejected, len(fake.output.rejections), fake.output.rejections["other"]) == (60, 51, 10)
+    assert [number for number in range(60) if f"field{number}:" in caplog.text] == [0, 1, 2, 3, 4]
 
 
 def test_silent_addresses_are_logged_once_up_to_the_limit(caplog: pytest.LogCaptureFixture) -> None:

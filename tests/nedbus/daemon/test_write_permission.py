@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
-from nedbus.daemon.write_permission import WritePermission
+from nedbus.client import PublisherRegistry
+from nedbus.daemon.write_permission import WritePermission, watch_permission
+from nedbus.settings import Settings
 from nedbus.timings import TIMINGS
 from nedbus.transport import Session, Tls
 
 
 class Panic(BaseException):
     """A panic in Zenoh, which is not an Exception."""
+
+
+def test_only_services_with_a_certificate_are_checked() -> None:
+    """A service without a client certificate, or without TLS, starts no checks."""
+    for tls in (None, SimpleNamespace(certificate=None)):
+        settings = cast("Settings", SimpleNamespace(connect=("tls/localhost:1",), tls=tls))
+        assert watch_permission(cast("Session", None), settings, cast("PublisherRegistry", None)) is None
 
 
 def test_unexpected_error_in_a_check_is_logged(

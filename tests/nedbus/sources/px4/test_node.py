@@ -1,14 +1,16 @@
-"""State that departed vehicles leave behind in the source `px4-zenoh:`."""
+"""The ROS 2 node of `px4-zenoh:`: its queue, its thread, and the state that departed vehicles leave behind."""
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 
 import pytest
 import zenoh
 
 from nedbus.errors import SourceError
+from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.source import Px4ZenohNode
 from nedbus.sources.px4.streams import StreamRegistry
@@ -16,7 +18,7 @@ from nedbus.transport import Attachment, Session, TopicKey, open_client
 from nedbus_msgs import dds_type
 from tests.flights.local_position import ROS2_TYPE, downgrade, encode_cdr, type_hash
 from tests.flights.messages import VLP, message
-from tests.waits import DEADLINE
+from tests.waits import DEADLINE, wait_for
 
 
 class Source:
@@ -27,14 +29,16 @@ class Source:
         self.streams = StreamRegistry(Px4ZenohOptions(), vehicle="1")
         self.node = Px4ZenohNode(self.session, self.streams, domain=None)
         self.events = self.node.run()
-        self.received = 0
+        self.received, self.rejected = 0, Counter[str]()
 
     def step_until(self, condition: Callable[[], object]) -> None:
         end = time.monotonic() + DEADLINE
         while not condition():
             assert time.monotonic() < end
             event = next(self.events)
-            self.received += type(event).__name__ == "SourceMessage"
+            self.received += isinstance(event, SourceMessage)
+            if isinstance(event, Rejection):
+                self.rejected[event.reason] += event.count
 
 
 @pytest.fixture
@@ -66,6 +70,19 @@ def test_departed_vehicles_leave_no_objects(source: Source, zenoh_session: Sessi
     source.streams.report(time.monotonic() + 61.0)
     tables = source.streams._streams, source.streams._owners, source.streams._reboots
     assert [len(each) for each in (*tables, source.node._nodes, source.node._tokens._keys)] == [0, 0, 0, 0, 0]
+
+
+def test_messages_beyond_the_queue_are_counted_as_rejected(
+    source: Source, zenoh_session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Messages that arrive faster than they are decoded are not queued without limit, but counted as rejected."""
+    monkeypatch.setattr("nedbus.sources.px4.source._MAX_PENDING", 3)
+    source.step_until(lambda: True)
+    for domain in range(10):
+        put(zenoh_session, domain)
+    wait_for(lambda: source.node._dropped.total() == 7, what="all messages")
+    source.step_until(lambda: source.received == 3)
+    assert source.rejected == {"messages arrive faster than they are decoded": 7}
 
 
 def test_end_of_receiving_thread_raises(source: Source) -> None:
