@@ -59,6 +59,12 @@ class VehicleDirectory:
         self._tokens: LivelinessTokens | None = None
         self._logged = False
 
+    def close(self) -> None:
+        """End the subscription."""
+        with self._lock, suppress(zenoh.ZError):  # the session is already closed
+            if self._tokens is not None:
+                self._tokens.undeclare()
+
     def publishers(self, session: Session, *, timeout: float) -> Publishers:
         """Return the publishers of each address; wait up to `timeout` seconds while the list is incomplete."""
         end = time.monotonic() + timeout

@@ -7,7 +7,7 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -29,7 +29,7 @@ _REBOOT_STEP: Final = 1_000_000  # us; PX4's time steps back by more in a reboot
 _GAP_FACTOR: Final = 3.0  # times the usual interval between PX4's timestamps; a longer interval is a gap
 _MIN_STEPS: Final = 5  # intervals before gaps are counted
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual interval and the usual rate
-_MAX_MEASURED: Final = 1000  # intervals and latencies per window
+_MAX_MEASURED: Final = 1000  # latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
 _MIN_PERIODIC_RATE: Final = 1.0  # Hz; below it, a topic without a nominal rate may be published on change
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
@@ -96,20 +96,31 @@ class _Window:
 
     start: int
     messages: int = 0
-    intervals: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
-    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
+    intervals: tuple[int, float, float] = (0, 0.0, 0.0)  # number, mean [s], sum of squared differences from the mean
+    latencies: list[float] = field(default_factory=list)
     flags: _FlagCounts = field(default_factory=Counter)
+
+    def add_interval(self, interval: float) -> None:
+        """Add an interval [s] by Welford's method; the tuple is replaced as a whole, because other threads read it."""
+        number, mean, squares = self.intervals
+        new = mean + (interval - mean) / (number + 1)
+        self.intervals = number + 1, new, squares + (interval - mean) * (interval - new)
+
+    def add_latency(self, latency: float) -> None:
+        """Add a latency [s], up to a maximum number."""
+        if len(self.latencies) < _MAX_MEASURED:
+            self.latencies.append(latency)
 
     @property
     def mean(self) -> float:
         """Mean interval [s]; 0 without intervals."""
-        return sum(self.intervals) / len(self.intervals) if self.intervals else 0.0
+        return self.intervals[1]
 
     @property
     def deviation(self) -> float:
         """Standard deviation of the intervals [s]."""
-        mean, intervals = self.mean, tuple(self.intervals)  # copied: another thread may add to them
-        return math.sqrt(sum((each - mean) ** 2 for each in intervals) / len(intervals))
+        number, _, squares = self.intervals
+        return math.sqrt(squares / number)
 
 
 class Histogram:
@@ -178,7 +189,7 @@ class StreamHealth:
         self._lost += lost
         window.messages += 1
         if self._received is not None:
-            window.intervals.append((received - self._received) / 1e9)
+            window.add_interval((received - self._received) / 1e9)
         self._received = received
         rebooted, counters = self._add_time(int(timestamp)), tuple(seen[len(DOUBT_FLAGS) :])
         if counters != self._counters:
@@ -187,7 +198,7 @@ class StreamHealth:
                     self._resets[quantity] += (after - before) % 256
             self._counters = counters
         if latency is not None:
-            window.latencies.append(latency)
+            window.add_latency(latency)
             self.latencies.add(latency)
         for flag, is_set in zip(DOUBT_FLAGS, seen, strict=False):
             if flag not in missing:

@@ -222,9 +222,10 @@ class SourceOutput:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, unavailable: UnavailableTopics) -> None:
-        """Store the unavailable topics of a live source; log each silent address once."""
+        """Store the unavailable topics of a live source; log each silent address once, up to the address limit."""
         self.unavailable = unavailable
-        if new := [address for address in unavailable.silent if address not in self._silent]:
+        new = [address for address in unavailable.silent if address not in self._silent]
+        if new := new[: _MAX_ADDRESSES - len(self._silent)]:
             self._silent.update(new)
             text = f"announced, nothing arrives: {', '.join(new)}; run 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("topic_silent", source=self._name))

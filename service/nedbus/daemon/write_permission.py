@@ -91,11 +91,13 @@ class WritePermission:
     def check(self) -> float:
         """Check once, and return the time until the next check [s]."""
         vehicles = self._vehicles()
+        verdicts: Mapping[str, Verdict] = {}
         try:
             verdicts = self._probe(vehicles)
         except NedbusError as exc:  # link or session closed, or a TLS file being replaced
             _log.debug("write permission unknown: %s", exc)
-            verdicts = {}
+        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; a failed check must not end the thread
+            _log.exception("unexpected error in a check of the write permission", extra=about("internal_error"))
         before = self.refused
         self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
         for vehicle, verdict in verdicts.items():

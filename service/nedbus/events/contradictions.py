@@ -11,7 +11,7 @@ from typing import Final
 from nedbus_msgs.frames import MapProjection
 
 from . import rules
-from .detectors import ChangeDetector, Detection, FieldReader, Finding
+from .detectors import ChangeDetector, Detection, Finding, read_fields
 
 AIR_DATA: Final = "vehicle_air_data"
 _GNSS: Final = ("GNSS", ("fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph", "epv"))
@@ -34,7 +34,7 @@ class ReferenceDetector(ChangeDetector):
     def __init__(self, topic: str, comparison: Comparison, own: Detection | None) -> None:
         self._name, fields = REFERENCES[topic]
         super().__init__(*(own or (fields, (), lambda _, __: iter(()))))
-        self._read_reference = FieldReader(fields, math.nan)
+        self._read_reference = read_fields(fields, math.nan)
         self._comparison, self._compared = comparison, 0
         self.pause = 0.0 if own else 1.05e-6 * _INTERVAL
 
@@ -61,7 +61,7 @@ class Comparison:
 
     def __init__(self, position: Callable[[], ChangeDetector | None]) -> None:
         self._estimate = position
-        self._read = FieldReader(_ESTIMATE, math.nan)
+        self._read = read_fields(_ESTIMATE, math.nan)
         self.reset()
 
     def reset(self) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from operator import attrgetter, itemgetter
 from typing import Any, Final, Literal, cast
 
@@ -72,8 +73,12 @@ class FieldReader:
             return tuple(getattr(message, name, self._absent) for name in self.names)
 
 
+read_fields: Final = cache(FieldReader)
+"""Return the reader of these fields, one for the streams of all vehicles; the names must be a tuple."""
+
+
 class ChangeDetector:
-    """Detector for one stream; calls `detect` only when one of the `compared` fields changes.
+    """Detector for one stream; calls `detect` only when one of the `compared` fields or `missing` changes.
 
     `detect` receives None for fields that were not provided. `context`: other fields passed to it.
     `last`, `missing`: the last message, and the names of its fields that were not provided.
@@ -85,8 +90,8 @@ class ChangeDetector:
     due = -math.inf
 
     def __init__(self, compared: Sequence[str], context: Sequence[str], detect: Detect) -> None:
-        self._read = FieldReader(("timestamp", *compared))
-        self._read_all = FieldReader(("timestamp", *compared, *context))
+        self._read = read_fields(("timestamp", *compared))
+        self._read_all = read_fields(("timestamp", *compared, *context))
         self._detect = detect
         self.last: object = None
         self._state: tuple[Any, ...] = ()

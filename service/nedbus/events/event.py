@@ -13,7 +13,7 @@ from .kinds import KINDS, SEVERITIES, Severity, importance
 from .rules import LARGE_CORRECTION
 
 WINDOW: Final = 10.0
-"""Seconds before an event in which other events are evidence; the start of an active condition always is evidence."""
+"""Seconds before an event in which events of related kinds are evidence; the start of an active one may be older."""
 
 ALL: Final = "*"
 """Vehicle name in events that concern all vehicles: events of the router link and of the reader."""

@@ -27,7 +27,7 @@ MAX_VEHICLES: Final = 1000
 """Maximum number of vehicles in an event log; beyond it, the vehicle that has been gone longest is forgotten."""
 
 MAX_GONE: Final = 50
-"""Maximum number of gone vehicles remembered, or the highest number ever present at once if that is larger."""
+"""Maximum number of vehicles gone for over a minute, or the highest number ever present at once if that is larger."""
 
 _SHARE: Final = 20  # events guaranteed to each vehicle while others have more
 

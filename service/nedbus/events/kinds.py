@@ -20,7 +20,7 @@ class Kind:
     always info. `message`: the PX4 message in which it is detected, "" for other sources.
     `causes`: kinds that may explain it. `row`: its row in plots, by default its name.
 
-    `fault`: `nedbus why` always reports it as a fault. `validity`: a quantity of the estimate is invalid.
+    `fault`: `nedbus why` reports it, also once it has ended. `validity`: a quantity of the estimate is invalid.
     `correction`: the estimate is corrected; both starts and ends of conditions may explain it.
     `phase`: a phase of a flight, shown even if its severity is info.
     `stateless`: it does not affect the vehicle's state. `kept_on_reboot`: a reboot does not end it.

@@ -8,7 +8,7 @@ from typing import Final
 from nedbus_msgs import RESET_COUNTERS, Quantity
 from nedbus_msgs.frames import MapProjection, wrap
 
-from .detectors import ChangeDetector, FieldReader, Fields, Finding, detect_flags
+from .detectors import ChangeDetector, Fields, Finding, detect_flags, read_fields
 from .kinds import Severity, flagged
 from .rules import JUMP_DISTANCE, JUMP_SHARE, SMALL_RESET
 
@@ -50,7 +50,7 @@ class PositionDetector(ChangeDetector):
 
     def __init__(self) -> None:
         super().__init__(_COMPARED, [*_CONTEXT], self._detect_position)
-        self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
+        self._read_motion = read_fields(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
         self._jump: Step | None = None  # in progress

@@ -40,6 +40,8 @@ class LivelinessTokens:
 
     def __init__(self, session: Session, key_expr: str) -> None:
         self._session, self._key_expr = session, key_expr
+        # Access rules that allow the key expression allow this key.
+        self._probe_key = re.sub(r"\*\*|\$?\*", "-", key_expr)
         self._keys: set[str] = set()
         self._unseen: set[str] = set()  # tokens of the previous subscription that the current one has not listed yet
         self._retry = math.inf  # monotonic time of the next attempt to list tokens beyond the limit [s]
@@ -59,6 +61,8 @@ class LivelinessTokens:
     def undeclare(self) -> None:
         """End the subscription."""
         self._subscriber.undeclare()
+        for key in (self._key_expr, self._probe_key):  # Zenoh frees neither until something else on it is undeclared
+            self._session.undeclare(self._session.declare_keyexpr(key))
 
     def poll(self) -> list[tuple[str, bool]]:
         """Return the changes since the last call, in order: the key of a token, and True if it was declared."""
@@ -89,8 +93,7 @@ class LivelinessTokens:
         self._probe, self._unseen, self._retry = self._send_probe(), self._keys.copy(), math.inf
 
     def _send_probe(self) -> Replies:
-        key = re.sub(r"\*\*|\$?\*", "-", self._key_expr)  # access rules that allow the key expression allow this key
-        return _query_tokens(self._session, key, _PROBE_TIMEOUT)
+        return _query_tokens(self._session, self._probe_key, _PROBE_TIMEOUT)
 
     def _apply(self, key: str, alive: bool) -> bool:
         """Apply a change; return False if it has no effect."""

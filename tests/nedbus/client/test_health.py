@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
 
 from nedbus import Sample
 from nedbus.client import describe_stream, stream_state
-from nedbus.client.health import _Window
 from nedbus.health import Health, Monitor, StreamHealth
 from nedbus_msgs import DOUBT_FLAGS, Address
 from tests.flights.messages import VALID, VLP, message
@@ -53,20 +52,25 @@ def test_rate_and_jitter_cover_the_last_second() -> None:
     assert health.messages == 201
 
 
-def test_concurrent_add_does_not_break_a_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_add_does_not_break_a_snapshot() -> None:
     """A snapshot computes the jitter correctly even if another thread adds a message meanwhile."""
     stream = stream_at(0.0, 0.01, 0.02)
-    mean = vars(_Window)["mean"].fget
+    window = stream._window
+    before = window.intervals
 
-    class LateMean(float):
-        """A mean that adds a message to the stream when the jitter is computed from it."""
+    class LateIntervals(tuple[int, float, float]):
+        """Measurements of the intervals during whose reading a message is added to the stream."""
 
-        def __rsub__(self, other: float) -> float:
+        __slots__ = ()
+
+        def __iter__(self) -> Iterator[float]:
+            window.intervals = before
             stream.add(message(30_000), received=SECOND // 50)
-            return other - float(self)
+            return super().__iter__()
 
-    monkeypatch.setattr(_Window, "mean", property(lambda window: LateMean(mean(window))))
+    window.intervals = LateIntervals(before)
     assert stream.snapshot(SECOND // 50).jitter == pytest.approx(0.0)
+    assert window.intervals[0] == 3
 
 
 def test_silent_stream_has_age_but_no_rate() -> None:

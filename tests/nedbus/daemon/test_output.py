@@ -7,10 +7,11 @@ from typing import Any, cast
 
 import pytest
 
+import nedbus
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import EventLog
-from nedbus.sources import Rejection, SourceMessage
+from nedbus.sources import Rejection, SourceMessage, UnavailableTopics
 from nedbus_msgs import BY_TOPIC, Address
 from tests.flights.messages import VLP
 
@@ -23,6 +24,7 @@ class FakeOutput:
 
     def __init__(self) -> None:
         self.now, self.published = 0.0, list[tuple[Address, int]]()  # address and timestamp
+        self.failure: nedbus.InvalidMessageError | None = None
         self.reports = list[dict[str, object]]()
         self.event_log = EventLog()
         registry = SimpleNamespace(publisher=self._open, reject=lambda _, report: self.reports.append(report))
@@ -40,6 +42,8 @@ class FakeOutput:
 
     def _open(self, address: Address, definition: Any, **_: object) -> SimpleNamespace:
         def publish(fields: dict[str, int]) -> None:
+            if self.failure is not None:
+                raise self.failure
             self.published.append((address, fields["timestamp"]))
 
         return SimpleNamespace(
@@ -126,3 +130,25 @@ def test_text_of_a_rejection_is_limited(caplog: pytest.LogCaptureFixture) -> Non
     assert caplog.messages == [f"px4: {where} rejected: {reason}"]
     assert fake.reports == [{"source": "px4-zenoh:", "where": where, "reason": reason}]
     assert [event.text for event in fake.event_log.events] == [f"{VLP} rejected: {reason}"]
+
+
+def test_number_of_rules_and_of_logged_invalid_messages_is_limited(caplog: pytest.LogCaptureFixture) -> None:
+    """Invalid messages are counted by rule, from the 51st rule on as "other", and the first five are logged."""
+    fake = FakeOutput()
+    for number in range(60):
+        rule = f"field{number}", "must be finite"
+        fake.failure = nedbus.InvalidMessageError(": ".join(rule), [rule], message="VehicleLocalPosition")
+        fake.receive(0, POSITION)
+    assert (fake.output.rejected, len(fake.output.rejections), fake.output.rejections["other"]) == (60, 51, 10)
+    assert [number for number in range(60) if f"field{number}:" in caplog.text] == [0, 1, 2, 3, 4]
+
+
+def test_silent_addresses_are_logged_once_up_to_the_limit(caplog: pytest.LogCaptureFixture) -> None:
+    """A silent address is logged once, and only the first 1,000, because a peer may announce any number."""
+    fake = FakeOutput()
+    for start in (0, 600, 1200, 0):
+        names = tuple(f"v{number}/{VLP}" for number in range(start, start + 600))
+        fake.output.note(UnavailableTopics(silent=names))
+        assert fake.output.unavailable.silent == names
+    text = "".join(record.getMessage() for record in caplog.records)
+    assert [text.count(f"v{number}/") for number in (0, 599, 999, 1000, 1799)] == [1, 1, 1, 0, 0]

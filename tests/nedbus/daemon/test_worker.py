@@ -385,6 +385,14 @@ def test_addresses_of_a_live_source_are_limited(monkeypatch: pytest.MonkeyPatch)
     assert status.warnings == (ignored,)
 
 
+def test_status_has_100_streams_at_most() -> None:
+    """A status has the health of 100 streams at most, because it must fit into one reply; metrics have all of them."""
+    clock = FakeClock(stop_at=100.0)
+    harness = run(FakeLive(clock, [at(0.0, Address(str(number), VLP)) for number in range(101)]), clock)
+    assert len(harness.status.streams) == 100
+    assert len(harness.worker.measures.status.streams) == 101
+
+
 def test_stop_interrupts_a_replay_between_messages() -> None:
     """A stopped source publishes nothing more, and is neither done nor failed."""
     harness = run(FakeReplay([at(0.0), at(60.0)]), FakeClock(stop_at=5.0))

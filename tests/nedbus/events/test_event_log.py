@@ -789,7 +789,7 @@ def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
     """For any messages, each end event follows a begin event or, at most once since boot, an initial condition.
 
     The last event of flapping may repeat an end, if an even number of changes was suppressed.
-    No condition ends before it began, and evidence precedes the event.
+    No condition ends before it began, its end is info, and evidence precedes the event.
     """
     flight = Flight()
     for name, value in steps:
@@ -803,6 +803,7 @@ def test_begin_and_end_events_are_paired(steps: list[tuple[str, Any]]) -> None:
         assert event.kind in KINDS
         assert all(each.time <= event.time for each in event.evidence)
         assert event.lasted is None or event.lasted >= 0
+        assert event.change != "end" or event.severity == "info"
         assert event.boot is None or math.isfinite(event.boot)
         if event.kind == "reboot":
             begun = {key: each for key, each in begun.items() if key[0] in OUTLIVING}

@@ -32,6 +32,8 @@ def test_row_in_the_table_defines_a_kind(monkeypatch: pytest.MonkeyPatch) -> Non
     flight.wait(1.0).send("vehicle_land_detected", landed=False, freefall=False)
     [story] = [each for each in stories_of(flight.event_log.events) if each.what == "free fall"]
     assert [each.kind for each in story.before] == ["gps_fix_lost"]
+    flight.wait(1.0).send("battery_status", warning=3, connected=True)
+    assert "free fall" in [each.what for each in stories_of(flight.event_log.events)]
 
 
 def test_unknown_kind_is_shown() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import SourceMessage
-from nedbus_msgs import BY_TOPIC, DEFAULT, TOPICS, VehicleLocalPosition, upgrade_with
+from nedbus_msgs import BY_TOPIC, DEFAULT, RESET_COUNTERS, TOPICS, VehicleLocalPosition, upgrade_with
 from nedbus_msgs.frames import quaternion_to_euler, to_global
 from tests.flights.local_position import FIELD_TYPES, encode, upgrade
 from tests.flights.messages import VLP
@@ -172,6 +172,15 @@ def test_origin_is_set_in_flight(streams: dict[str, list[VehicleLocalPosition]])
     """There is no global origin for the first two seconds, as before the first fix."""
     assert all(each.xy_global == (each.timestamp >= 12_000_000) for each in streams[VLP])  # boot is at 10 s
     assert streams[VLP][-1].ref_lat == 47.397742
+
+
+def test_external_ins_has_neither_outage_nor_resets(streams: dict[str, list[VehicleLocalPosition]]) -> None:
+    """The position aiding of the external INS never fails, so its estimate is always valid, and is not reset."""
+    for message in streams["external_ins_local_position"]:
+        assert message.xy_valid
+        assert message.z_valid
+        assert not message.dead_reckoning
+        assert not any(getattr(message, counter) for counter in RESET_COUNTERS.values())
 
 
 def test_vehicles_with_different_seeds_fly_apart() -> None:

@@ -94,11 +94,9 @@ class PublisherRegistry:
 
     def shared_vehicles(self) -> set[str]:
         """Return the vehicles that another process also publishes; log new ones."""
-        with self._lock:
-            directories = list(self._directories.items())
-        counts = {name: each.publishers(self._session, timeout=0).values() for name, each in directories}
-        shared = {name for name, numbers in counts.items() if max(numbers, default=0) > 1}
-        with self._lock:  # several threads call this
+        with self._lock:  # several threads call this, and `forget` closes directories
+            counts = {name: each.publishers(self._session, timeout=0) for name, each in self._directories.items()}
+            shared = {name for name, numbers in counts.items() if max(numbers.values(), default=0) > 1}
             known, self._shared = self._shared, shared
         for name in shared - known:
             text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
@@ -156,7 +154,8 @@ class PublisherRegistry:
         self._queries.end(f"{self.prefix}/{vehicle}/**")
         if (listener := self._rate_listeners.pop(vehicle, None)) is not None:
             listener.close()
-        self._directories.pop(vehicle, None)
+        if (directory := self._directories.pop(vehicle, None)) is not None:
+            directory.close()
         if self._rate_listeners or self._former:  # another vehicle can answer
             self._queries.end(schema_key(ANY, vehicle=vehicle, prefix=self.prefix))
         else:

@@ -111,11 +111,13 @@ class Px4ZenohNode:
         self._thread.start()
 
     def run(self) -> Iterator[SourceMessage | Rejection | UnavailableTopics | None]:
-        """Yield events until the iterator is closed."""
+        """Yield events until the iterator is closed; raise SourceError if the receiving thread has ended."""
         yield None
         last: UnavailableTopics | None = None
         next_report = 0.0
         while True:
+            if not self._thread.is_alive():
+                raise SourceError("px4-zenoh", "receiving has stopped unexpectedly")
             new = self._dropped - self._reported
             for (where, reason), count in new.items():
                 yield Rejection(where, reason, count=count)
@@ -199,6 +201,8 @@ class Px4ZenohNode:
         elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
             with suppress(zenoh.ZError):  # the session may be closed already
                 self._subscriptions.pop(token.key).undeclare()
+                if all(key.domain != token.key.domain for key in self._subscriptions):
+                    self._nodes.pop(token.key.domain).undeclare()
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
         with translate_zenoh_errors():
