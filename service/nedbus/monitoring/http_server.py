@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import logging
+import math
 import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, NamedTuple
 
@@ -19,11 +18,14 @@ from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
 from nedbus.timings import TIMINGS
 
+from .access import why_refused
+
 _log = logging.getLogger(__name__)
 
 _MAX_REQUESTS: Final = 16  # concurrent
+_POLL: Final = 0.1  # s
+_GRACE: Final = 0.2  # s to send a request or read a response, even if all threads are in use
 _ACCEPT_PAUSE: Final = 0.2  # s
-_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # scrapers and probes may use any host name
 
 
 class Page(NamedTuple):
@@ -50,12 +52,10 @@ class Page(NamedTuple):
 
 
 class HttpServer(ThreadingHTTPServer):
-    """Serve pages by path on HOST:PORT, in up to 16 background threads, until closed.
+    """Serve pages by path on HOST:PORT, in up to 16 background threads, until closed; access as in `why_refused`.
 
-    Protects against DNS rebinding, where a web page in a browser on this network points its own host name to this
-    server to read the responses. Pages are served only under host names that such a page cannot control: IP addresses,
-    localhost, this host's own names and, unless bound to loopback, names without a dot, as in Docker. Unless bound to
-    loopback, metrics, health, readiness and vehicle states are served under any name.
+    A client has 5 s to send its request, and 5 s to read the response. If all threads are in use, a new client takes
+    the thread of the client that has been sending or reading for the longest time, or waits for a page to be made.
 
     Raises ConfigError for an invalid HOST:PORT, ListenError if it cannot listen there.
     """
@@ -71,19 +71,37 @@ class HttpServer(ThreadingHTTPServer):
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.pages, self.is_local = pages, is_loopback(host)
         self._free = threading.Semaphore(_MAX_REQUESTS)
+        self._lock = threading.Lock()
+        self._waiting: dict[socket.socket, float] = {}  # start of sending or reading by client, the earliest first [s]
         try:
             super().__init__((host, port), _Handler)
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             raise ListenError([f"http://{where}"], reason, hint="choose another address with --http") from exc
         self.port: int = self.server_address[1]
-        threading.Thread(target=self.serve_forever, args=(0.2,), name="nedbus-http", daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(_POLL,), name="nedbus-http", daemon=True).start()
 
     def close(self) -> None:
-        """Stop listening; do not wait for queued clients."""
+        """Stop listening, and disconnect clients that are sending or reading; do not wait for queued clients."""
         self._free.release(_MAX_REQUESTS)
         self.shutdown()
         self.server_close()
+        self._disconnect(before=math.inf)
+
+    def start_waiting(self, client: socket.socket) -> None:
+        """Start the time limit of a client that sends its request or reads the response."""
+        client.settimeout(TIMINGS.http_client)  # also effective after `close`
+        with self._lock:
+            self._waiting[client] = time.monotonic()
+
+    def stop_waiting(self, client: socket.socket) -> None:
+        """Stop the time limit of a client."""
+        with self._lock:
+            self._waiting.pop(client, None)
+
+    def service_actions(self) -> None:
+        """Disconnect clients after their time limit; the base class calls this at each poll."""
+        self._disconnect(before=time.monotonic() - TIMINGS.http_client)
 
     def get_request(self) -> tuple[socket.socket, Any]:
         """Accept a client; if that fails, for example without free file descriptors, pause to avoid a busy loop."""
@@ -95,10 +113,15 @@ class HttpServer(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Handle a client in a thread; disconnect the client if no thread is free within 5 s."""
-        if self._free.acquire(timeout=TIMINGS.http_client):
-            super().process_request(request, client_address)
-        else:
+        is_free, end = self._free.acquire(blocking=False), time.monotonic() + TIMINGS.http_client
+        while not is_free and time.monotonic() < end:
+            self._disconnect(before=time.monotonic() - _GRACE, limit=1)
+            is_free = self._free.acquire(timeout=_POLL)
+        if not is_free:
             self.shutdown_request(request)
+            return
+        self.start_waiting(request)
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Handle a client, and release its thread."""
@@ -107,9 +130,22 @@ class HttpServer(ThreadingHTTPServer):
         finally:
             self._free.release()
 
+    def shutdown_request(self, request: Any) -> None:
+        """Close the connection of a client."""
+        self.stop_waiting(request)
+        super().shutdown_request(request)
+
     def handle_error(self, request: object, client_address: object) -> None:
         """Log a disconnected client."""
         _log.debug("an HTTP client disconnected", exc_info=True)
+
+    def _disconnect(self, *, before: float, limit: int = _MAX_REQUESTS) -> None:
+        """Disconnect up to `limit` clients that started to send or read before this time, the earliest first."""
+        with self._lock:  # a thread cannot close its connection meanwhile
+            for client in [each for each, start in self._waiting.items() if start < before][:limit]:
+                del self._waiting[client]
+                with suppress(OSError):  # the client has disconnected
+                    client.shutdown(socket.SHUT_RDWR)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -117,18 +153,10 @@ class _Handler(BaseHTTPRequestHandler):
     server_version = "nedbus"
     sys_version = ""
 
-    def handle(self) -> None:
-        """Handle one request; stop receiving after the timeout, even from a client that sends byte by byte."""
-        self.connection.settimeout(TIMINGS.http_client)
-        deadline = threading.Timer(TIMINGS.http_client, self._stop_receiving)
-        deadline.start()
-        try:
-            super().handle()
-        finally:
-            deadline.cancel()
-
     def do_GET(self) -> None:
+        self.server.stop_waiting(self.connection)
         page = self._make_page(self.path.partition("?")[0])
+        self.server.start_waiting(self.connection)
         self.send_response(page.status)
         self.send_header("Content-Type", page.content_type)
         self.send_header("Content-Length", str(len(page.content)))
@@ -144,32 +172,13 @@ class _Handler(BaseHTTPRequestHandler):
         _log.debug(format, *args)
 
     def _make_page(self, path: str) -> Page:
-        pages, is_local = self.server.pages, self.server.is_local
+        pages, headers = self.server.pages, self.headers
+        if refusal := why_refused(path, lambda name: headers.get_all(name, []), is_local=self.server.is_local):
+            return Page.text(refusal, status=403)
         if path not in pages:
             return Page.text(f"available pages: {', '.join(pages)}", status=200 if path == "/" else 404)
-        host = self.headers.get("Host") or "localhost"  # every browser sends Host
-        if (is_local or path not in _ANY_NAME) and not is_local_host_header(host, local=is_local):
-            return Page.text(f"{path} is only served under an IP address or a name of this host", status=403)
         try:
             return pages[path]()
         except Exception:  # noqa: BLE001 - one page must not break the server
             _log.exception("unexpected error in page %s", path, extra=about("internal_error"))
             return Page.text("unexpected error: see the log", status=500)
-
-    def _stop_receiving(self) -> None:
-        with suppress(OSError):  # the client has disconnected
-            self.connection.shutdown(socket.SHUT_RD)
-
-
-def is_local_host_header(host: str, *, local: bool) -> bool:
-    """Return whether the name in a Host header is one that a foreign web page cannot point to this host."""
-    name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
-    name = name.lower().removesuffix(".")
-    with suppress(ValueError):
-        return bool(ipaddress.ip_address(name))
-    return name == "localhost" or (not local and "." not in name) or name in _names()
-
-
-@cache
-def _names() -> set[str]:
-    return {socket.gethostname().lower(), socket.getfqdn().lower()}
