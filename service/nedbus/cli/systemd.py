@@ -24,16 +24,16 @@ _START_INTERVAL: Final = 0.1  # s between two checks until the service is ready
 def notify(address: str, **fields: object) -> bool:
     """Send these fields to NOTIFY_SOCKET as one datagram, see sd_notify(3); return True if it was accepted.
 
-    Never raises and never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not report
-    whether a datagram was accepted.
+    Never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not report whether a datagram
+    was accepted.
     """
     where = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), where)
-        except OSError as exc:  # no reader, or a full queue: READY and STATUS are sent again
-            _log.debug("cannot notify systemd: %s", exc)
-            return False
+    except OSError as exc:  # no reader, a full queue, or no free file descriptor: READY and STATUS are sent again
+        _log.debug("cannot notify systemd: %s", exc)
+        return False
     return True
 
 

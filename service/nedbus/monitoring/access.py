@@ -21,7 +21,7 @@ def why_refused(
     In DNS rebinding, a website points its own host name to this server to read the responses. Therefore the Host header
     must be a name that such a website cannot control: an IP address, localhost, a name of this host or, unless bound to
     loopback, a name without a dot, as in Docker. Unless bound to loopback, metrics, health, readiness and vehicle
-    states are served under any name. A request without a Host header is accepted, because browsers always send one.
+    states are served under any name. A request without a Host header is accepted, because no browser sends one.
 
     An Origin header must name the host and port of the Host header. Of cross-site requests only links are accepted.
     """

@@ -13,7 +13,7 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final, NamedTuple
 
-from nedbus.errors import ConfigError, ListenError
+from nedbus.errors import ListenError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
 from nedbus.timings import TIMINGS
@@ -57,22 +57,19 @@ class HttpServer(ThreadingHTTPServer):
     A client has 5 s to send its request, and 5 s to read the response. If all threads are in use, a new client takes
     the thread of the client that has been sending or reading for the longest time, or waits for a page to be made.
 
-    Raises ConfigError for an invalid HOST:PORT, ListenError if it cannot listen there.
+    Raises ListenError if it cannot listen there.
     """
 
     daemon_threads = True
     request_queue_size = 2 * _MAX_REQUESTS  # with Python's default of 5, the sixth concurrent client waits 1 s
 
     def __init__(self, where: str, pages: Mapping[str, Callable[[], Page]]) -> None:
-        try:
-            host, port = split_http(where)
-        except ValueError as exc:
-            raise ConfigError("--http", str(exc)) from exc
+        host, port = split_http(where)
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.pages, self.is_local = pages, is_loopback(host)
         self._free = threading.Semaphore(_MAX_REQUESTS)
         self._lock = threading.Lock()
-        self._waiting: dict[socket.socket, float] = {}  # start of sending or reading by client, the earliest first [s]
+        self._starts: dict[socket.socket, float] = {}  # see `set_start`
         try:
             super().__init__((host, port), _Handler)
         except OSError as exc:
@@ -88,16 +85,11 @@ class HttpServer(ThreadingHTTPServer):
         self.server_close()
         self._disconnect(before=math.inf)
 
-    def start_waiting(self, client: socket.socket) -> None:
-        """Start the time limit of a client that sends its request or reads the response."""
+    def set_start(self, client: socket.socket, start: float) -> None:
+        """Set when a client started to send its request or to read the response; inf while its page is made."""
         client.settimeout(TIMINGS.http_client)  # also effective after `close`
         with self._lock:
-            self._waiting[client] = time.monotonic()
-
-    def stop_waiting(self, client: socket.socket) -> None:
-        """Stop the time limit of a client."""
-        with self._lock:
-            self._waiting.pop(client, None)
+            self._starts[client] = start
 
     def service_actions(self) -> None:
         """Disconnect clients after their time limit; the base class calls this at each poll."""
@@ -120,7 +112,7 @@ class HttpServer(ThreadingHTTPServer):
         if not is_free:
             self.shutdown_request(request)
             return
-        self.start_waiting(request)
+        self.set_start(request, time.monotonic())
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -132,7 +124,8 @@ class HttpServer(ThreadingHTTPServer):
 
     def shutdown_request(self, request: Any) -> None:
         """Close the connection of a client."""
-        self.stop_waiting(request)
+        with self._lock:
+            self._starts.pop(request, None)
         super().shutdown_request(request)
 
     def handle_error(self, request: object, client_address: object) -> None:
@@ -142,8 +135,9 @@ class HttpServer(ThreadingHTTPServer):
     def _disconnect(self, *, before: float, limit: int = _MAX_REQUESTS) -> None:
         """Disconnect up to `limit` clients that started to send or read before this time, the earliest first."""
         with self._lock:  # a thread cannot close its connection meanwhile
-            for client in [each for each, start in self._waiting.items() if start < before][:limit]:
-                del self._waiting[client]
+            slow = [client for client, start in self._starts.items() if start < before]
+            for client in sorted(slow, key=self._starts.__getitem__)[:limit]:
+                del self._starts[client]
                 with suppress(OSError):  # the client has disconnected
                     client.shutdown(socket.SHUT_RDWR)
 
@@ -154,9 +148,9 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def do_GET(self) -> None:
-        self.server.stop_waiting(self.connection)
+        self.server.set_start(self.connection, math.inf)
         page = self._make_page(self.path.partition("?")[0])
-        self.server.start_waiting(self.connection)
+        self.server.set_start(self.connection, time.monotonic())
         self.send_response(page.status)
         self.send_header("Content-Type", page.content_type)
         self.send_header("Content-Length", str(len(page.content)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -281,6 +282,16 @@ def test_notify_returns_false_if_queue_is_full(systemd: Systemd) -> None:
         systemd.receive()
     assert notify(systemd.address, READY=1)
     Path(systemd.address).unlink()
+    assert not notify(systemd.address, READY=1)
+
+
+def test_notify_returns_false_without_file_descriptor(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit of open files `notify` returns False, so the watchdog's thread does not end."""
+
+    def fail(*_: object) -> socket.socket:
+        raise OSError(errno.EMFILE, "too many open files")
+
+    monkeypatch.setattr("nedbus.cli.systemd.socket.socket", fail)
     assert not notify(systemd.address, READY=1)
 
 
