@@ -7,6 +7,8 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -51,7 +53,9 @@ def split_http(where: str) -> tuple[str, int]:
 
 def is_loopback(host: str) -> bool:
     """Return whether a server on this address is reachable from this host only."""
-    return host in {"127.0.0.1", "::1", "localhost"}
+    with suppress(ValueError):
+        return ip_address(host).is_loopback
+    return host == "localhost"
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:

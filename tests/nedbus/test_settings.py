@@ -12,7 +12,7 @@ import nedbus
 from nedbus import Tls
 from nedbus.errors import ConfigError, ConnectError, ListenError
 from nedbus.pki import make_authority, make_certificate
-from nedbus.settings import load_settings
+from nedbus.settings import is_loopback, load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
 from nedbus.transport.endpoints import resolution_error
@@ -277,3 +277,13 @@ def test_malformed_endpoint_raises(endpoint: str) -> None:
         open_client((endpoint,), timeout=0)
     with pytest.raises(ConfigError, match="is not an endpoint"):
         open_router(listen=(endpoint,))
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [("127.0.0.1", True), ("127.0.0.2", True), ("::1", True), ("localhost", True), ("0.0.0.0", False),  # noqa: S104
+     ("::", False), ("192.0.2.1", False), ("ground", False)],
+)  # fmt: skip
+def test_loopback_addresses_are_recognised(host: str, expected: bool) -> None:
+    """All of 127.0.0.0/8, ::1 and localhost are reachable from this host only."""
+    assert is_loopback(host) == expected

@@ -46,7 +46,7 @@ _NO_ROTATION: Final = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 class FoxgloveServer:
     """Serve the streams of a bus over Foxglove's WebSocket protocol; a context manager that stops the server on exit.
 
-    Fields are encoded only for channels with a subscriber. A slow client misses the oldest messages.
+    Fields are encoded for channels with a subscriber. A slow client misses the oldest messages.
 
     Raises ListenError if the address is not available.
     """

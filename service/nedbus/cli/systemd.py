@@ -25,8 +25,8 @@ _START_INTERVAL: Final = 0.1  # s between two checks until the service is ready
 def notify(address: str, **fields: object) -> bool:
     """Send these fields to NOTIFY_SOCKET as one datagram, see sd_notify(3); return True if it was accepted.
 
-    Never raises and never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not report
-    whether a datagram was accepted.
+    Never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not report whether a datagram
+    was accepted.
     """
     where = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
     try:

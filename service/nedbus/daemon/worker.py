@@ -66,7 +66,7 @@ class Clock(threading.Event):
 class Worker:
     """Run one source in a thread until the worker is stopped; publishers stay open after the source has ended.
 
-    `retry`: restart a failed replay with exponential backoff; a failed live source is always restarted.
+    `retry`: restart a failed replay with exponential backoff; a failed live source is restarted in any case.
     `router`: the embedded router, for live sources; `on_end`: called when the source has ended.
     """
 

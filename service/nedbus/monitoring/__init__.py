@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
-from .http_server import HttpServer, Page, is_local_host_header
+from .access import why_refused
+from .http_server import HttpServer, Page
 from .observer import Observer, Snapshot
 from .pages import service_pages, why_not_ready
 

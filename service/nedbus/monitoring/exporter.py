@@ -73,15 +73,16 @@ class Exporter(Observer):
     def poll(self) -> Snapshot:
         """Poll all vehicles; called by `run` twice a second."""
         snapshot = super().poll()
-        for address in [*self._sources]:  # copied: another thread adds streams
-            if address not in snapshot.healths:
+        with self._lock:  # not by `snapshot`: a stream may have been added since
+            for address in [each for each in self._sources if self.monitor.latencies(each) is None]:
                 del self._sources[address]
         return snapshot
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample; called by `run` for each one read."""
         super().add(sample)
-        self._sources[sample.address] = sample.source or ""
+        with self._lock:
+            self._sources[sample.address] = sample.source or ""
 
     def _metrics(self) -> Iterator[Metric]:
         counts = self.subscription.counts

@@ -39,8 +39,8 @@ class Snapshot:
 class Observer:
     """Subscribe to a selection and keep an `event_log` of its vehicles on the steady clock.
 
-    The thread that reads `subscription` passes each sample to `add`. Any thread may call `poll`, about twice a second,
-    and `measure`.
+    The thread that reads `subscription` passes each sample to `add`. One thread calls `poll`, about twice a second. Any
+    thread may call `measure`.
     """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:

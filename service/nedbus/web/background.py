@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +18,7 @@ from .style import Style
 
 _WORLD_FILES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # suffixes
 _MAX_SIDE: Final = 2000  # pixels; larger images are scaled down
+_MAX_PIXELS: Final = 50_000_000  # of an image file; decoded, each takes up to 4 bytes
 _PARTS: Final = {"FeatureCollection": "features", "GeometryCollection": "geometries", "Feature": "geometry"}
 
 Ring = list[tuple[float, float]]
@@ -73,13 +75,17 @@ class Background:
         width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
         if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
             raise ValueError("the image is not north up in degrees: convert it with gdalwarp -t_srs EPSG:4326")
+        too_large = f"more than {_MAX_PIXELS:,} pixels: reduce it with gdal_translate -outsize {_MAX_SIDE} 0"
+        warned = Image.DecompressionBombWarning
         try:
-            with Image.open(path) as image:
+            with warnings.catch_warnings(category=warned, action="error"), Image.open(path) as image:
                 columns, rows = image.size
+                if columns * rows > _MAX_PIXELS:  # before it is decoded
+                    raise ValueError(too_large)
                 image.thumbnail((_MAX_SIDE, _MAX_SIDE))
                 pixels = np.asarray(image.convert("RGBA"))[::-1]
-        except Image.DecompressionBombError as exc:
-            raise ValueError(str(exc)) from exc
+        except (Image.DecompressionBombError, warned) as exc:
+            raise ValueError(too_large) from exc
         self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
         left, top = west - width / 2, north - height / 2  # the world file has the centre of the first pixel
         self._corners = [(left, top + rows * height), (left + columns * width, top)]

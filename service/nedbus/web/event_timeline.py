@@ -23,6 +23,7 @@ from nedbus.events import (
 
 PAST: Final = 600.0  # seconds of history on a live page
 _MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
+_MAX_CACHED: Final = 2000  # stories and verdicts; more than the vehicles of an event log, which `faults` looks up
 _URL_RESOLUTION: Final = 0.1  # s; times in the URL are rounded to this
 
 
@@ -41,7 +42,7 @@ class EventTimeline:
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
-        self._find_stories_cached = functools.cache(self._find_stories)  # shared by all viewers
+        self._find_stories_cached = functools.lru_cache(_MAX_CACHED)(self._find_stories)  # for all viewers
         self._verdicts: dict[tuple[str, float | None], tuple[float, Verdict]] = {}
 
     @property
@@ -95,6 +96,8 @@ class EventTimeline:
             events = [event for event in events if event.time > end - PAST or not self.times.is_live]
             verdict = verdict_of(vehicle, events, held, topics=topics, times=self.times, end=end, at=at)
             self._verdicts[vehicle, at] = end, verdict
+            if len(self._verdicts) > _MAX_CACHED:
+                del self._verdicts[next(iter(self._verdicts))]
         return verdict
 
     @property

@@ -2,6 +2,7 @@
 
 import math
 import re
+import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -142,24 +143,23 @@ class Fleet:
         numbers = count()
         self._number_of = lru_cache(MAX_STREAMS)(lambda vehicle: next(numbers))
         self._left_out: set[Address] = set()
-        self._gone: list[Address] = []  # to be removed by the thread that adds samples
+        self._lock = threading.Lock()  # guards `streams` and `_left_out`
         self._rejected: Counter[Address] = Counter()
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
 
     def add(self, sample: Sample[Any], time: float) -> None:
         """Add a sample received at `time`: seconds since the Unix epoch, or since the start of a recording."""
-        while self._gone:
-            self.streams.pop(self._gone.pop(), None)
         address = sample.address
         is_estimate = is_position(address) and address.topic != TRUTH
-        truth = self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None
-        if stream := self.streams.get(address):
-            stream.add(sample, time, truth)
-        elif len(self.streams) < MAX_STREAMS or (is_position(address) and self._evict(time)):
-            self.streams[address] = PageStream(sample, time, truth, self.origin, self._long)
-            self._left_out.discard(address)
-        elif len(self._left_out) < MAX_STREAMS:
-            self._left_out.add(address)
+        with self._lock:
+            truth = self.streams.get(Address(address.vehicle, TRUTH)) if is_estimate else None
+            if stream := self.streams.get(address):
+                stream.add(sample, time, truth)
+            elif len(self.streams) < MAX_STREAMS or (is_position(address) and self._evict(time)):
+                self.streams[address] = PageStream(sample, time, truth, self.origin, self._long)
+                self._left_out.discard(address)
+            elif len(self._left_out) < MAX_STREAMS:
+                self._left_out.add(address)
 
     def reject(self, reports: Sequence[RejectionReport]) -> None:
         """Add reports of rejected messages."""
@@ -178,12 +178,15 @@ class Fleet:
         """Update `snapshot`; `states`, `logs`: states and ULog streams by vehicle."""
         self.reject(now.rejected)
         time, alive = now.time, now.alive
-        if alive is not None and not now.link:
-            known, silent = {*alive, *now.healths}, time - _SILENT
-            self._gone = [key for key, stream in [*self.streams.items()] if key not in known and stream.time < silent]
-            self._left_out.intersection_update(alive)
+        with self._lock:
+            if alive is not None and not now.link:
+                known, silent = {*alive, *now.healths}, time - _SILENT
+                for gone in [key for key, each in self.streams.items() if key not in known and each.time < silent]:
+                    del self.streams[gone]
+                self._left_out.intersection_update(alive)
+            streams = sorted(self.streams.items())
         views: dict[str, list[StreamView]] = {}
-        for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
+        for address, stream in streams:
             health = now.healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
             state = stream_state(health, publishers=None if alive is None else alive[address], connected=not now.link)
             view = StreamView(address, stream, health, state, self._rejected[address])

@@ -20,6 +20,7 @@ from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
 from bokeh.util.token import get_token_payload
 from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.iostream import IOStream
 from tornado.web import HTTPError, RequestHandler
@@ -29,7 +30,7 @@ from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError
 from nedbus.events import ALL, Times
 from nedbus.log_event import about
-from nedbus.monitoring import Exporter, Page, Snapshot, is_local_host_header
+from nedbus.monitoring import Exporter, Page, Snapshot, why_refused
 from nedbus.settings import is_loopback
 from nedbus.timings import TIMINGS
 from nedbus_msgs import Selection
@@ -133,8 +134,7 @@ class LiveFleet(Exporter):
 class WebServer:
     """Server of the Bokeh page and of text pages by path.
 
-    It rejects cross-site requests and DNS rebinding by other sites in the same browser: the Host header must be a name
-    that such a site cannot control, as for `HttpServer`, or one of `options.origins`.
+    Access as in `why_refused`, with the hosts of `options.origins`.
 
     Raises ListenError if the address is not available.
     """
@@ -164,13 +164,13 @@ class WebServer:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --http"
             raise ListenError([f"http://{host}:{options.port}"], reason, hint=hint) from exc
-        tornado = BokehTornado(
-            {"/": Application(FunctionHandler(open_or_refuse))},
-            extra_websocket_origins=["*"], auth_provider=_HostCheck(options),
+        tornado = _Tornado(
+            options, {"/": Application(FunctionHandler(open_or_refuse))},
+            extra_websocket_origins=["*"], auth_provider=_TokenCheck(),
             keep_alive_milliseconds=0, websocket_ping_interval=_PING,  # Bokeh's keep-alive may drop a busy session
             unused_session_lifetime_milliseconds=_UNUSED_LIFETIME, check_unused_sessions_milliseconds=1000,
             websocket_max_message_size_bytes=_MAX_MESSAGE_BYTES,
-            extra_patterns=[(path, _TextHandler, {"render": each, "options": options}) for path, each in pages.items()],
+            extra_patterns=[(path, _TextHandler, {"render": render}) for path, render in pages.items()],
         )  # fmt: skip
         http = _HttpServer(
             tornado, max_body_size=_MAX_BODY_BYTES, max_buffer_size=2 * _MAX_MESSAGE_BYTES,
@@ -215,18 +215,29 @@ def _log_once(text: str, limit: int) -> None:
     _log.warning(text, limit, extra=about("http"))
 
 
-class _HostCheck(NullAuth):
-    """Bokeh's auth hook, without a login: reject foreign hosts, cross-site requests and invalid tokens."""
+class _Tornado(BokehTornado):
+    """Bokeh's application with the access rule, which applies to every path: pages, WebSocket and scripts."""
+
+    def __init__(self, options: PageOptions, *args: Any, **kwargs: Any) -> None:
+        self._options = options
+        super().__init__(*args, **kwargs)
+
+    def find_handler(self, request: HTTPServerRequest, **kwargs: Any) -> Any:
+        is_local, origins = is_loopback(self._options.host), self._options.origins
+        refusal = why_refused(request.path, request.headers.get_list, is_local=is_local, origins=origins)
+        if not refusal:
+            return super().find_handler(request, **kwargs)
+        page = Page.text(f"{refusal}; add other names with --origin", status=403)
+        return self.get_handler_delegate(request, _TextHandler, {"render": lambda: page})
+
+
+class _TokenCheck(NullAuth):
+    """Bokeh's auth hook, without a login: reject a WebSocket without a valid token, which Bokeh would log."""
 
     login_url = "/"  # required by Bokeh, never used
 
-    def __init__(self, options: PageOptions) -> None:
-        super().__init__()
-        self._options = options
-
     async def get_user_async(self, handler: RequestHandler) -> str:  # type: ignore[override] # a property in Bokeh
-        _check_host(handler, self._options)
-        if handler.request.path.endswith("/ws"):  # without a valid token, Bokeh would log a traceback
+        if handler.request.path.endswith("/ws"):
             name, _, token = handler.request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
             try:
                 is_valid = name == "bokeh" and clock.utc() < get_token_payload(token.strip())["session_expiry"]
@@ -237,25 +248,11 @@ class _HostCheck(NullAuth):
         return "viewer"
 
 
-def _check_host(handler: RequestHandler, options: PageOptions) -> None:
-    headers = handler.request.headers
-    host = headers.get("Host", "")
-    origin = headers.get("Origin", f"//{host}").partition("//")[2]  # "Origin: null" has no host
-    is_own = host in options.origins or is_local_host_header(host, local=is_loopback(options.host))
-    if not is_own or origin not in (host, *options.origins):
-        name = (origin if is_own else host)[:100]
-        raise HTTPError(403, reason=f"host name {name} is not allowed: add it with --origin")
-    if headers.get("Sec-Fetch-Site") == "cross-site" and headers.get("Sec-Fetch-Dest") != "document":
-        raise HTTPError(403, reason="cross-site request")
-
-
 class _TextHandler(RequestHandler):
-    def initialize(self, render: Callable[[], Page], options: PageOptions) -> None:
-        self._render, self._options = render, options
+    def initialize(self, render: Callable[[], Page]) -> None:
+        self._render = render
 
     def get(self) -> None:
-        if is_loopback(self._options.host):
-            _check_host(self, self._options)
         page = self._render()
         self.set_status(page.status)
         self.set_header("Content-Type", page.content_type)

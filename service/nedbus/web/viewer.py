@@ -43,7 +43,7 @@ class Viewer:
     """One page in one browser; `update`, called ten times a second, sends it the changes to the fleet.
 
     `timeline`: the events; `player`: playback of a recording, None for live vehicles.
-    The URL always contains the selected vehicle, moment, view and theme, so it can be shared.
+    The URL contains what differs from the default of the selected vehicle, moment, view and theme, so it can be shared.
     """
 
     def __init__(

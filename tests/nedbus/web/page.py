@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import queue
-import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from html import unescape
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, Final
 from urllib.parse import parse_qsl
+from xml.etree import ElementTree as ET
 
 import pytest
 from bokeh.document import Document
@@ -40,12 +39,6 @@ WING: Final = Address("wing", VLP)
 QUAD: Final = Address("quad", VLP)
 NOON: Final = 1_700_000_000.0
 """Seconds since the Unix epoch: 22:13:20 UTC."""
-_ROW: Final = re.compile(
-    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-current="(?P<chosen>\w+)">'
-    r'<span class="(?P<grade>\w+)">.*?<span class="\w+">(?P<text>[^<]*)</span>'
-    r'<span class="quiet">(?P<since>[^<]*)</span><span class="mode">(?P<mode>[^<]*)</span>'
-    r'<span>(?P<battery>[^<]*)</span><span class="gps">(?P<gps>[^<]*)</span></div>'
-)
 
 
 class SimulatedFleet:
@@ -179,6 +172,20 @@ class RenderedPage:
         """Return the HTML of one panel of the page."""
         return next(str(div.text) for div in models_of(self.document, Div) if name in div.css_classes)
 
+    def elements(self, panel: str, name: str) -> list[ET.Element]:
+        """Return the elements of a panel with this tag or CSS class; the panel must be well-formed."""
+        root = ET.fromstring(f"<body>{self.panel(panel)}</body>")  # noqa: S314 - written by our templates
+        return [each for each in root.iter() if name in (each.tag, *each.get("class", "").split())]
+
+    def texts(self, panel: str, name: str) -> list[str]:
+        """Return the text of each of these elements, without markup."""
+        return ["".join(each.itertext()) for each in self.elements(panel, name)]
+
+    def table(self, number: int = 0) -> list[list[str]]:
+        """Return the cells of each row of a table of streams, without its header."""
+        rows = self.elements("more", "table")[number].iter("tr")
+        return [["".join(cell.itertext()) for cell in row] for row in rows][1:]
+
     @property
     def text(self) -> str:
         return "\n".join(str(div.text) for div in models_of(self.document, Div))
@@ -195,8 +202,16 @@ class RenderedPage:
     @property
     def listed(self) -> dict[str, dict[str, str]]:
         """The rows of the list by vehicle, in the order shown."""
-        found = (match.groupdict() for match in _ROW.finditer(self.panel("list")))
-        return {row["vehicle"]: {name: unescape(text) for name, text in row.items()} for row in found}
+        names = "symbol", "vehicle", "text", "since", "mode", "battery", "gps"
+        rows = {}
+        for each in self.elements("list", "row"):
+            if vehicle := each.get("data-with"):
+                cells = ("".join(cell.itertext()) for cell in each)
+                rows[vehicle] = dict(zip(names, cells, strict=True)) | {
+                    "title": each.get("title", ""), "chosen": each.get("aria-current", ""),
+                    "grade": each[0].get("class", ""),
+                }  # fmt: skip
+        return rows
 
     @property
     def vehicles(self) -> list[str]:

@@ -86,6 +86,27 @@ def test_large_image_is_scaled_down(tmp_path: Path) -> None:
     assert max(Background(file).pixels.shape) == 2000
 
 
+@pytest.mark.parametrize("pillow_limit", [1000, 900, 400], ids=["accepted", "warning", "error"])
+def test_image_above_the_pixel_limit_raises_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pillow_limit: int
+) -> None:
+    """An image above the limit raises an error with the remedy, even if Pillow would warn about it or refuse it."""
+    monkeypatch.setattr("nedbus.web.background._MAX_PIXELS", 960)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", pillow_limit)
+    file = write_image(tmp_path, world=WORLD, size=(31, 31))
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", pytest.fail)
+    with pytest.raises(ConfigError) as error:
+        Background(file)
+    assert "more than 960 pixels" in str(error.value)
+    assert "gdal_translate -outsize" in str(error.value)
+
+
+def test_image_at_the_pixel_limit_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An image with as many pixels as the limit is drawn."""
+    monkeypatch.setattr("nedbus.web.background._MAX_PIXELS", 961)
+    assert Background(write_image(tmp_path, world=WORLD, size=(31, 31))).pixels.shape == (31, 31)
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [

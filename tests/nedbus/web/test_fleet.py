@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import threading
+from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from nedbus.events import EventLog, Times
+from nedbus.monitoring import Snapshot
 from nedbus.web.event_timeline import EventTimeline
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, PageStream
@@ -15,6 +19,7 @@ from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection
 from tests.flights.messages import VLP, message
 from tests.nedbus.web.page import NOON, QUAD, WING, SimulatedFleet, addresses_of, sim
+from tests.waits import DEADLINE
 
 __all__ = ["sim"]  # a fixture
 
@@ -183,6 +188,29 @@ def test_streams_above_the_limit_are_only_counted(sim: SimulatedFleet, monkeypat
     sim.fly(0.1, names[0])
     snapshot = sim.poll()
     assert (addresses_of(snapshot), snapshot.left_out) == ([names[0], *names[2:4]], 1)
+
+
+def test_streams_added_during_an_update_are_counted(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Streams above the limit that arrive in another thread while the snapshot is updated are counted."""
+    monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
+    others = [Address(f"v{number}", VLP) for number in range(2)]
+    waiting, adding = list(others), list[threading.Thread]()
+
+    class Alive(Counter[Address]):
+        def __iter__(self) -> Iterator[Address]:
+            yield from super().__iter__()
+            for address in waiting[:1]:
+                waiting.remove(address)
+                adding.append(threading.Thread(target=sim.add, args=[address]))
+                adding[-1].start()
+                adding[-1].join(0.1)  # it ends now if it does not have to wait
+
+    sim.fly(1, WING, QUAD)
+    sim.fleet.update(Snapshot(sim.time, alive=Alive([WING, QUAD, *others])), {}, {})
+    for thread in adding:
+        thread.join(DEADLINE)
+    assert len(adding) == 2
+    assert sim.poll(alive=[WING, QUAD, *others]).left_out == 2
 
 
 def test_position_replaces_other_streams_at_the_limit(sim: SimulatedFleet, monkeypatch: pytest.MonkeyPatch) -> None:

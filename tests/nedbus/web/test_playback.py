@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -155,19 +154,16 @@ def test_selecting_an_event_seeks_to_it(recording: Recording) -> None:
     page = open_page(recording)
     assert page.grades == {"wing": "ok"}
     assert page.plot_range == (0.0, 60.0)
-    marks = re.findall(
-        r'data-with="(\d+)" title="([^"]*)" class="(\w+)"\s+style="left: ([\d.]+)%"', page.panel("marks")
-    )
-    assert [(text, grade) for _, text, grade, _ in marks] == [
+    marks = page.elements("marks", "span")
+    assert [(mark.get("title"), mark.get("class")) for mark in marks] == [
         ("xy not valid", "bad"), ("reset of xy by 4.1 m (0.1 north, 4.1 east)", "watch"),
     ]  # fmt: skip
-    assert float(marks[0][3]) == pytest.approx(50, abs=0.2)
-    page.send("event", marks[0][0])
+    assert float(marks[0].get("style", "").removeprefix("left: ").rstrip("%")) == pytest.approx(50, abs=0.2)
+    page.send("event", marks[0].get("data-with"))
     assert page.player.time == pytest.approx(90, abs=0.01)
     assert (page.grades, page.document.title) == ({"wing": "bad"}, "(1 bad) flight.mcap")
-    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)' in page.panel(
-        "why"
-    )
+    (verdict,) = page.texts("why", "verdict")
+    assert verdict.startswith("not usable: xy not valid from 91.000 to 121.000 s since boot (30.0 s)")
     assert page.marks["wing"]["north"] == pytest.approx(89.9)
     assert page.plot_range == pytest.approx((30, 90), abs=0.01)
     page.send("next")
@@ -195,9 +191,10 @@ def test_recording_page_lists_verdict_and_faults(recording: Recording) -> None:
     Times are on the vehicle's clock, which header and axes name.
     """
     page = open_page(recording)
-    assert '<div class="verdict">not usable: xy not valid from 91.000 to 121.000 s since boot' in page.panel("list")
-    faults = re.findall(r'data-do="fault" data-with="(\d)">.*?<b>(.*?)</b> (.*?)</div>', page.panel("list"))
-    assert faults == [("0", "xy not valid", "from 91.000 to 121.000 s since boot (30.0 s)")]
+    (verdict,), (fault,) = page.texts("list", "verdict"), page.elements("list", "fault")
+    assert verdict.startswith("not usable: xy not valid from 91.000 to 121.000 s since boot")
+    assert (fault.get("data-do"), fault.get("data-with"), fault.findtext("b")) == ("fault", "0", "xy not valid")
+    assert page.texts("list", "fault")[0].endswith(" xy not valid from 91.000 to 121.000 s since boot (30.0 s)")
     assert "1.0 s since boot, 0.0 s since the start" in page.panel("head")
     assert page.viewer._clock.args == {"start": 1.0, "clock": "s since boot"}
     assert page.grades == {"wing": "ok"}

@@ -8,6 +8,7 @@ import tracemalloc
 import weakref
 from collections import Counter
 from collections.abc import Collection
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -326,11 +327,21 @@ def small_queue(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
     return make_queue("every")
 
 
+def test_documented_capacity_is_that_of_the_queue() -> None:
+    """A queue in mode `every` holds as many unread samples as the documentation states, and one more drops one."""
+    queue = make_queue("every")
+    put(queue, [raw(None)] * CAPACITY)
+    assert queue.counts.dropped == 0
+    put(queue, [raw(None)])
+    assert queue.counts.dropped == 1
+    for page in ("docs/data.md", "CONTRIBUTING.md"):
+        assert f"{CAPACITY:,}" in (Path(__file__).parents[4] / page).read_text(), page
+
+
 def test_oldest_samples_are_dropped_counted_and_logged_once(
     small_queue: PendingQueue, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A full queue drops the oldest samples, which count as dropped, not as lost, and are logged once."""
-    assert CAPACITY == 65_536
     for start in range(0, 40, 10):
         assert (small_queue.counts, len(caplog.messages)) == (Counts(dropped=max(0, start - 10)), start > 10)
         put(small_queue, [raw(number, timestamp=number + 1) for number in range(start, start + 10)])
