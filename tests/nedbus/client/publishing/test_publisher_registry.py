@@ -11,7 +11,7 @@ import pytest
 
 from nedbus.client import PublisherRegistry, QueryServer
 from nedbus.transport import Session, open_router
-from nedbus_msgs import Address
+from nedbus_msgs import Address, schema_key
 from tests.flights.messages import VLP, message
 from tests.peers.ports import free_endpoint
 
@@ -56,7 +56,7 @@ def test_departed_vehicle_leaves_no_objects(registry: PublisherRegistry) -> None
     assert [each() for each in references if each() is not None] == []
     tables = registry.publishers, registry._rate_listeners, registry._directories, registry.heartbeats.writers
     assert [len(each) for each in tables] == [0, 0, 0, 0]
-    assert list(registry._queries._queryables) == [registry._schema_key("*")]
+    assert list(registry._queries._queryables) == [schema_key("*", vehicle="v4", prefix=registry.prefix)]
     assert len(registry._definitions) == len(TOPICS)
 
 
