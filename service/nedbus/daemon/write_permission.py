@@ -96,8 +96,6 @@ class WritePermission:
             verdicts = self._probe(vehicles)
         except NedbusError as exc:  # link or session closed, or a TLS file being replaced
             _log.debug("write permission unknown: %s", exc)
-        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; a failed check must not end the thread
-            _log.exception("unexpected error in a check of the write permission", extra=about("internal_error"))
         before = self.refused
         self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
         for vehicle, verdict in verdicts.items():

@@ -272,8 +272,9 @@ def test_user_definition_has_timestamp_at_any_place(listen: Listen, zenoh_sessio
     text = "float32 speed\nuint64 timestamp\n"
     (tmp_path / "WheelEncoders.msg").write_text(text)
     dds_name, type_hash = dds_type(ros2_type(define_msg("WheelEncoders", text))), hash_of_msg("WheelEncoders", text)
-    listener = listen(f"?msg={tmp_path}")
-    zenoh_session.put(f"0/fmu/out/wheel_encoders/{dds_name}/{type_hash}", struct.pack("<4sf4xQ", b"\0\1\0\0", 2.5, 7))
+    listener, key = listen(f"?msg={tmp_path}"), f"0/fmu/out/wheel_encoders/{dds_name}/{type_hash}"
+    wait_for_matching(zenoh_session, key)
+    zenoh_session.put(key, struct.pack("<4sf4xQ", b"\0\1\0\0", 2.5, 7))
     assert listener.receive()[0].fields == {"speed": 2.5, "timestamp": 7}
 
 
