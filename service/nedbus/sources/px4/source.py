@@ -116,8 +116,6 @@ class Px4ZenohNode:
         last: UnavailableTopics | None = None
         next_report = 0.0
         while True:
-            if not self._thread.is_alive():
-                raise SourceError("px4-zenoh", "receiving has stopped unexpectedly")
             new = self._dropped - self._reported
             for (where, reason), count in new.items():
                 yield Rejection(where, reason, count=count)
@@ -219,8 +217,8 @@ class Px4ZenohNode:
                 else:
                     self._pending.put(sample)
         except BaseException as exc:  # noqa: BLE001 - re-raised by `run`, on the thread of the source
-            if not isinstance(exc, zenoh.ZError):  # else it is undeclared
-                self._pending.put(exc)
+            ended = SourceError("px4-zenoh", "receiving has stopped unexpectedly")  # the subscriber is undeclared
+            self._pending.put(ended if isinstance(exc, zenoh.ZError) else exc)
 
 
 def _read_definitions(paths: str) -> Definitions:
