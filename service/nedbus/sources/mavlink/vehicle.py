@@ -15,7 +15,8 @@ from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
-from .fields import CONVERSIONS, is_reboot
+from .boot_clock import BootClock
+from .fields import CONVERSIONS
 
 _log = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ class Vehicle:
         self._rates = request_rates(options.rate, options.baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
-        self._newest: int | None = None  # ms since boot
+        self.clock = BootClock()
         self._last_message = 0.0
         self.lost = 0
         self._rebooted = False
@@ -138,7 +139,7 @@ class Vehicle:
         """Convert a message; return None if no chosen topic needs it, or a Rejection (out of order, too many texts)."""
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
-        timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
+        timestamp = self._track_time(message, now)
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
         is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
@@ -148,9 +149,10 @@ class Vehicle:
                 address = Address(self._name, LOG_MESSAGE.name)
                 return Rejection(str(address), "more than 100 log messages per second", address)
             self._texts.add(message, now)
-        if fields_of is None and self._newest is not None:
-            topic, timestamp, fields_of = LOG_MESSAGE.name, self._newest * 1000, lambda _: self._texts.pop(now)
-        if fields_of is None or topic not in self._topics or is_redundant or timestamp is None:
+        if fields_of is None:
+            topic, fields_of = LOG_MESSAGE.name, lambda _: self._texts.pop(now)
+            timestamp = self.clock.newest
+        if topic not in self._topics or is_redundant or timestamp is None:
             return None
         fields = {name: value for name, value in fields_of(message).items() if value is not None}
         if not fields:
@@ -229,19 +231,15 @@ class Vehicle:
 
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
+        if self.clock.add(message, now):
+            self._rebooted = True
+            self.lost = 0  # the sequence restarted too, so the count is wrong
+            self._reset(now)
         microseconds: int = getattr(message, "time_usec", 0)
         if 0 < microseconds < YEAR_2000:
             return microseconds
-        ms: int | None = getattr(message, "time_boot_ms", self._newest)
-        if ms is None:
-            return None
-        if is_reboot(ms, self._newest):
-            self._rebooted = True
-            self.lost = 0  # the sequence restarted too, so the count is wrong
-            self._newest = None
-            self._reset(now)
-        self._newest = max(ms, self._newest or 0)
-        return ms * 1000
+        ms: int | None = getattr(message, "time_boot_ms", None)
+        return self.clock.newest if ms is None else 1000 * ms
 
 
 def _validity(bits: int) -> dict[str, object]:

@@ -28,7 +28,7 @@ from nedbus.timings import Timings
 from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from tests.flights.ulogs import log_messages_in, write_raw_log
 from tests.peers.ports import free_port
-from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
+from tests.peers.px4_log_stream import SHORT, START, STREAMS, Entry, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
 from .test_log_reassembly import compare as compare_records
@@ -62,9 +62,11 @@ class Received:
     """Messages that a source yields until the recording has ended and nothing more arrives."""
 
     def __init__(
-        self, options: str, recording: Path = SHORT, *, attack: Attack | None = None, **peer: Any
+        self, options: str, recording: Path | Recording = SHORT, *, attack: Attack | None = None, **peer: Any
     ) -> None:  # fmt: skip
         port = free_port()
+        if isinstance(recording, Path):
+            recording = read_recording(recording)
         if attack:
             peer["on_send"] = lambda frame: attack(frame, port)
         self.rejections: list[Rejection] = []
@@ -74,7 +76,7 @@ class Received:
         source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?{options}").open_source(vehicle="1"))
         with (
             closing(cast("Any", source.listen(None))) as items,
-            Px4LogStream(read_recording(recording), port, speed=None, deadline=300, **peer) as self.peer,
+            Px4LogStream(recording, port, speed=None, deadline=300, **peer) as self.peer,
         ):
             for item in items:
                 if isinstance(item, SourceMessage):
@@ -135,6 +137,33 @@ def test_stream_is_published_in_full() -> None:
     status = received.status
     assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
     assert status.header_time is not None
+
+
+def test_failing_sensor_does_not_end_stream() -> None:
+    """A sensor that repeats the time of its last sample is not taken for a reboot, which would end the stream."""
+    recording, mav = read_recording(SHORT), dialect.MAVLink(None, 1, 1)
+    failing = dialect.MAVLink_scaled_pressure_message(100, 1.0, 0.0, 20).pack(mav)
+    entries = recording.entries
+    recording.entries = [each for entry in entries for each in (entry, Entry(entry.time, failing))]
+    received = Received("log=1", recording)
+    assert [(each.address.topic, repr(each.fields)) for each in received.stream] == [
+        each for each in sent_messages() if each[0] != LOG_MESSAGE.name
+    ]
+    assert received.rejections == []
+    assert received.status.state == "streaming"
+    assert not any(each.rebooted for each in received.messages)
+
+
+@recorded_flight
+def test_failing_barometer_does_not_end_stream() -> None:
+    """While the barometer of a real PX4 (SITL) fails in flight, the stream continues, and equals the vehicle's log."""
+    received = Received("log=armed&vehicles=4:1", STREAMS.parent / "baro_failure_mavlink.bin.gz")
+    assert compare(received, STREAMS.parent / "baro_failure.ulg") > 4_500
+    assert [each for each in received.rejections if "not requested" in each.reason] == []
+    assert not any(each.rebooted for each in received.messages)
+    status = received.status
+    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
+    assert len({each for each in received.reasons if each}) == 0, received.reasons
 
 
 @recorded_flight

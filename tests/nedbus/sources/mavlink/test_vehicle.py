@@ -198,6 +198,8 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert "heading" not in later
     assert later["ref_lat"] == 47.3977418
     assert "ref_timestamp" not in later
+    for ms in (4000, 490):
+        vehicle.handle(dialect.MAVLink_global_position_int_message(ms, 0, 0, 0, 0, 0, 0, 0, 65535), 105.0)
     back = handle(vehicle, position(500), 105.0)
     assert ("ref_lat" in back.fields, back.rebooted) == (False, True)
     assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
