@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import chain
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
@@ -80,12 +81,8 @@ class _LinkSession:
             for item in self._read(TIMINGS.source_tick):
                 if isinstance(item, Rejection):
                     yield item
-                elif item.chunk is not None:
-                    if (log := self._log_of(item.system)) is not None:
-                        yield from log.add(item.chunk, item.time)
-                    self._handle(item)  # to track its sequence number
                 else:
-                    yield self._handle(item)
+                    yield from self._handle(item)
             yield None
             now = time.monotonic()
             if now >= next_requests:
@@ -104,7 +101,7 @@ class _LinkSession:
                 next_status = now + _STATUS_INTERVAL
                 for system, log in self._logs.items():
                     yield log.status(now)
-                    self._send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()), self._peers[system])
+                    self._send(dialect.MAVLink_timesync_message(0, log.request_time()), self._peers[system])
 
     def close(self) -> None:
         """Stop the ULog streams, and close their files."""
@@ -113,24 +110,27 @@ class _LinkSession:
         for log in self._logs.values():
             log.close()
 
-    def _handle(self, received: Received) -> SourceMessage | Rejection | None:
-        message, system, now = received.message, received.system, received.time
+    def _handle(self, received: Received) -> Iterator[SourceMessage | Rejection]:
+        message, system, now, chunk = received.message, received.system, received.time, received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
             vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
-        vehicle.track_sequence(received.sequence, now, counted=received.chunk.lost if received.chunk else 0)
+        vehicle.track_sequence(received.sequence, now, counted=chunk.lost if chunk else None)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
-            log.add_timesync(message.tc1 / 1e9, message.ts1 / 1e9, now)
-        converted = vehicle.handle(message, now)
-        if isinstance(converted, SourceMessage) and converted.rebooted:
-            address = Address(converted.address.vehicle, DEFAULT_TOPIC)
-            _log.warning("vehicle %s rebooted", address.vehicle, extra=about("rebooted", address, source=self._name))
-        is_streamed = log and converted and converted.address and log.delivers(converted.address)
-        return None if is_streamed else converted
+            log.add_timesync(message.tc1, message.ts1, now)
+        converted = vehicle.handle(message, now, log)
+        streamed = log.add(chunk, now) if log and chunk else ()
+        for each in chain([converted] if converted else [], streamed):
+            item = vehicle.report(each, log) if isinstance(each, SourceMessage) else each
+            if isinstance(item, SourceMessage) and item.rebooted:
+                address = Address(item.address.vehicle, DEFAULT_TOPIC)
+                extra = about("rebooted", address, source=self._name)
+                _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
+            yield item
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
