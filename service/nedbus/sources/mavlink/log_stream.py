@@ -225,10 +225,14 @@ class LogStream:
 
 
 class LogFile:
-    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OSError, such as on a full disk."""
+    """One stream in a new `<vehicle>_<UTC>.ulg`, which ends with a complete record after each call.
+
+    Raises OSError, such as on a full disk.
+    """
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)
+        self._size = 0
         self._partial = bytearray()  # the last record, until it is complete
         self._begins = True
 
@@ -240,14 +244,25 @@ class LogFile:
             end = stop
             stop += _RECORD_HEADER + int.from_bytes(self._partial[stop : stop + 2], "little")
         self._begins = self._begins and not end
-        self._file.write(self._partial[:end])
+        self._append(bytes(self._partial[:end]))
         del self._partial[:end]
 
     def mark_gap(self, seconds: float) -> None:
         """Discard the record that the gap truncated, and write a dropout of this duration."""
         self._partial.clear()
         if not self._begins:
-            self._file.write(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+            self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+
+    def _append(self, records: bytes) -> None:
+        """Write complete records; if only a part can be written, remove it again."""
+        written = 0
+        try:
+            while written < len(records):
+                written += self._file.write(records[written:])
+        except OSError:
+            self._file.truncate(self._size)
+            raise
+        self._size += written
 
     def close(self) -> None:
         """Close the file. Idempotent."""
