@@ -41,7 +41,8 @@ class MavlinkSource:
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
-        parse_link(link)
+        if not _is_serial(link) and "baud" in options.model_fields_set:
+            raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
@@ -67,6 +68,7 @@ class _LinkSession:
         self._link, self._options, self._name = link, options, name
         self._sender = dialect.MAVLink(None, SYSTEM, COMPONENT)
         self._sending = threading.Lock()
+        self._unsent = 0  # messages that the link did not accept, to be logged
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
         self._senders = DuplicateIds()
@@ -99,6 +101,7 @@ class _LinkSession:
                     self._send(heartbeat, peer)
             if now >= next_status:
                 next_status = now + _STATUS_INTERVAL
+                self._log_unsent()
                 for system, log in self._logs.items():
                     yield log.status(now)
                     self._send(dialect.MAVLink_timesync_message(0, log.request_time()), self._peers[system])
@@ -114,7 +117,8 @@ class _LinkSession:
         message, system, now, chunk = received.message, received.system, received.time, received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
+            baud = self._options.baud if _is_serial(self._name) else None
+            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options, baud=baud)
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
@@ -131,6 +135,13 @@ class _LinkSession:
                 extra = about("rebooted", address, source=self._name)
                 _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
             yield item
+
+    def _log_unsent(self) -> None:
+        with self._sending:
+            count, self._unsent = self._unsent, 0
+        if count:
+            text = "%s: %d messages to the vehicle were not sent, because the link did not accept them"
+            _log.warning(text, self._name, count, extra=about("dropped", source=self._name))
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
@@ -154,5 +165,9 @@ class _LinkSession:
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread of LogReceiver also sends
-            self._link.send(message.pack(self._sender), peer)
+            self._unsent += not self._link.send(message.pack(self._sender), peer)
             self._sender.seq = (self._sender.seq + 1) % 256
+
+
+def _is_serial(link: str) -> bool:
+    return parse_link(link)[0] == "serial"

@@ -57,10 +57,10 @@ _USABLE_SHARE: Final = 0.9  # share of a link's bandwidth; the rest is for heart
 _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bits
 
 
-def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
+def request_rates(rate: float, baud: int | None, topics: Collection[str]) -> dict[int, float]:
     """Return the rates to request [Hz] for these topics: positions at `rate`, other messages at their own rates.
 
-    If the link cannot carry them all, the other messages share a common upper limit.
+    If a serial link with this baud rate cannot carry them all, the other messages share a common upper limit.
     """
     wanted = {
         number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
@@ -68,7 +68,7 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
         if not set(needed.split()).isdisjoint(topics)
     }
     others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
-    free = _USABLE_SHARE * baud / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    free = _USABLE_SHARE * (baud or math.inf) / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
     for index, number in enumerate(others):
         level = free / sum(STREAMS[each][0] for each in others[index:])
         wanted[number] = min(wanted[number], max(_MIN_RATE, level))
@@ -77,12 +77,15 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
 
 
 class Vehicle:
-    """State of one vehicle: pass its messages to `handle`, and send the requests from `next_request`."""
+    """State of one vehicle: pass its messages to `handle`, and send the requests from `next_request`.
 
-    def __init__(self, name: str, options: MavlinkOptions) -> None:
+    `baud`: of a serial link; None for other links, whose bandwidth is unknown.
+    """
+
+    def __init__(self, name: str, options: MavlinkOptions, *, baud: int | None = None) -> None:
         self._name = name
         self._topics = options.chosen_topics or TOPICS
-        self._rates = request_rates(options.rate, options.baud, self._topics)
+        self._rates = request_rates(options.rate, baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
         self.clock = BootClock()

@@ -84,10 +84,11 @@ def test_unusable_message_time_is_replaced(time_usec: int, timestamp: int) -> No
         (45.0, 57600, 8.86, 8.86),
         (50.0, 115200, 50.0, 10.0),
         (0.5, 57600, 2.0, 10.0),
+        (200.0, None, 200.0, 10.0),
     ],
 )
-def test_estimator_status_rate_fits_link(rate: float, baud: int, status: float, odometry: float) -> None:
-    """ESTIMATOR_STATUS is requested with each position, or as often as the remaining bandwidth allows."""
+def test_estimator_status_rate_fits_link(rate: float, baud: int | None, status: float, odometry: float) -> None:
+    """ESTIMATOR_STATUS is requested with each position, or as often as the remaining bandwidth of a port allows."""
     rates = request_rates(rate, baud, [VLP])
     assert [*rates] == [*NEEDED]
     assert rates[32] == rate
