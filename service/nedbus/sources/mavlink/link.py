@@ -30,7 +30,7 @@ _FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:
 class _UdpLink:
     """A UDP socket; `peer` is None if it listens."""
 
-    stream = False
+    stream, baud = False, None
 
     def __init__(self, host: str, port: int, *, listens: bool) -> None:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -66,16 +66,16 @@ class _UdpLink:
 
 
 class _StreamLink:
-    """A TCP connection or a serial port; a read may return a partial message."""
+    """A TCP connection, or a serial port if `baud` is set; a read may return a partial message."""
 
     stream = True
 
-    def __init__(self, file: Any, peer: Peer) -> None:
+    def __init__(self, file: Any, peer: Peer, baud: int | None = None) -> None:
         os.set_blocking(file.fileno(), False)
-        self.peer = peer
+        self.peer, self.baud = peer, baud
         self.close = file.close
         self._file = file
-        self._unsent = bytearray()  # whole frames, except the first one
+        self._unsent = bytearray()  # whole frames; the first may be sent in part
         self._sending = threading.Lock()
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
@@ -123,7 +123,7 @@ def open_link(text: str, *, baud: int) -> Link:
         if kind == "serial":
             from serial import Serial
 
-            return _StreamLink(Serial(host, baud, timeout=0), host)
+            return _StreamLink(Serial(host, baud, timeout=0), host, baud)
         if kind == "tcp":
             with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
                 return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps the socket open

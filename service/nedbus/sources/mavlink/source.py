@@ -28,8 +28,7 @@ from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 
-_HEARTBEAT_INTERVAL: Final = 1.0  # s
-_STATUS_INTERVAL: Final = 1.0  # s between status reports of ULog streams
+_STATUS_INTERVAL: Final = 1.0  # s between heartbeats, and between status reports of ULog streams
 
 
 class MavlinkSource:
@@ -41,7 +40,7 @@ class MavlinkSource:
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
-        if not _is_serial(link) and "baud" in options.model_fields_set:
+        if parse_link(link)[0] != "serial" and "baud" in options.model_fields_set:
             raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
@@ -78,7 +77,7 @@ class _LinkSession:
         self._read = (self._receiver or reader).read
 
     def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
-        next_requests = next_heartbeat = next_status = 0.0
+        next_requests = next_status = 0.0
         while True:
             for item in self._read(TIMINGS.source_tick):
                 if isinstance(item, Rejection):
@@ -92,15 +91,13 @@ class _LinkSession:
                 self._send_requests(now)
                 for log in self._logs.values():
                     log.log_changes()
-            if now >= next_heartbeat:
-                next_heartbeat = now + _HEARTBEAT_INTERVAL
+            if now >= next_status:
+                next_status = now + _STATUS_INTERVAL
                 # Routers and vehicles send only to components that have announced themselves.
                 kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
                 heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
                 for peer in {self._link.peer} - {None} or set(self._peers.values()):
                     self._send(heartbeat, peer)
-            if now >= next_status:
-                next_status = now + _STATUS_INTERVAL
                 self._log_unsent()
                 for system, log in self._logs.items():
                     yield log.status(now)
@@ -117,8 +114,7 @@ class _LinkSession:
         message, system, now, chunk = received.message, received.system, received.time, received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            baud = self._options.baud if _is_serial(self._name) else None
-            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options, baud=baud)
+            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options, baud=self._link.baud)
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
@@ -167,7 +163,3 @@ class _LinkSession:
         with self._sending:  # the thread of LogReceiver also sends
             self._unsent += not self._link.send(message.pack(self._sender), peer)
             self._sender.seq = (self._sender.seq + 1) % 256
-
-
-def _is_serial(link: str) -> bool:
-    return parse_link(link)[0] == "serial"
