@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePath
 from typing import Final, cast
-from urllib.parse import parse_qsl, unquote, urlencode
+from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 from pydantic import ValidationError
 
@@ -90,7 +90,8 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         form = f"{kind_name}:{kind.target}" if kind.target else f"{kind_name}:?OPTION=VALUE"
         raise ConfigError(f"source {text!r}", f"the target is missing or not allowed; write {form}")
     try:
-        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+        # Unlike in an HTML form, a plus is not a space.
+        pairs = parse_qsl(query.replace("+", "%2B"), keep_blank_values=True, strict_parsing=bool(query))
         options = kind.options.model_validate(dict(pairs))
     except ValidationError as exc:
         detail = exc.errors()[0]
@@ -144,5 +145,5 @@ def _text_of_value(value: object) -> str:
 def _join(kind: str, target: str, options: Mapping[str, str]) -> str:
     """Return the text of a source, with % and ? escaped in a path."""
     path = target.replace("%", "%25").replace("?", "%3F") if SOURCE_KINDS[kind].target == "FILE" else target
-    query = urlencode(options, safe=":,/")
+    query = urlencode(options, safe=":,/+", quote_via=quote)
     return f"{kind}:{path}?{query}" if query else f"{kind}:{path}"

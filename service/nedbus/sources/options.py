@@ -131,7 +131,7 @@ class MavlinkOptions(Options):
         30.0, description="positions per second to request from the vehicle, 0.1 to 200"
     )
     baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(
-        57600, description="baud rate of the serial port, or of a radio on the link, 300 to 12000000"
+        57600, description="baud rate of a serial port, 300 to 12000000"
     )
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"

@@ -22,6 +22,10 @@ from nedbus.sources import parse_source
         ),
         ('[{ kind = "px4-zenoh", vehicles = { left = "a", right = "b" } }]', ["px4-zenoh:?vehicles=left:a,right:b"]),
         ('[{ kind = "px4-zenoh", endpoint = "tcp/b:7447", domain = 5 }]', ["px4-zenoh:tcp/b:7447?domain=5"]),
+        (
+            '[{ kind = "mavlink", link = "udpin::1", log = true, save = "/a+b c&d%20" }]',
+            ["mavlink:udpin::1?log=1&save=/a+b%20c%26d%2520"],
+        ),
         ('["sim:", { kind = "sim", vehicle = 2 }]', ["sim:", "sim:?vehicle=2"]),
     ],
 )
@@ -48,3 +52,19 @@ def test_source_table_equals_source_text(tmp_path: Path, sources: str, texts: li
 def test_invalid_source_table_raises(source: dict[str, object], reason: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(reason)):
         parse_source(source)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("mavlink:udpin::1?log=1&save=/logs/a+b", "/logs/a+b"),
+        ("mavlink:udpin::1?log=1&save=/logs/a%2Bb%20c", "/logs/a+b c"),
+        ("px4-zenoh:?msg=/logs/a+b.msg", "/logs/a+b.msg"),
+        ("ulog:/logs/a+b.ulg?speed=2", "/logs/a+b.ulg"),
+        ("ulog:/logs/a%20b%2B.ulg", "/logs/a%20b%2B.ulg"),
+    ],
+)
+def test_plus_in_source_text_is_literal(text: str, value: str) -> None:
+    """A plus is not a space; %XX is decoded in options, and in a path only %3F and %25 are."""
+    spec = parse_source(text)
+    assert value in (spec.target, *spec.options.model_dump().values())

@@ -13,12 +13,6 @@ _FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: sta
 _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # 12: body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
-_MAX_DELAY: Final = 1000  # ms by which a reordered datagram may be older; more means a reboot
-
-
-def is_reboot(time_boot_ms: int, newest: int | None) -> bool:
-    """Return whether a message is so much older than the vehicle's newest time that it must have rebooted."""
-    return newest is not None and time_boot_ms < newest - _MAX_DELAY
 
 
 def _number(value: int, unit: float, *unknown: int) -> float | None:

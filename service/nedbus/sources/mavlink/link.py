@@ -5,6 +5,7 @@ import os
 import re
 import select
 import socket
+import threading
 from collections import defaultdict, deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -19,6 +20,7 @@ _CHANGES: Final = 5  # address changes per window that mean two senders; a recon
 _WINDOW: Final = 5.0  # s
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
+_MAX_UNSENT: Final = 4096  # bytes that a TCP or serial link may queue; more are too old to be of use when they arrive
 _RECEIVE_BUFFER: Final = 2**22  # bytes, if net.core.rmem_max allows it: the default holds 277 small datagrams
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
@@ -28,7 +30,7 @@ _FORMS: Final = "udpin:0.0.0.0:14540, udpout:HOST:PORT, tcp:HOST:PORT or serial:
 class _UdpLink:
     """A UDP socket; `peer` is None if it listens."""
 
-    stream = False
+    stream, baud = False, None
 
     def __init__(self, host: str, port: int, *, listens: bool) -> None:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -46,39 +48,60 @@ class _UdpLink:
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
         """Yield received datagrams with their senders; wait up to `timeout` seconds for the first."""
-        if not _is_ready(self._socket, timeout):
+        if not _wait(self._socket, timeout):
             return
         with suppress(BlockingIOError, ConnectionError):  # ICMP: the peer is not listening yet
             for _ in range(_MAX_DATAGRAMS):
                 yield self._socket.recvfrom(_MAX_READ)
 
-    def send(self, data: bytes, peer: Peer) -> None:
-        """Send without blocking; drop the data if that fails."""
-        with suppress(OSError):  # a temporary failure; if it lasts, the vehicle times out
-            self._socket.sendto(data, peer)
+    def send(self, frame: bytes, peer: Peer) -> bool:
+        """Send a frame without blocking; return False if that fails, such as in a full buffer."""
+        try:
+            self._socket.sendto(frame, peer)
+        except ConnectionError:  # ICMP: the peer is not listening yet
+            pass
+        except OSError:
+            return False
+        return True
 
 
 class _StreamLink:
-    """A TCP connection or a serial port; a read may return a partial message."""
+    """A TCP connection, or a serial port if `baud` is set; a read may return a partial message."""
 
     stream = True
 
-    def __init__(self, file: Any, peer: Peer) -> None:
-        self.peer = peer
+    def __init__(self, file: Any, peer: Peer, baud: int | None = None) -> None:
+        os.set_blocking(file.fileno(), False)
+        self.peer, self.baud = peer, baud
         self.close = file.close
         self._file = file
+        self._unsent = bytearray()  # whole frames; the first may be sent in part
+        self._sending = threading.Lock()
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield received bytes with their sender; wait up to `timeout` seconds for them."""
-        if _is_ready(self._file, timeout):
-            data = self._file.read(_MAX_READ)
-            if not data:
-                raise ConnectionResetError(None, "the peer closed the connection")
-            yield data, self.peer
+        """Yield received bytes with their sender, and send queued frames; wait up to `timeout` seconds."""
+        if ready := _wait(self._file, timeout, select.POLLOUT * bool(self._unsent)):
+            self._flush()
+        if ready & ~select.POLLOUT:
+            with suppress(BlockingIOError):
+                data = os.read(self._file.fileno(), _MAX_READ)
+                if not data:
+                    raise ConnectionResetError(None, "the peer closed the connection")
+                yield data, self.peer
 
-    def send(self, data: bytes, _: Peer) -> None:
-        """Send the data; raise OSError if that fails."""
-        self._file.write(data)
+    def send(self, frame: bytes, _: Peer) -> bool:
+        """Send or queue a whole frame without blocking; return False if the queue is full. Raises OSError."""
+        with self._sending:
+            if len(self._unsent) + len(frame) > _MAX_UNSENT:
+                return False
+            self._unsent += frame
+        self._flush()
+        return True
+
+    def _flush(self) -> None:
+        with self._sending, suppress(BlockingIOError):
+            while self._unsent:
+                del self._unsent[: os.write(self._file.fileno(), self._unsent)]
 
 
 Link = _UdpLink | _StreamLink
@@ -100,7 +123,7 @@ def open_link(text: str, *, baud: int) -> Link:
         if kind == "serial":
             from serial import Serial
 
-            return _StreamLink(Serial(host, baud, timeout=0, write_timeout=1.0), host)
+            return _StreamLink(Serial(host, baud, timeout=0), host, baud)
         if kind == "tcp":
             with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
                 return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps the socket open
@@ -112,11 +135,11 @@ def open_link(text: str, *, baud: int) -> Link:
         raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason}){remedy}") from exc
 
 
-def _is_ready(file: Any, timeout: float) -> bool:
-    """Wait for data or the end of the stream; unlike select(), poll() has no limit on file descriptors."""
-    poll = select.poll()
-    poll.register(file, select.POLLIN)
-    return bool(poll.poll(timeout * 1000))
+def _wait(file: Any, timeout: float, events: int = 0) -> int:
+    """Wait for data, the end of the stream, or other events; return them, 0 after a timeout."""
+    poll = select.poll()  # unlike select(), without a limit on file descriptors
+    poll.register(file, select.POLLIN | events)
+    return next((found for _, found in poll.poll(timeout * 1000)), 0)
 
 
 def ignore_reason(system: int, component: int) -> str:

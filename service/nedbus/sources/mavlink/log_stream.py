@@ -3,6 +3,8 @@
 import logging
 import math
 import struct
+import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -25,7 +27,7 @@ _SOURCE: Final = "mavlink-ulog"  # `sample.source` of the stream's messages; con
 _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _CHUNK_SIZE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
-_MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
+_MAX_REQUESTS: Final = 10  # TIMESYNC requests that may be unanswered
 _FILE_HEADER: Final = 16  # bytes
 _RECORD_HEADER: Final = 3  # bytes: the size of the rest, and the type
 _DROPOUT: Final = struct.Struct("<HBH")  # a record of type O: duration [ms]
@@ -46,19 +48,19 @@ class LogStream:
         self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
         self._last_chunk: float | None = None
         self._unreported = 0  # losses to report with the next message
-        self._clock: tuple[float, float] | None = None  # vehicle clock minus host clock [s], and time of measurement
-        self._round_trip = math.inf
+        self._requests: deque[int] = deque(maxlen=_MAX_REQUESTS)  # times of unanswered TIMESYNC requests [ns]
         self._window_start = self._rate = self._delays = 0.0
         self._window_bytes = self._delayed = 0
         self._delay: float | None = None
         self._restart()
 
     def _restart(self) -> None:
-        """Discard the definitions, which may differ in the next stream."""
+        """Discard the definitions and the clock offset, because the vehicle may have rebooted."""
         self._parser, self._texts = ulog.UlogParser(verify=False), ulog.LogMessageBuilder()
         self._streams: dict[ulog.Subscription, ulog.LoggedStream | None] = {}
         self._damages: set[str] = set()
         self._dropout = 0.0  # s that the vehicle's logger lost before the next message
+        self._offset, self._round_trip = 0.0, math.inf  # vehicle clock minus host clock [s]; how it was measured [s]
 
     @property
     def is_streaming(self) -> bool:
@@ -109,12 +111,24 @@ class LogStream:
         yield from [Rejection(where, "more than 100 log messages per second", count=count)] * (count > 0)
         yield from [Rejection(where, self._texts.problem, count=0)] * (self._texts.problem != problem)
 
-    def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
-        """Use the answer to a TIMESYNC request if its round trip is the shortest so far, or the last offset is old."""
-        is_old = self._clock is None or now - self._clock[1] > _MAX_OFFSET_AGE
-        if 0 <= now - sent <= self._round_trip or is_old:
-            self._round_trip = now - sent
-            self._clock = vehicle_time - (sent + now) / 2, now
+    def request_time(self) -> int:
+        """Return the time to send in a TIMESYNC request, by which its answer is recognised [ns]."""
+        self._requests.append(time.monotonic_ns())
+        return self._requests[-1]
+
+    def add_timesync(self, vehicle_time: int, sent: int, now: float) -> None:
+        """Measure the clock offset from an answer to TIMESYNC, unless another client on the link sent the request.
+
+        The shortest round trip is the most exact, unless a later one disproves it, as after a reboot.
+        """
+        if sent not in self._requests:
+            return
+        self._requests.remove(sent)
+        round_trip = now - sent / 1e9
+        offset = vehicle_time / 1e9 - (now - round_trip / 2)
+        tolerance = (round_trip + self._round_trip) / 2
+        if round_trip <= self._round_trip or abs(offset - self._offset) > tolerance:
+            self._offset, self._round_trip = offset, round_trip
 
     def log_changes(self) -> None:
         """Log changes of the stream's state; clear the list of streamed addresses at its end."""
@@ -166,8 +180,8 @@ class LogStream:
 
     def _message(self, stream: ulog.LoggedStream, fields: dict[str, Any], now: float) -> SourceMessage:
         timestamp = fields.get("timestamp")
-        if self._clock is not None and isinstance(timestamp, int):
-            self._delays += now + self._clock[0] - timestamp / 1e6
+        if self._round_trip < math.inf and isinstance(timestamp, int):
+            self._delays += now + self._offset - timestamp / 1e6
             self._delayed += 1
         self._streamed.add(stream.address)
         lost, self._unreported, dropout, self._dropout = self._unreported, 0, self._dropout, 0.0
@@ -208,10 +222,14 @@ class LogStream:
 
 
 class LogFile:
-    """One stream in a new `<vehicle>_<UTC>.ulg`, valid at any moment; raises OSError, such as on a full disk."""
+    """One stream in a new `<vehicle>_<UTC>.ulg`, which ends with a complete record after each call.
+
+    Raises OSError, such as on a full disk.
+    """
 
     def __init__(self, folder: Path, vehicle: str) -> None:
         self.path, self._file = _create(folder, vehicle)
+        self._size = 0
         self._partial = bytearray()  # the last record, until it is complete
         self._begins = True
 
@@ -223,14 +241,25 @@ class LogFile:
             end = stop
             stop += _RECORD_HEADER + int.from_bytes(self._partial[stop : stop + 2], "little")
         self._begins = self._begins and not end
-        self._file.write(self._partial[:end])
+        self._append(bytes(self._partial[:end]))
         del self._partial[:end]
 
     def mark_gap(self, seconds: float) -> None:
         """Discard the record that the gap truncated, and write a dropout of this duration."""
         self._partial.clear()
         if not self._begins:
-            self._file.write(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+            self._append(_DROPOUT.pack(2, ord("O"), max(1, min(_MAX_DROPOUT, round(seconds * 1000)))))
+
+    def _append(self, records: bytes) -> None:
+        """Write complete records; if only a part can be written, remove it again."""
+        written = 0
+        try:
+            while written < len(records):
+                written += self._file.write(records[written:])
+        except OSError:
+            self._file.truncate(self._size)
+            raise
+        self._size += written
 
     def close(self) -> None:
         """Close the file. Idempotent."""

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection
 
-from .fields import is_reboot
+from .boot_clock import BootClock
 from .link import AUTOPILOT, Link, Peer, ignore_reason
 from .log_client import COMMANDS, Command, LogStreamClient
 from .log_reassembly import Chunk, Reassembly
@@ -90,7 +90,7 @@ class _Vehicle:
     client: LogStreamClient
     peer: Peer
     reassembly: Reassembly = field(default_factory=Reassembly)
-    newest: int = 0  # ms since boot
+    clock: BootClock = field(default_factory=BootClock)
 
 
 class LogReceiver:
@@ -160,6 +160,8 @@ class LogReceiver:
                 fields = message.sequence, message.length, message.first_message_offset, message.data
                 chunk = vehicle.reassembly.add(*fields)
                 received, begins = received._replace(chunk=chunk), chunk.begins
+                if chunk.verdict == "delivered" and not chunk.lost:  # a reboot ends the stream
+                    vehicle.clock.confirm()
             is_acked = kind == "LOGGING_DATA_ACKED"
             self._execute(vehicle, vehicle.client.on_data(message.sequence, now, acked=is_acked, begins=begins))
         elif kind == "HEARTBEAT":
@@ -172,11 +174,9 @@ class LogReceiver:
         elif vehicle is not None and kind == "COMMAND_ACK":
             target = message.target_system, message.target_component
             self._execute(vehicle, vehicle.client.on_command_ack(message.command, message.result, *target, now))
-        elif vehicle is not None and (ms := getattr(message, "time_boot_ms", None)) is not None:
-            if is_reboot(ms, vehicle.newest):
-                vehicle.client.on_reboot()
-                vehicle.reassembly, vehicle.newest = Reassembly(), ms
-            vehicle.newest = max(ms, vehicle.newest)
+        elif vehicle is not None and vehicle.clock.add(message, now):
+            vehicle.client.on_reboot()
+            vehicle.reassembly = Reassembly()
         return received
 
     def _execute(self, vehicle: _Vehicle, commands: Iterable[Command]) -> None:

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import chain
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
@@ -27,8 +28,7 @@ from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 
-_HEARTBEAT_INTERVAL: Final = 1.0  # s
-_STATUS_INTERVAL: Final = 1.0  # s between status reports of ULog streams
+_STATUS_INTERVAL: Final = 1.0  # s between heartbeats, and between status reports of ULog streams
 
 
 class MavlinkSource:
@@ -40,7 +40,8 @@ class MavlinkSource:
     """
 
     def __init__(self, link: str, options: MavlinkOptions, *_: object) -> None:
-        parse_link(link)
+        if parse_link(link)[0] != "serial" and "baud" in options.model_fields_set:
+            raise ConfigError(f"mavlink:{link}", "baud= is the rate of a serial port; remove it", key="baud")
         known = {LOG_MESSAGE.name, *(topic for topic, _ in CONVERSIONS.values())}
         if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
@@ -66,6 +67,7 @@ class _LinkSession:
         self._link, self._options, self._name = link, options, name
         self._sender = dialect.MAVLink(None, SYSTEM, COMPONENT)
         self._sending = threading.Lock()
+        self._unsent = 0  # messages that the link did not accept, to be logged
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
         self._senders = DuplicateIds()
@@ -75,17 +77,13 @@ class _LinkSession:
         self._read = (self._receiver or reader).read
 
     def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
-        next_requests = next_heartbeat = next_status = 0.0
+        next_requests = next_status = 0.0
         while True:
             for item in self._read(TIMINGS.source_tick):
                 if isinstance(item, Rejection):
                     yield item
-                elif item.chunk is not None:
-                    if (log := self._log_of(item.system)) is not None:
-                        yield from log.add(item.chunk, item.time)
-                    self._handle(item)  # to track its sequence number
                 else:
-                    yield self._handle(item)
+                    yield from self._handle(item)
             yield None
             now = time.monotonic()
             if now >= next_requests:
@@ -93,18 +91,17 @@ class _LinkSession:
                 self._send_requests(now)
                 for log in self._logs.values():
                     log.log_changes()
-            if now >= next_heartbeat:
-                next_heartbeat = now + _HEARTBEAT_INTERVAL
+            if now >= next_status:
+                next_status = now + _STATUS_INTERVAL
                 # Routers and vehicles send only to components that have announced themselves.
                 kind, autopilot = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
                 heartbeat = dialect.MAVLink_heartbeat_message(kind, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
                 for peer in {self._link.peer} - {None} or set(self._peers.values()):
                     self._send(heartbeat, peer)
-            if now >= next_status:
-                next_status = now + _STATUS_INTERVAL
+                self._log_unsent()
                 for system, log in self._logs.items():
                     yield log.status(now)
-                    self._send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()), self._peers[system])
+                    self._send(dialect.MAVLink_timesync_message(0, log.request_time()), self._peers[system])
 
     def close(self) -> None:
         """Stop the ULog streams, and close their files."""
@@ -113,24 +110,34 @@ class _LinkSession:
         for log in self._logs.values():
             log.close()
 
-    def _handle(self, received: Received) -> SourceMessage | Rejection | None:
-        message, system, now = received.message, received.system, received.time
+    def _handle(self, received: Received) -> Iterator[SourceMessage | Rejection]:
+        message, system, now, chunk = received.message, received.system, received.time, received.chunk
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
+            vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options, baud=self._link.baud)
         self._peers[system] = received.peer
         if text := self._senders.add(system, received.peer, now):
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
-        vehicle.track_sequence(received.sequence, now, counted=received.chunk.lost if received.chunk else 0)
+        vehicle.track_sequence(received.sequence, now, counted=chunk.lost if chunk else None)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
-            log.add_timesync(message.tc1 / 1e9, message.ts1 / 1e9, now)
-        converted = vehicle.handle(message, now)
-        if isinstance(converted, SourceMessage) and converted.rebooted:
-            address = Address(converted.address.vehicle, DEFAULT_TOPIC)
-            _log.warning("vehicle %s rebooted", address.vehicle, extra=about("rebooted", address, source=self._name))
-        is_streamed = log and converted and converted.address and log.delivers(converted.address)
-        return None if is_streamed else converted
+            log.add_timesync(message.tc1, message.ts1, now)
+        converted = vehicle.handle(message, now, log)
+        streamed = log.add(chunk, now) if log and chunk else ()
+        for each in chain([converted] if converted else [], streamed):
+            item = vehicle.report(each, log) if isinstance(each, SourceMessage) else each
+            if isinstance(item, SourceMessage) and item.rebooted:
+                address = Address(item.address.vehicle, DEFAULT_TOPIC)
+                extra = about("rebooted", address, source=self._name)
+                _log.warning("vehicle %s rebooted", address.vehicle, extra=extra)
+            yield item
+
+    def _log_unsent(self) -> None:
+        with self._sending:
+            count, self._unsent = self._unsent, 0
+        if count:
+            text = "%s: %d messages to the vehicle were not sent, because the link did not accept them"
+            _log.warning(text, self._name, count, extra=about("dropped", source=self._name))
 
     def _log_of(self, system: int) -> LogStream | None:
         """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
@@ -154,5 +161,5 @@ class _LinkSession:
 
     def _send(self, message: Any, peer: Peer) -> None:
         with self._sending:  # the thread of LogReceiver also sends
-            self._link.send(message.pack(self._sender), peer)
+            self._unsent += not self._link.send(message.pack(self._sender), peer)
             self._sender.seq = (self._sender.seq + 1) % 256

@@ -65,7 +65,8 @@ class TlogReader:
                 if isinstance(found, Rejection):
                     found = SourceMessage(item.time, found.address, {}, error=found.reason)
                 elif found.rebooted or found.address.vehicle not in {each.vehicle for each in self.definitions}:
-                    self._boots.add(stamp - cast("int", found.fields["timestamp"]))
+                    # The message may have the time of an old sample.
+                    self._boots.add(stamp - (vehicle.clock.newest or cast("int", found.fields["timestamp"])))
                 self.definitions.setdefault(found.address, BY_TOPIC[found.address.topic])
                 yield replace(found, due=item.time)
         if not self.definitions:

@@ -4,6 +4,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any, Final, cast
 
 from pymavlink.dialects.v20 import common as dialect
@@ -15,7 +16,9 @@ from nedbus.ulog import LOG_MESSAGE, RateLimit, to_log_text
 from nedbus_msgs import DEFAULT, DEFAULT_TOPIC, TOPICS, YEAR_2000, Address, decode_text, is_unix_time
 from nedbus_msgs.frames import wrap
 
-from .fields import CONVERSIONS, is_reboot
+from .boot_clock import BootClock
+from .fields import CONVERSIONS
+from .log_stream import LogStream
 
 _log = logging.getLogger(__name__)
 
@@ -54,10 +57,10 @@ _USABLE_SHARE: Final = 0.9  # share of a link's bandwidth; the rest is for heart
 _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bits
 
 
-def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
+def request_rates(rate: float, baud: int | None, topics: Collection[str]) -> dict[int, float]:
     """Return the rates to request [Hz] for these topics: positions at `rate`, other messages at their own rates.
 
-    If the link cannot carry them all, the other messages share a common upper limit.
+    If a serial link with this baud rate cannot carry them all, the other messages share a common upper limit.
     """
     wanted = {
         number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
@@ -65,7 +68,7 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
         if not set(needed.split()).isdisjoint(topics)
     }
     others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
-    free = _USABLE_SHARE * baud / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    free = _USABLE_SHARE * (baud or math.inf) / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
     for index, number in enumerate(others):
         level = free / sum(STREAMS[each][0] for each in others[index:])
         wanted[number] = min(wanted[number], max(_MIN_RATE, level))
@@ -74,17 +77,20 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
 
 
 class Vehicle:
-    """State of one vehicle: pass its messages to `handle`, and send the requests from `next_request`."""
+    """State of one vehicle: pass its messages to `handle`, and send the requests from `next_request`.
 
-    def __init__(self, name: str, options: MavlinkOptions) -> None:
+    `baud`: of a serial link; None for other links, whose bandwidth is unknown.
+    """
+
+    def __init__(self, name: str, options: MavlinkOptions, *, baud: int | None = None) -> None:
         self._name = name
         self._topics = options.chosen_topics or TOPICS
-        self._rates = request_rates(options.rate, options.baud, self._topics)
+        self._rates = request_rates(options.rate, baud, self._topics)
         if _POSITION in self._rates:
             self._rates[ORIGIN] = 0.0
-        self._newest: int | None = None  # ms since boot
+        self.clock = BootClock()
         self._last_message = 0.0
-        self.lost = 0
+        self.lost = self._certain = 0  # `_certain`: those before the last LOGGING_DATA, which are not of the stream
         self._rebooted = False
         self._text_limit = RateLimit()
         self._reported: set[int] = set()  # requested messages that were logged as not sent
@@ -101,8 +107,11 @@ class Vehicle:
         self._pending = [*self._rates] * _FIRST_ROUNDS
         self._next_round = now + _REQUEST_INTERVAL
 
-    def track_sequence(self, sequence: int, now: float, *, counted: int = 0) -> None:
-        """Count the messages of any type lost before this one; `counted`: those already counted by the ULog stream."""
+    def track_sequence(self, sequence: int, now: float, *, counted: int | None = None) -> None:
+        """Count the messages of any type lost before this one.
+
+        `counted`: those that the ULog stream has counted, if this is one of its messages.
+        """
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
@@ -110,8 +119,18 @@ class Vehicle:
         if step > 128:  # out of order: the message was counted as lost
             self.lost = max(0, self.lost - 1)
         elif step:  # else a duplicate
-            self.lost = max(0, self.lost + step - 1 - counted)
+            self.lost = max(0, self.lost + step - 1 - (counted or 0))
             self._sequence = sequence
+        if counted is not None:
+            self._certain = self.lost
+
+    def report(self, message: SourceMessage, log: LogStream | None = None) -> SourceMessage:
+        """Add the losses and the reboot that were not reported yet; during a ULog stream only losses of others."""
+        lost = min(self.lost, self._certain) if log is not None and log.is_streaming else self.lost
+        if not (lost or self._rebooted):
+            return message
+        rebooted, self._rebooted, self.lost, self._certain = self._rebooted, False, self.lost - lost, 0
+        return replace(message, lost=message.lost + lost, rebooted=rebooted)
 
     def next_request(self, now: float) -> tuple[int, float] | None:
         """Return id and rate [Hz] of the next message to request, rate 0 for a single one; None if none is due.
@@ -134,37 +153,42 @@ class Vehicle:
         number = self._pending.pop(0)
         return number, self._rates[number]
 
-    def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
-        """Convert a message; return None if no chosen topic needs it, or a Rejection (out of order, too many texts)."""
+    def handle(self, message: Any, now: float, log: LogStream | None = None) -> SourceMessage | Rejection | None:
+        """Convert a message; return a Rejection if it is out of order, or there are too many texts.
+
+        Return None if no chosen topic needs it, or `log`, the vehicle's ULog stream, delivers that topic.
+        """
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
-        timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
+        timestamp = self._track_time(message, now)
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now
         is_redundant = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
         self._store_fields(kind, message, timestamp, now)
-        if kind == "STATUSTEXT" and LOG_MESSAGE.name in self._topics:
+        address = Address(self._name, LOG_MESSAGE.name)
+        if kind == "STATUSTEXT" and address.topic in self._topics and not (log and log.delivers(address)):
             if not self._text_limit.admits(round(now * 1e6)):
-                address = Address(self._name, LOG_MESSAGE.name)
                 return Rejection(str(address), "more than 100 log messages per second", address)
             self._texts.add(message, now)
-        if fields_of is None and self._newest is not None:
-            topic, timestamp, fields_of = LOG_MESSAGE.name, self._newest * 1000, lambda _: self._texts.pop(now)
-        if fields_of is None or topic not in self._topics or is_redundant or timestamp is None:
+        if fields_of is None:
+            topic, fields_of = LOG_MESSAGE.name, lambda _: self._texts.pop(now)
+            timestamp = self.clock.newest
+        if topic not in self._topics or is_redundant or timestamp is None:
             return None
         fields = {name: value for name, value in fields_of(message).items() if value is not None}
         if not fields:
             return None
         instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
         address = Address(self._name, topic, instance)
+        if log is not None and log.delivers(address):
+            return None
         if timestamp < (last := self._last.get(address, 0)):
             reason = f"out of order ({timestamp // 1000} ms since boot, after {last // 1000} ms)"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
         fields = {"timestamp": timestamp, **fields}
         self._add_stored_fields(topic, fields, timestamp, now)
-        lost, rebooted, self.lost, self._rebooted = self.lost, self._rebooted, 0, False
-        return SourceMessage(0.0, address, fields, lost, rebooted)
+        return self.report(SourceMessage(0.0, address, fields), log)
 
     def _store_fields(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
         match kind:
@@ -229,19 +253,15 @@ class Vehicle:
 
     def _track_time(self, message: Any, now: float) -> int | None:
         """Return the time of a message [us since boot], or of the newest message if it has none; None if unknown."""
+        if self.clock.add(message, now):
+            self._rebooted = True
+            self.lost = self._certain = 0  # the sequence restarted too, so the count is wrong
+            self._reset(now)
         microseconds: int = getattr(message, "time_usec", 0)
         if 0 < microseconds < YEAR_2000:
             return microseconds
-        ms: int | None = getattr(message, "time_boot_ms", self._newest)
-        if ms is None:
-            return None
-        if is_reboot(ms, self._newest):
-            self._rebooted = True
-            self.lost = 0  # the sequence restarted too, so the count is wrong
-            self._newest = None
-            self._reset(now)
-        self._newest = max(ms, self._newest or 0)
-        return ms * 1000
+        ms: int | None = getattr(message, "time_boot_ms", None)
+        return self.clock.newest if ms is None else 1000 * ms
 
 
 def _validity(bits: int) -> dict[str, object]:

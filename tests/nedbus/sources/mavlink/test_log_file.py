@@ -1,9 +1,10 @@
-"""Saving a ULog stream: the file is a valid log at any moment."""
+"""Saving a ULog stream: the file contains only complete records."""
 
 from __future__ import annotations
 
 import os
 import random
+import resource
 import signal
 import subprocess
 import sys
@@ -66,6 +67,23 @@ def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
     saved = ULog(str(file.path))
     assert [each.duration for each in saved.dropouts] == [250]
     assert not saved.file_corruption
+
+
+def test_full_disk_leaves_complete_records(tmp_path: Path) -> None:
+    """A write of which only a part fits on the disk raises, and its part is removed."""
+    log, file = small_log(), LogFile(tmp_path, "1")
+    file.write(log[:BEGIN])
+    complete = file.path.read_bytes()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:  # a limit of the file size, which like a full disk makes the first write a short one
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(complete) + 5, before[1]))
+        with pytest.raises(OSError, match="File too large"):
+            file.write(log[BEGIN:])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    file.close()
+    assert file.path.read_bytes() == complete
+    assert not ULog(str(file.path)).file_corruption
 
 
 def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:

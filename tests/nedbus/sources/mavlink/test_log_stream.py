@@ -9,7 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
-from itertools import groupby
+from itertools import count, groupby, permutations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final, cast
@@ -29,7 +29,7 @@ from nedbus.timings import Timings
 from nedbus.ulog import LOG_MESSAGE, Data, LogMessageBuilder, UlogParser
 from tests.flights.ulogs import UlogWriter, log_messages_in, write_raw_log
 from tests.peers.ports import free_port
-from tests.peers.px4_log_stream import SHORT, START, STOP, STREAMS, Px4LogStream, Recording, read_recording
+from tests.peers.px4_log_stream import SHORT, START, STOP, STREAMS, Entry, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
 from .test_log_reassembly import compare as compare_records
@@ -66,6 +66,8 @@ class Received:
         self, options: str, recording: Path | Recording = SHORT, *, attack: Attack | None = None, **peer: Any
     ) -> None:  # fmt: skip
         port = free_port()
+        if isinstance(recording, Path):
+            recording = read_recording(recording)
         if attack:
             peer["on_send"] = lambda frame: attack(frame, port)
         self.rejections: list[Rejection] = []
@@ -139,9 +141,52 @@ def test_stream_is_published_in_full() -> None:
     assert status.header_time is not None
 
 
+def test_losses_of_link_are_reported_with_stream() -> None:
+    """MAVLink messages that are lost while all topics come from the stream are reported with its messages."""
+    recording, camera = read_recording(SHORT), dialect.MAVLink(None, 1, dialect.MAV_COMP_ID_CAMERA)
+    # The peer numbers all frames together, so a frame of another component is a gap in those of the autopilot.
+    gap = dialect.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3).pack(camera)
+    entries = recording.entries
+    middle = range(len(entries) // 2, len(entries) * 3 // 4)
+    recording.entries = [
+        each for index, entry in enumerate(entries) for each in [entry] + [Entry(entry.time, gap)] * (index in middle)
+    ]
+    received = Received("log=1&topics=vehicle_attitude", recording)
+    assert {each.source for each in received.messages[-50:]} == {"mavlink-ulog"}
+    assert sum(each.lost for each in received.messages) == len(middle)
+
+
+def test_failing_sensor_does_not_end_stream() -> None:
+    """A sensor that repeats the time of its last sample is not taken for a reboot, which would end the stream."""
+    recording, mav = read_recording(SHORT), dialect.MAVLink(None, 1, 1)
+    failing = dialect.MAVLink_scaled_pressure_message(100, 1.0, 0.0, 20).pack(mav)
+    entries = recording.entries
+    recording.entries = [each for entry in entries for each in (entry, Entry(entry.time, failing))]
+    received = Received("log=1", recording)
+    assert [(each.address.topic, repr(each.fields)) for each in received.stream] == [
+        each for each in sent_messages() if each[0] != LOG_MESSAGE.name
+    ]
+    assert received.rejections == []
+    assert received.status.state == "streaming"
+    assert not any(each.rebooted for each in received.messages)
+
+
 @recorded_flight
-def test_conversion_resumes_when_stream_ends() -> None:
+def test_failing_barometer_does_not_end_stream() -> None:
+    """While the barometer of a real PX4 (SITL) fails in flight, the stream continues, and equals the vehicle's log."""
+    received = Received("log=armed&vehicles=4:1", STREAMS.parent / "baro_failure_mavlink.bin.gz")
+    assert compare(received, STREAMS.parent / "baro_failure.ulg") > 4_500
+    assert [each for each in received.rejections if "not requested" in each.reason] == []
+    assert not any(each.rebooted for each in received.messages)
+    status = received.status
+    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
+    assert len({each for each in received.reasons if each}) == 0, received.reasons
+
+
+@recorded_flight
+def test_conversion_resumes_when_stream_ends(timings: Timings) -> None:
     """After another client's STOP, converted messages replace those of the stream, without overlap."""
+    timings.log_silence = 0.2  # at full speed the rest of the flight takes little more than a second
     received = Received("log=1&topics=vehicle_attitude", FLIGHT, events={40.0: "foreign_stop"})
     sources = [each.source for each in received.messages if each.address.topic == "vehicle_attitude"]
     assert [source for source, _ in groupby(sources)] == [None, "mavlink-ulog", None]
@@ -365,6 +410,83 @@ def test_hostile_vehicle_does_not_affect_others() -> None:
     assert any("deep cannot be decoded" in reason for _, reason in reasons), reasons
     assert any("two fields are called timestamp" in reason for _, reason in reasons), reasons
     assert len(reasons) < 110
+
+
+WINDOWS: Final = count(10**9, 1000)
+"""Times [s] at which the delay is measured, each in a new window."""
+
+
+def small_stream(tmp_path: Path) -> tuple[LogStream, bytes]:
+    """Return a stream and its header; each message has a timestamp and a cell count."""
+    path = write_raw_log(tmp_path / "a.ulg", {"battery_status": ("uint64_t timestamp;int32_t cell_count;", "Qi")}, [])
+    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=0.0))
+    return LogStream("1", MavlinkOptions(log=frozenset({"1"})), client), path.read_bytes()
+
+
+def measured_delay(stream: LogStream, vehicle_time: float, now: float) -> float | None:
+    """Return the delay of one message, logged at a time of the vehicle [s]."""
+    record = struct.pack("<HBHQi", 14, ord("D"), 0, round(vehicle_time * 1e6), 4)
+    assert len(list(stream.add(Chunk("delivered", record), now))) == 1
+    return stream.status(next(WINDOWS)).delay
+
+
+class TestClock:
+    """The vehicle's clock, from its answers to TIMESYNC; the vehicle booted 50 s before the host's time 0."""
+
+    BOOT: Final = 50.0
+
+    def answer(self, stream: LogStream, there: float, back: float, boot: float = BOOT) -> float:
+        """Answer a request after delays in both directions [s]; return the time of arrival."""
+        sent = stream.request_time()
+        vehicle_time = sent / 1e9 + there + boot
+        stream.add_timesync(round(vehicle_time * 1e9), sent, now := sent / 1e9 + there + back)
+        return now
+
+    def test_answers_for_other_clients_are_ignored(self, tmp_path: Path) -> None:
+        """Only an answer with the time of an own request counts, once; others may have Unix time, or another clock."""
+        stream, header = small_stream(tmp_path)
+        list(stream.add(Chunk("delivered", header, begins=True), 0.0))
+        now = self.answer(stream, 0.002, 0.003)
+        for sent in (1_700_000_000 * 10**9, round(now * 1e9) - 1, 1):
+            stream.add_timesync(10**9, sent, now)
+        repeated = stream.request_time()
+        stream.add_timesync(round((repeated / 1e9 + 0.002 + self.BOOT) * 1e9), repeated, repeated / 1e9 + 0.005)
+        stream.add_timesync(10**9, repeated, repeated / 1e9 + 0.001)
+        assert measured_delay(stream, now + self.BOOT - 0.25, now) == pytest.approx(0.25, abs=0.001)
+
+    def test_requests_without_answer_are_bounded(self, tmp_path: Path) -> None:
+        """An answer to a request before the last ten is too late to be used."""
+        stream, header = small_stream(tmp_path)
+        list(stream.add(Chunk("delivered", header, begins=True), 0.0))
+        sent = [stream.request_time() for _ in range(11)]
+        stream.add_timesync(10**9, sent[0], sent[0] / 1e9 + 10)
+        assert measured_delay(stream, 1.0, 1.0) is None
+
+    def test_answer_with_shortest_round_trip_is_used(self, tmp_path: Path) -> None:
+        """Of several answers that agree, the one with the shortest round trip gives the offset, in any order."""
+        for delays in permutations([(0.001, 0.003), (0.005, 0.5), (0.2, 0.01)]):
+            stream, header = small_stream(tmp_path)
+            list(stream.add(Chunk("delivered", header, begins=True), 0.0))
+            now = max(self.answer(stream, *each) for each in delays)
+            assert measured_delay(stream, now + self.BOOT - 0.25, now) == pytest.approx(0.25, abs=0.0015), delays
+
+    def test_clock_that_went_back_is_measured_again(self, tmp_path: Path) -> None:
+        """An answer that disproves the offset replaces it, even if its round trip is longer."""
+        stream, header = small_stream(tmp_path)
+        list(stream.add(Chunk("delivered", header, begins=True), 0.0))
+        self.answer(stream, 0.001, 0.001)
+        now = self.answer(stream, 0.02, 0.02, boot=self.BOOT - 21.57)
+        assert measured_delay(stream, now + self.BOOT - 21.57 - 0.25, now) == pytest.approx(0.25, abs=0.001)
+
+    def test_new_stream_has_no_delay_until_clock_is_measured(self, tmp_path: Path) -> None:
+        """A new stream may be that of a new boot: its delay is unknown until the vehicle answers again."""
+        stream, header = small_stream(tmp_path)
+        list(stream.add(Chunk("delivered", header, begins=True), 0.0))
+        now = self.answer(stream, 0.001, 0.001)
+        list(stream.add(Chunk("delivered", header, begins=True), now))
+        assert measured_delay(stream, now + self.BOOT, now) is None
+        now = self.answer(stream, 0.02, 0.02)
+        assert measured_delay(stream, now + self.BOOT - 0.25, now) == pytest.approx(0.25, abs=0.001)
 
 
 def test_field_types_of_old_release_are_converted(tmp_path: Path) -> None:

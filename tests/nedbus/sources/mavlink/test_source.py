@@ -245,7 +245,7 @@ def test_messages_are_converted_to_chosen_topics(port: int) -> None:
 def test_vehicles_on_one_port_are_separate(timings: Timings, listener: Listener, port: int) -> None:
     """Each system id on a port is a separate vehicle, and receives its requests at its own address."""
     timings.source_tick = 0.01
-    expected = {32: 20_000, **dict.fromkeys([33, 141, 230, 331], 119_974.875), ORIGIN: 0}
+    expected = {**dict.fromkeys([32, 230], 20_000), **dict.fromkeys([33, 141, 331], 100_000), ORIGIN: 0}
     with Autopilot(port, system=3) as one, Autopilot(port, system=250) as other:
         requested: dict[Autopilot, dict[int, float]] = {one: {}, other: {}}
         for step in count():
@@ -364,6 +364,31 @@ def test_serial_port_is_read_until_it_disappears() -> None:
             listener.receive()
 
 
+def test_requests_fit_serial_port(timings: Timings) -> None:
+    """On a serial port messages are requested at rates that fit its baud rate."""
+    timings.source_tick = 0.01
+    radio, port = os.openpty()
+    tty.setraw(port)
+    os.set_blocking(radio, False)
+    requested: dict[int, float] = {}
+    with Listener(f"mavlink:serial:{os.ttyname(port)}?topics={VLP}") as listener:
+        os.write(radio, local_position(1000).pack(dialect.MAVLink(None, 9, 1)))
+        parser = dialect.MAVLink(None)
+
+        def is_requested() -> bool:
+            with suppress(BlockingIOError):
+                for each in parser.parse_buffer(os.read(radio, 65535)) or []:
+                    if each.get_type() == "COMMAND_LONG":
+                        requested[int(each.param1)] = each.param2
+            return ORIGIN in requested
+
+        listener.step_until(is_requested, what="all requests")
+    os.close(radio)
+    os.close(port)
+    assert requested[32] == pytest.approx(1e6 / 30)
+    assert requested[230] == pytest.approx(1e6 / 13.04, rel=1e-3)
+
+
 def test_port_in_use_raises(listener: Listener, port: int) -> None:
     with pytest.raises(SourceError, match=r"\(address already in use\): close the other program or use another"):
         Listener(f"mavlink:udpin:127.0.0.1:{port}")
@@ -380,6 +405,7 @@ def test_port_in_use_raises(listener: Listener, port: int) -> None:
         ("mavlink:udpin:0.0.0.0:14550?vehicles=1:a b", "SYSTEM_ID:VEHICLE"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=wing:1", "SYSTEM_ID:VEHICLE"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=1:wing,2:wing", "each vehicle once"),
+        ("mavlink:udpin:0.0.0.0:14550?baud=57600", "baud= is the rate of a serial port; remove it"),
         ("px4-zenoh:?vehicles=px4_1:a,px4_1:b", "NAMESPACE:VEHICLE"),
         ("px4-zenoh:?domain=500", "a ROS domain, 0 to 232"),
         ("px4-zenoh:?layout=1.12", "whose layouts apply to keys without a type hash"),

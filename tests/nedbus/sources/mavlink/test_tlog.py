@@ -91,6 +91,20 @@ def test_autopilots_in_tlog_are_separate_vehicles(tmp_path: Path) -> None:
     assert run_command("why", "-v", "1", str(path)).exit_code == 0
 
 
+def test_boot_time_of_tlog_ignores_old_samples(tmp_path: Path) -> None:
+    """The time of the boot comes from the vehicle's newest time, not from the old sample of a lost GPS receiver."""
+    sender = mavlink.MAVLink(None, 7, 1)
+    messages: list[Any] = [
+        mavlink.MAVLink_system_time_message(0, 60_000),
+        mavlink.MAVLink_gps_raw_int_message(5_000_000, 1, 0, 0, 0, 0, 0, 0, 0, 9),
+    ]
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(b"".join(struct.pack(">Q", EPOCH + 60_000_000) + each.pack(sender) for each in messages))
+    utc = nedbus.utc_of(path)
+    assert utc is not None
+    assert utc.offset_us == EPOCH
+
+
 def test_damaged_tlog_loses_only_the_damaged_messages(tmp_path: Path) -> None:
     """Bytes that are not MAVLink are skipped and reported; a truncated file is read up to the last whole frame."""
     path = tmp_path / "flight.tlog"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -11,9 +12,10 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources import Rejection, SourceMessage
 from nedbus.sources.mavlink.fields import CONVERSIONS
+from nedbus.sources.mavlink.log_stream import LogStream
 from nedbus.sources.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
-from nedbus_msgs import TOPICS
+from nedbus_msgs import TOPICS, Address
 from nedbus_msgs.frames import quaternion_to_euler
 from tests.flights.messages import VLP
 
@@ -30,9 +32,9 @@ def vehicle() -> Vehicle:
     return new_vehicle(VLP)
 
 
-def handle(vehicle: Vehicle, message: Any, now: float) -> SourceMessage:
+def handle(vehicle: Vehicle, message: Any, now: float, log: LogStream | None = None) -> SourceMessage:
     """Return the message converted by a vehicle, which must not be rejected."""
-    converted = vehicle.handle(message, now)
+    converted = vehicle.handle(message, now, log)
     assert isinstance(converted, SourceMessage)
     return converted
 
@@ -82,10 +84,11 @@ def test_unusable_message_time_is_replaced(time_usec: int, timestamp: int) -> No
         (45.0, 57600, 8.86, 8.86),
         (50.0, 115200, 50.0, 10.0),
         (0.5, 57600, 2.0, 10.0),
+        (200.0, None, 200.0, 10.0),
     ],
 )
-def test_estimator_status_rate_fits_link(rate: float, baud: int, status: float, odometry: float) -> None:
-    """ESTIMATOR_STATUS is requested with each position, or as often as the remaining bandwidth allows."""
+def test_estimator_status_rate_fits_link(rate: float, baud: int | None, status: float, odometry: float) -> None:
+    """ESTIMATOR_STATUS is requested with each position, or as often as the remaining bandwidth of a port allows."""
     rates = request_rates(rate, baud, [VLP])
     assert [*rates] == [*NEEDED]
     assert rates[32] == rate
@@ -185,6 +188,46 @@ def test_reordered_and_duplicate_messages_do_not_count_as_lost(vehicle: Vehicle)
     assert vehicle.lost == 85 + 99 + 55
 
 
+def fake_log(*streamed: str) -> LogStream:
+    """Return a ULog stream that delivers these topics."""
+    log: Any = SimpleNamespace(is_streaming=True)
+    log.delivers = lambda address: log.is_streaming and address.topic in streamed
+    return cast("LogStream", log)
+
+
+def test_losses_during_stream_are_reported_once() -> None:
+    """Losses of streamed topics are reported with the next message; those of the stream only by the stream."""
+    vehicle, log = new_vehicle(f"{VLP},vehicle_attitude"), fake_log(VLP)
+    streamed = SourceMessage(0.0, Address("9", VLP), {}, lost=3)
+
+    def attitude(ms: int) -> SourceMessage:
+        converted = vehicle.handle(dialect.MAVLink_attitude_quaternion_message(ms, 1, 0, 0, 0, 0, 0, 0), 100.0, log)
+        assert isinstance(converted, SourceMessage)
+        return converted
+
+    for number in range(10):
+        vehicle.track_sequence(2 * number, 100.0)
+        assert vehicle.handle(position(1000 + number), 100.0, log) is None
+    assert attitude(1100).lost == 0, "may be data of the stream"
+    assert vehicle.report(streamed, log).lost == 3
+    vehicle.track_sequence(19, 100.0, counted=2)
+    assert vehicle.report(streamed, log).lost == 3 + 9 - 2
+    assert vehicle.report(streamed, log).lost == 3
+    vehicle.track_sequence(24, 100.0)
+    cast("Any", log).is_streaming = False
+    assert attitude(1200).lost == 4
+    assert handle(vehicle, position(1300), 100.0).lost == 0
+
+
+def test_streamed_texts_are_not_converted() -> None:
+    """A STATUSTEXT is neither converted nor limited while the ULog stream delivers the log messages."""
+    vehicle, log = new_vehicle("log_message"), fake_log("log_message")
+    assert vehicle.handle(position(1000), 0.0) is None
+    assert not any(vehicle.handle(chunk(b"text", 0), 50.0, log) for _ in range(200))
+    cast("Any", log).is_streaming = False
+    assert handle(vehicle, chunk(b"converted", 0), 50.0, log).fields["text"] == "converted"
+
+
 def test_stopped_positions_are_requested_again(vehicle: Vehicle) -> None:
     """If positions stop while other messages arrive, positions are requested again."""
     requested = []
@@ -204,6 +247,8 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert "heading" not in later
     assert later["ref_lat"] == 47.3977418
     assert "ref_timestamp" not in later
+    for ms in (4000, 490):
+        vehicle.handle(dialect.MAVLink_global_position_int_message(ms, 0, 0, 0, 0, 0, 0, 0, 65535), 105.0)
     back = handle(vehicle, position(500), 105.0)
     assert ("ref_lat" in back.fields, back.rebooted) == (False, True)
     assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
