@@ -52,7 +52,7 @@ class ReferenceDetector(ChangeDetector):
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         super().reset()
-        self._compared, self.due = 0, -math.inf
+        self._compared = 0
         self._comparison.reset()
 
 

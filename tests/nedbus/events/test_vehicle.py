@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import pytest
@@ -182,6 +183,16 @@ def test_noisy_vehicle_does_not_displace_events_of_others() -> None:
     assert [event.kind for event in answered if event.vehicle == "quiet"] == ["xy_invalid", "xy_invalid"]
     assert len(answered) == 300
     assert [event.time for event in answered] == sorted(event.time for event in answered)
+
+
+def test_oldest_event_is_deleted_while_no_vehicle_has_many() -> None:
+    """In a full event log of vehicles with up to 20 events each, the oldest event of all is deleted."""
+    event_log = EventLog(keep=40)
+    for start, vehicle, count in ((0, "a", 5), (5, "b", 20), (25, "c", 16)):
+        for number in range(count + 1):
+            fields = {**VALID, "timestamp": (number + 1) * 10**6, "xy_reset_counter": number}
+            event_log.add(Address(vehicle, VLP), fields, float(start + number))
+    assert Counter(each.vehicle for each in event_log.events) == {"a": 4, "b": 20, "c": 16}
 
 
 def test_logging_dropout_is_not_silence(vehicle: SimpleVehicle) -> None:

@@ -59,6 +59,25 @@ def test_verdict_on_active_fault_includes_evidence() -> None:
     assert "UTC, until now (1.0 s)" in verdict(flight, times=LIVE).text
 
 
+def test_verdict_names_the_latest_evidence() -> None:
+    """Of much evidence before a fault, the text has the last three events, the cause all of them."""
+    flight = Flight()
+    flight.fly(1)
+    flags: dict[str, Any] = {"cs_mag_fault": False, "reject_hor_pos": False, "cs_gnss_pos": True}
+    flight.send("estimator_status_flags", instance=0, **flags)
+    for name, value in flags.items():
+        flags[name] = not value
+        flight.wait(1.0).send("estimator_status_flags", instance=0, **flags)
+    flight.wait(1.0).send(dead_reckoning=True)
+    flight.wait(1.0).send(dead_reckoning=True, xy_valid=False)
+    found = verdict(flight)
+    assert [each.kind for each in found.cause] == [
+        "estimator_fault", "innovation_rejected", "not_fused", "dead_reckoning",
+    ]  # fmt: skip
+    assert "Evidence: 13.000 EKF rejects horizontal position; 14.000 EKF stopped fusing" in found.text
+    assert "15.000 dead reckoning" in found.text
+
+
 def test_verdict_on_ended_fault_includes_start_and_end() -> None:
     """The verdict states the start and end of a fault that has ended."""
     flight = Flight()

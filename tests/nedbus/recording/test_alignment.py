@@ -287,6 +287,20 @@ def test_data_frames_have_nulls_and_utc(tmp_path: Path) -> None:
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
 
 
+def test_fields_that_a_message_lacks_are_null_in_a_table(tmp_path: Path) -> None:
+    """In a table of streams, a field is null in the rows whose message lacks it, as in the data frame of a stream."""
+    pytest.importorskip("polars")
+    address, path = Address("1", VLP), tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for number in range(4):
+            missing = frozenset({"xy_valid", "x"} if number in (1, 2) else ())
+            writer.write_messages([(message(1_000_000 + number), address, Provenance("sim", missing), number)])
+    table = nedbus.align(path, dataframe="polars")
+    assert table[f"{VLP}.xy_valid"].to_list() == [False, None, None, False]
+    assert table[f"{VLP}.x"].is_null().to_list() == [False, True, True, False]
+    assert nedbus.align(path, on=[999_999, 1_000_000], dataframe="polars")[f"{VLP}.xy_valid"].to_list() == [None, False]
+
+
 def test_utc_comes_from_gnss_then_companion_clock() -> None:
     """UTC comes from GNSS, else from a companion's Unix clock; zeros and inconsistent offsets are ignored."""
     times = range(1_000_000, 11_000_000, 1_000_000)

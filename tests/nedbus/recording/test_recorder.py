@@ -12,6 +12,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -26,7 +27,7 @@ from nedbus.sources import ReplayRun, SourceMessage, convert
 from nedbus.timings import Timings
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition
-from nedbus_msgs.arrays import to_array
+from nedbus_msgs.arrays import arrays_of, to_array
 from nedbus_msgs.messages import LogMessage
 from tests.flights.local_position import LAYOUTS, ROS2_TYPE, downgrade, encode, encode_cdr, message_definition, upgrade
 from tests.flights.messages import VLP, message
@@ -119,6 +120,26 @@ def test_replay_of_a_recording_is_bit_exact(
     assert received == sent
 
 
+def test_message_without_a_time_of_sending_has_its_log_time(
+    bus: nedbus.Bus, zenoh_session: Session, tmp_path: Path
+) -> None:
+    """The publish time of a message is its time of sending; without one, such as from another client, the log time."""
+    path, stop = tmp_path / "a.mcap", threading.Event()
+    publisher = bus.publisher(VLP, vehicle="7")
+    recorder = Recorder(bus.subscribe(VLP, mode="every"), path)
+    thread = threading.Thread(target=recorder.run, args=(stop,))
+    thread.start()
+    wait_for_matching(zenoh_session, "nedbus/8/vehicle_local_position")
+    publisher.publish(message(1))
+    zenoh_session.put(f"nedbus/8/{VLP}", encode(message(2)))
+    wait_for(lambda: recorder.messages == 2, what="both messages")
+    stop.set()
+    thread.join(DEADLINE)
+    ages = {topic: logged - published for topic, logged, published, _ in read_independently(path)}
+    assert 0 < ages[f"/7/{VLP}"] < DEADLINE * 1e9
+    assert ages[f"/8/{VLP}"] == 0
+
+
 @pytest.mark.slow
 def test_kill_loses_about_the_last_second(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
     """After kill -9 an independent reader can read the file, which lacks about the last second.
@@ -163,6 +184,19 @@ def test_file_is_valid_and_synced_after_every_flush(tmp_path: Path, monkeypatch:
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == 5
+
+
+def test_messages_between_flushes_do_not_fill_the_memory(tmp_path: Path) -> None:
+    """A recording that is not flushed buffers at most 16 MiB of data in memory; the rest is on the disk."""
+    path, blob = tmp_path / "a.mcap", nedbus.define_msg("Blob", "uint64 timestamp\nfloat64[440] data\n")
+    rows, noise = np.zeros(550, arrays_of(blob).dtype), np.random.default_rng(1)
+    streams, times = repeat((Address("1", "blob"), Provenance())), repeat(1)
+    with RecordingWriter(path) as writer:
+        for _ in range(16):  # 2 MB that can hardly be compressed
+            rows["data"] = noise.random((550, 440))
+            writer.write(rows, blob, streams, logged=times, published=times)
+        with RecordingReader(path, vehicle="1") as reader:
+            assert sum(reader.counts.values()) > 16 * 550 / 4
 
 
 def test_truncated_file_is_read_up_to_the_cut(tmp_path: Path) -> None:

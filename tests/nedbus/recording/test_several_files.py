@@ -77,6 +77,17 @@ def test_commands_in_the_docs_run(swarm: list[str], monkeypatch: pytest.MonkeyPa
         assert ended.exit_code == 0, ended.err
 
 
+def test_files_of_one_name_have_distinct_vehicles(tmp_path: Path) -> None:
+    """Vehicles of several files are named after their files, with a number if the names of the files are equal."""
+    paths = [tmp_path / folder / "a.ulg" for folder in "xyz"]
+    for number, path in enumerate(paths):
+        path.parent.mkdir()
+        write_flight(path, boot=0, start=60 + number, seconds=1)
+    streams = nedbus.read(paths, [VLP])
+    seconds = {name: round(1e-6 * int(own["timestamp"][0] - EPOCH)) for name, own in streams.items()}
+    assert seconds == {f"a/{VLP}": 60, f"a_2/{VLP}": 61, f"a_3/{VLP}": 62}
+
+
 def test_flights_years_apart_are_read_together(tmp_path: Path) -> None:
     """Two flights of a vehicle, years apart, are read together under different names."""
     first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)

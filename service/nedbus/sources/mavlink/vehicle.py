@@ -31,7 +31,6 @@ _UNKNOWN_HEADING: Final = 65535
 _CHUNK_TIMEOUT: Final = 2.0  # s for the next chunk of a STATUSTEXT; then the text ends with "..."
 _CHUNK: Final = 50  # bytes; a shorter chunk is the last
 _MAX_WAITING: Final = 100  # log messages
-_MAX_BYTES: Final = 500  # bytes of a log message
 _DEBUG: Final = 7
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -295,7 +294,7 @@ class _StatusTexts:
         if self._next and (self._current != current or sequence < self._next):
             self._finish("...")
         gap = b"..." if sequence > self._next else b""
-        self._data = (self._data + gap + data.partition(b"\0")[0])[:_MAX_BYTES]
+        self._data += gap + data.partition(b"\0")[0]  # at most 256 chunks
         self._current, self._next, self._time = current, sequence + 1, now
         if not message.id or len(data) < _CHUNK or b"\0" in data:
             self._finish()

@@ -11,6 +11,7 @@ import pytest
 
 from nedbus.client.receiving import LayoutLookup, layout_lookup
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
+from nedbus.timings import Timings
 from tests.waits import DEADLINE, wait_for
 
 FIELDS = {"timestamp": "uint64", "x": "float32"}
@@ -144,6 +145,22 @@ def test_wait_for_unanswered_lookups_is_bounded() -> None:
     assert len(lookup._failed) <= layout_lookup._MAX_FAILED
     assert start <= lookup._budget_time <= time.monotonic()
     wait_for(lambda: lookup.codec("Honest", "hash"), what="the definition")
+    lookup.close()
+
+
+def test_wait_for_an_unanswered_lookup_uses_up_the_budget(timings: Timings) -> None:
+    """After a reader has waited for the full timeout, the next waits are short until time has passed."""
+    timings.definition_timeout, closed = 0.1, threading.Event()
+
+    def find(_: Collection[SchemaId]) -> Schemas:
+        closed.wait(DEADLINE)
+        return {}
+
+    lookup = LayoutLookup(find)
+    assert lookup._wait_budget == 0.1
+    assert lookup.codec("Evil", "hash", wait=True) is None
+    assert lookup._wait_budget == 0.0
+    closed.set()
     lookup.close()
 
 

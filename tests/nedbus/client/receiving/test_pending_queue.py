@@ -19,7 +19,7 @@ from nedbus.client.receiving import pending_queue as module
 from nedbus.client.receiving.decoder import KeyState
 from nedbus.client.receiving.layout_lookup import SchemaId, Schemas
 from nedbus.client.receiving.pending_queue import CAPACITY
-from nedbus.client.receiving.writer_proxy import WriterProxy
+from nedbus.client.receiving.writer_proxy import NUMBERS, WriterProxy
 from nedbus.timings import Timings
 from nedbus.transport import RawSample
 from nedbus_msgs.messages import VehicleAttitude
@@ -95,6 +95,16 @@ def test_largest_reorder_buffers_are_given_up_first(monkeypatch: pytest.MonkeyPa
     pending_queue.put([raw(1)])
     assert timestamps(pending_queue) == [1, 2]
     assert pending_queue.counts == Counts(received=14, lost=1)
+
+
+@pytest.mark.parametrize(("before", "after", "lost"), [(-4, -2, 0), (-4, -1, 2), (-2, 0, 1), (-3, 1, 3), (-1, 2, 0)])
+def test_gap_across_the_wrap_of_sequence_numbers_is_lost(before: int, after: int, lost: int) -> None:
+    """A gap up to the highest sequence number, or across it, counts as lost at once; others are requested."""
+    pending_queue = make_queue("every")
+    pending_queue.put([raw(before % NUMBERS), raw(after % NUMBERS, timestamp=2)])
+    assert bool(pending_queue.counters.requesting) == (lost == 0)
+    assert [each.lost for each in drain(pending_queue)] == [0, lost][: 1 + bool(lost)]
+    assert pending_queue.counts.lost == lost
 
 
 def test_gap_that_is_being_filled_does_not_expire(timings: Timings) -> None:
@@ -283,6 +293,7 @@ def test_state_of_silent_vehicles_is_freed(mode: Mode, monkeypatch: pytest.Monke
     assert {"steady", "silent", *map(str, range(1935, 1999))} <= measured.keys()
     assert len(measured) <= 72
     assert set(measured.values()) == {2}
+    assert pending_queue.counts.forgotten == 0, "only keys beyond the limit are counted"
 
 
 def test_losses_during_a_long_outage_are_counted() -> None:
@@ -452,9 +463,9 @@ ATTITUDE = Payload(encode(VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))))
 UNDEFINED = f"application/msgpack;px4_msgs/FooBar;hash={'0' * 32}"
 
 
-def undefined(payload: bytes = VALID) -> RawSample:
+def undefined(payload: bytes = VALID, *, number: int | None = None, publisher: str = "a") -> RawSample:
     """Return a sample of a message whose definition no publisher has."""
-    return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding=UNDEFINED)
+    return raw(number, key="nedbus/1/foo_bar", payload=Payload(payload), encoding=UNDEFINED, publisher=publisher)
 
 
 def test_messages_left_by_a_batch_are_read_next() -> None:
@@ -476,6 +487,22 @@ def test_batch_skips_messages_without_a_definition() -> None:
         assert take_batch(pending_queue).sequence.tolist() == [0]
         assert pending_queue.pop_batch() is None
         assert pending_queue.counts == Counts(received=1, invalid=1)
+
+
+def test_definition_is_requested_again_for_another_publisher() -> None:
+    """After a failed lookup, a message of another publisher starts the next one at once, of the same one later."""
+    queried: list[SchemaId] = []
+
+    def find(schema_ids: Collection[SchemaId]) -> Schemas:
+        queried.extend(schema_ids)
+        return {}
+
+    lookup = LayoutLookup(find, now=lambda: 0.0)
+    pending_queue = PendingQueue("every", Decoder(lookup, prefix="nedbus"))
+    for publisher, count in (("a", 1), ("a", 1), ("b", 2)):
+        pending_queue.put([undefined(number=0, publisher=publisher)])
+        lookup.wait()
+        assert len(queried) == count
 
 
 def test_samples_are_queued_while_a_batch_waits_for_a_lookup(timings: Timings) -> None:

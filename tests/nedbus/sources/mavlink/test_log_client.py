@@ -13,7 +13,7 @@ from nedbus.sources.mavlink.log_client import Command, LogReason, LogState, LogS
 from nedbus.timings import TIMINGS
 from tests.peers.px4_log_stream import START, STOP, STREAMS, datagrams
 
-from .counting_reassembly import CountingReassembly
+from .test_log_reassembly import CountingReassembly
 
 OURS: Final = (245, 191)
 OTHERS: Final = (246, 190)

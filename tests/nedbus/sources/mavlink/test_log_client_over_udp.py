@@ -18,8 +18,8 @@ from nedbus.sources.mavlink.log_client import Command, LogStreamClient
 from tests.peers.px4_log_stream import START, STOP, STREAMS, Px4LogStream, Recording, read_recording
 from tests.waits import DEADLINE
 
-from .counting_reassembly import CountingReassembly
 from .test_log_client import OTHERS, OURS, Log, StateAndReason
+from .test_log_reassembly import CountingReassembly
 
 STARTED: Final[list[StateAndReason]] = [("starting", None), ("header", None), ("streaming", None)]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from pyulog import ULog
 from nedbus.sources.mavlink.log_stream import LogFile
 from tests.flights.ulogs import write_log
 from tests.nedbus.ulog.test_parser import small_log
-from tests.peers.processes import without_coverage
+from tests.peers.processes import Start, without_coverage
 
 BEGIN: Final = 1500
 """Length of a first write that contains the definitions and some messages of the small log."""
@@ -39,6 +38,21 @@ for folder in sys.stdin:
         time.sleep(3600)
     os.waitpid(pid, 0)
     print("killed", flush=True)
+"""
+FILL: Final = f"""
+import resource, sys
+from pathlib import Path
+from nedbus.sources.mavlink.log_stream import LogFile
+sys.dont_write_bytecode = True  # the limit would truncate it
+log, file = Path(sys.argv[1]).read_bytes(), LogFile(Path(sys.argv[2]), "1")
+file.write(log[:{BEGIN}])
+size = file.path.stat().st_size + 5  # as on a full disk, the first write of what follows is a short one
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+try:
+    file.write(log[{BEGIN}:])
+except OSError as exc:
+    print(exc.strerror)
+file.close()
 """
 
 
@@ -69,21 +83,18 @@ def test_gap_is_saved_as_dropout(tmp_path: Path) -> None:
     assert not saved.file_corruption
 
 
-def test_full_disk_leaves_complete_records(tmp_path: Path) -> None:
+def test_full_disk_leaves_complete_records(start: Start, tmp_path: Path) -> None:
     """A write of which only a part fits on the disk raises, and its part is removed."""
-    log, file = small_log(), LogFile(tmp_path, "1")
-    file.write(log[:BEGIN])
-    complete = file.path.read_bytes()
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:  # a limit of the file size, which like a full disk makes the first write a short one
-        resource.setrlimit(resource.RLIMIT_FSIZE, (len(complete) + 5, before[1]))
-        with pytest.raises(OSError, match="File too large"):
-            file.write(log[BEGIN:])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    file.close()
-    assert file.path.read_bytes() == complete
-    assert not ULog(str(file.path)).file_corruption
+    log, expected = small_log(), LogFile(tmp_path / "expected", "1")
+    expected.write(log[:BEGIN])
+    expected.close()
+    (tmp_path / "log.ulg").write_bytes(log)
+    process = start("-c", FILL, str(tmp_path / "log.ulg"), str(tmp_path / "saved"), coverage=False)
+    assert process.wait() == 0, process.err
+    assert process.out == "File too large\n"
+    (saved,) = (tmp_path / "saved").iterdir()
+    assert saved.read_bytes() == expected.path.read_bytes()
+    assert not ULog(str(saved)).file_corruption
 
 
 def test_streams_in_the_same_second_get_separate_files(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import random
 import socket
 import struct
 from bisect import bisect_left
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from functools import cache
@@ -18,14 +18,12 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources.mavlink.link import open_link
-from nedbus.sources.mavlink.log_reassembly import Chunk
+from nedbus.sources.mavlink.log_reassembly import Chunk, Reassembly, Verdict
 from nedbus.sources.mavlink.reader import LinkReader, LogReceiver, Received
 from nedbus.sources.options import MavlinkOptions
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
 from tests.waits import DEADLINE
-
-from .counting_reassembly import CountingReassembly
 
 HEADER: Final = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 3_000_000)
 SIZE: Final = 249
@@ -34,6 +32,25 @@ needs_recordings = [
     pytest.mark.logs,
     pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} does not exist"),
 ]
+
+
+class CountingReassembly(Reassembly):
+    """Count messages per verdict, and also lost messages, delivered bytes and bytes skipped after a gap."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts = Counter[Verdict]()
+        self.lost = self.bytes = self.skipped = 0
+
+    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Chunk:
+        """Add the next message and count the result."""
+        chunk = super().add(sequence, length, first_message_offset, data)
+        self.counts[chunk.verdict] += 1
+        self.lost += chunk.lost
+        self.bytes += len(chunk.data)
+        if chunk.verdict in ("delivered", "unsynchronised"):
+            self.skipped += length - len(chunk.data)
+        return chunk
 
 
 def add(reassembly: CountingReassembly, message: Message) -> Chunk:

@@ -290,6 +290,22 @@ def test_bounds_of_gaps_are_exact_for_records_of_one_size(size: int, lost: int) 
     assert min(surplus) == 0
 
 
+def test_rate_is_measured_since_the_last_window(tmp_path: Path) -> None:
+    """The status has the mean rate of the last window, which is at least a second long, and the total of all bytes."""
+    fields = "uint64_t timestamp;uint8_t[87] data;"
+    header = write_raw_log(tmp_path / "a.ulg", {"noise": (fields, "Q87x")}, []).read_bytes()
+    record = struct.pack("<HBHQ87x", 97, ord("D"), 0, 1)
+    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming"), header_seconds=None))
+    stream, found = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client), []
+    assert not [*stream.add(Chunk("delivered", header, begins=True), 10.0)]
+    stream.status(10.0)
+    for now, number in ((11.0, 100), (11.5, 100), (13.0, 50), (14.0, 0)):
+        assert len([*stream.add(Chunk("delivered", record * number), now)]) == number
+        status = stream.status(now)
+        found.append((status.received - len(header), status.rate))
+    assert found == [(10_000, 10_000.0), (20_000, 10_000.0), (25_000, 7_500.0), (25_000, 0.0)]
+
+
 @pytest.mark.parametrize(("peer", "reason"), [
     ({"refusal": 1}, "another client already receives it"), ({"refusal": 2}, "5000 B/s"),
 ])  # fmt: skip

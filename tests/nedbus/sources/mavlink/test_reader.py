@@ -118,13 +118,18 @@ def test_messages_that_wait_for_the_source_are_limited(autopilot: Autopilot) -> 
 
 
 def test_late_messages_do_not_hide_a_reboot(timings: Timings, autopilot: Autopilot) -> None:
-    """After messages that arrived late, the vehicle has rebooted if its time is a second below the newest one.
+    """After messages that arrived late, the vehicle has rebooted if its times are a second below the newest one.
 
     After a reboot, its ULog stream is requested again.
     """
     timings.log_answer = DEADLINE  # no retransmission of START
+    attitude, height = dialect.MAVLink_attitude_message, dialect.MAVLink_global_position_int_message
+
+    def messages(ms: int) -> list[Any]:
+        return [position(ms), attitude(ms, *[0] * 6), height(ms, *[0] * 8)]
+
     with Listener(f"mavlink:{autopilot.link}?log=1"):
-        autopilot.send(*autopilot.pack(heartbeat(), position(5000), position(4200)))
+        autopilot.send(*autopilot.pack(heartbeat(), *messages(5000), position(4200)))
         wait_for(lambda: autopilot.starts == 1, what="the first START")
-        autopilot.send(*autopilot.pack(position(3900), heartbeat()))
+        autopilot.send(*autopilot.pack(*messages(3900), heartbeat()))
         wait_for(lambda: autopilot.starts == 2, what="START after the reboot")

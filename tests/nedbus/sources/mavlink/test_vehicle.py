@@ -64,6 +64,17 @@ def test_constant_position_mode_invalidates_only_without_velocity(vehicle: Vehic
     assert estimate(vehicle, 1, 100.0)["xy_valid"] is expected
 
 
+def test_variances_are_the_diagonals_of_covariances() -> None:
+    """MAVLink sends the upper triangle of a 6x6 matrix row by row: its diagonal has indices 0, 6, 11, 15, 18 and 20."""
+    pose, twist = [float(each) for each in range(21)], [float(100 + each) for each in range(21)]
+    vectors = (0, 0, 0, (1, 0, 0, 0), *(0,) * 6)
+    message = dialect.MAVLink_odometry_message(1_000_000, 1, 12, *vectors, pose, twist, 0, 8, 100)
+    fields = handle(new_vehicle("vehicle_odometry"), message, 100.0).fields
+    assert fields["position_variance"] == (0.0, 6.0, 11.0)
+    assert fields["orientation_variance"] == (15.0, 18.0, 20.0)
+    assert fields["velocity_variance"] == (100.0, 106.0, 111.0)
+
+
 @pytest.mark.parametrize(
     ("time_usec", "timestamp"),
     [(0, 7_000_000), (6_500_000, 6_500_000), (1_700_000_000_000_000, 7_000_000), (2**64 - 1, 7_000_000)],
