@@ -17,19 +17,7 @@ from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.client import Bus, format_duration
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import (
-    CLOCKS,
-    SEVERITIES,
-    WINDOW,
-    AccountReport,
-    Event,
-    Story,
-    Times,
-    Verdict,
-    by_vehicle,
-    report_of,
-    verdict_of,
-)
+from nedbus.events import CLOCKS, SEVERITIES, WINDOW, Event, Story, Times, Verdict, by_vehicle, report_of, verdict_of
 from nedbus.monitoring import Observer
 from nedbus.sources import FileEvents, read_file_events
 from nedbus_msgs import ANY, Selection, check_vehicle
@@ -38,6 +26,8 @@ _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
 )  # fmt: skip
 _MAX_TEXT: Final = 400  # characters of a peer's text
+_WITHIN: Final = "First show the events of the last SECONDS"
+_ORIGIN: Final = "PX4's own log messages, or events derived by nedbus"
 _AT: Final = "14:05:12 (UTC), 123.4 (s since boot) or +12.3 (s since the start of the recording)"
 _DAY: Final = 86_400.0
 
@@ -48,13 +38,9 @@ def events(
     files: FilesArgument = None,
     *,
     vehicle: VehicleOption = ANY,
-    within: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=0.0, help="First show the events of the last SECONDS")
-    ] = None,
+    within: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help=_WITHIN)] = None,
     severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
-    origin: Annotated[
-        str, typer.Option(metavar="px4|nedbus", help="PX4's own log messages, or events derived by nedbus")
-    ] = ANY,
+    origin: Annotated[str, typer.Option(metavar="px4|nedbus", help=_ORIGIN)] = ANY,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     duration: DurationOption = None,
@@ -92,7 +78,7 @@ def events(
         with open_bus() as bus:
             times = Times(is_live=True)
             if within is not None:
-                show(_merge(bus.accounts(within=within)), times)
+                show(_in_order(each for report in bus.accounts(within=within) for each in report.events), times)
             _follow(bus, Selection(ANY, vehicle), lambda found: show(found, times), duration)
         return
     if within is not None or duration is not None:
@@ -135,7 +121,8 @@ def why(
             reports = bus.accounts(within=_DAY)
             published = bus.vehicles()
             routers = " or ".join(bus.routers)
-        found, times, where, advice = _merge(reports), Times(is_live=True), "the history of the services", _LIVE_ADVICE
+        found = _in_order(event for report in reports for event in report.events)
+        times, where, advice = Times(is_live=True), "the history of the services", _LIVE_ADVICE
     reporting, faults, texts = by_vehicle(reports), 0, list[str]()
     if not files and vehicle in published and vehicle not in reporting:
         hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
@@ -238,11 +225,11 @@ def _read(files: Sequence[Path]) -> tuple[FileEvents, list[Event]]:
         write_stderr(warning)
     if total > len(found):
         write_stderr(f"{_name(files)}: showing the last {len(found)} of {total} events")
-    return read, sorted(found, key=lambda event: event.time)
+    return read, _in_order(found)
 
 
-def _merge(reports: Iterable[AccountReport]) -> list[Event]:
-    return sorted((event for report in reports for event in report.events), key=lambda event: event.time)
+def _in_order(events: Iterable[Event]) -> list[Event]:
+    return sorted(events, key=lambda event: event.time)
 
 
 def _to_fields(event: Event, times: Times) -> dict[str, object]:
