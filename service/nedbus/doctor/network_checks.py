@@ -28,11 +28,9 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
         text = f"connected sessions: {router.sessions:,}"
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-        if router.load is not None and router.load >= _NEARLY_FULL:
-            advice = "raise max_sessions and the limit of open files, or run a second router (docs/hosts.md)"
-            yield Finding("router", router.zid, "warning", text, advice)
-        else:
-            yield Finding("router", router.zid, "ok", text)
+        is_full = (router.load or 0.0) >= _NEARLY_FULL
+        advice = "raise max_sessions and the limit of open files, or run a second router (docs/hosts.md)"
+        yield Finding("router", router.zid, "warning" if is_full else "ok", text, advice if is_full else "")
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:

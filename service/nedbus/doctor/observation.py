@@ -11,22 +11,10 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus import clock
+from nedbus import clock, transport
 from nedbus.client import ServiceStatus, SourceStatus, find_reports, find_services
 from nedbus.events import AccountReport
 from nedbus.timings import TIMINGS
-from nedbus.transport import (
-    PublisherToken,
-    RawSample,
-    RouterState,
-    Session,
-    Verdict,
-    px4_publishers_key_expr,
-    query,
-    query_routers,
-    token_keys,
-    translate_zenoh_errors,
-)
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
 
 T = TypeVar("T")
@@ -56,7 +44,7 @@ class Observation:
     prefix: str
     version: str
     vehicle: str | None
-    verdict: Verdict | None = None
+    verdict: transport.Verdict | None = None
     services: list[ServiceStatus] = field(default_factory=list)
     asked: float = 0.0
     error: float = 0.0
@@ -66,8 +54,8 @@ class Observation:
     delays: dict[Address, float | None] = field(default_factory=dict)
     errors: dict[Address, str] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
-    ros2: list[PublisherToken] = field(default_factory=list)
-    routers: list[RouterState] = field(default_factory=list)
+    ros2: list[transport.PublisherToken] = field(default_factory=list)
+    routers: list[transport.RouterState] = field(default_factory=list)
     listened: float = 0.0
 
     @property
@@ -75,27 +63,31 @@ class Observation:
         """The sources of all services."""
         return [source for service in self.services for source in service.sources]
 
-    def observe(self, session: Session) -> None:
+    def observe(self, session: transport.Session) -> None:
         """Send the queries, and receive messages for at least 3 s."""
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-        self.routers = query_routers(session, timeout=_QUERY_TIMEOUT)
+        self.routers = transport.query_routers(session, timeout=_QUERY_TIMEOUT)
         before = clock.utc()
         self.services = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)[:_MAX_SERVICES]
         self.asked, self.error = (before + clock.utc()) / 2, (clock.utc() - before) / 2
         self.accounts = find_reports(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        tokens = token_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
+        tokens = transport.token_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
         self.alive = Counter(_parse_each(partial(address_of_alive_key, prefix=prefix), tokens))
-        tokens = token_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
-        publishers = _parse_each(PublisherToken.parse, tokens)
+        tokens = transport.token_keys(session, transport.px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
+        publishers = _parse_each(transport.PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # without nedbus's bridges
-        for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
+        for sample in transport.query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
             if (address := self._address_of(str(sample.key_expr))) is not None:
                 # several publishers, or a storage, may answer for one key
                 self.ages[address] = _least(_age_of(sample), self.ages.get(address))
         queried = clock.utc()
-        others = {key for key in token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT) if not key.startswith("@")}
+        others = {
+            key
+            for key in transport.token_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
+            if not key.startswith("@")
+        }
         self._add(take_messages())
         self.delays = dict.fromkeys(self.delays)  # messages buffered during the queries seem late
         end = max(start + TIMINGS.listen, time.monotonic() + TIMINGS.min_listen)
@@ -108,7 +100,7 @@ class Observation:
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
-    def _add(self, samples: Iterable[RawSample]) -> None:
+    def _add(self, samples: Iterable[transport.RawSample]) -> None:
         for sample in samples:
             address = self._address_of(str(sample.key_expr))
             if address is None or (address not in self.delays and len(self.delays) >= _MAX_KEYS):
@@ -125,14 +117,14 @@ class Observation:
         return next(iter(_parse_each(partial(Address.from_key, prefix=self.prefix), [key])), None)
 
 
-def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
+def _subscribe(session: transport.Session, key_expr: str) -> Callable[[], Iterable[transport.RawSample]]:
     """Return a function that drains up to one full ring of samples; deleting it ends the subscription."""
-    with translate_zenoh_errors():
+    with transport.translate_zenoh_errors():
         subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING))
     return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 
 
-def _age_of(sample: RawSample) -> float | None:
+def _age_of(sample: transport.RawSample) -> float | None:
     """Return the time since a sample's Zenoh timestamp [s]; None without a timestamp."""
     stamp = sample.timestamp
     return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9

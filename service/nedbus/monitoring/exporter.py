@@ -40,13 +40,7 @@ class Exporter(Observer):
             "/healthz": lambda: Page.text("ok"),
             "/readyz": lambda: Page.verdict(self._faults(), "ready"),
             "/vehicles": self._vehicles,
-            "/status": lambda: Page.json(
-                {
-                    "connected": self._bus.connected,
-                    **asdict(self.subscription.counts),
-                    "streams": {str(address): asdict(each) for address, (each, _) in self.measure().items()},
-                }
-            ),
+            "/status": lambda: Page.json(self._status()),
         }
         self._routers: list[RouterState] = []
         self.log_streams: Mapping[str, LogStreamStatus] = {}  # by vehicle
@@ -131,6 +125,10 @@ class Exporter(Observer):
                     self.log_streams = {log.vehicle: log for log in logs}
         if self._session is not None:
             self._session.close()
+
+    def _status(self) -> dict[str, Any]:
+        streams = {str(address): asdict(each) for address, (each, _) in self.measure().items()}
+        return {"connected": self._bus.connected, **asdict(self.subscription.counts), "streams": streams}
 
     def _faults(self) -> list[str]:
         return [] if self._bus.connected else [f"no router answers at {' or '.join(self._bus.routers)}"]

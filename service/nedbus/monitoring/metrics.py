@@ -34,13 +34,11 @@ _LOG_STREAM: Final = ("vehicle", "source")
 METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     # Services
     "nedbus_start_time_seconds": (_GAUGE, (), "Start time of the service, as Unix time"),
-    "nedbus_sessions": (
-        _GAUGE, ("role",), "Open Zenoh sessions of the embedded router, or routers that the client is connected to",
-    ),
+    "nedbus_sessions":
+        (_GAUGE, ("role",), "Open Zenoh sessions of the embedded router, or routers that the client is connected to"),
     "nedbus_sessions_max": (_GAUGE, ("role",), "Session limit of the embedded router"),
-    "nedbus_vehicle_refused": (
-        _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, else 0",
-    ),
+    "nedbus_vehicle_refused":
+        (_GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, else 0"),
     "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
     "nedbus_limit_reached": (_COUNTER, ("limit",), "Messages ignored, and streams or keys evicted, because of a limit"),
     # Exporters
@@ -60,48 +58,39 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_stream_age_seconds": (_GAUGE, _STREAM, "Seconds since the last message"),
     "nedbus_stream_rate_hertz": (_GAUGE, _STREAM, "Message rate over the last full second"),
     "nedbus_stream_usual_rate_hertz": (_GAUGE, _STREAM, "Usual message rate of the stream"),
-    "nedbus_stream_jitter_seconds": (
-        _GAUGE, _STREAM, "Standard deviation of message intervals over the last second",
-    ),
-    "nedbus_stream_flag_ratio": (
-        _GAUGE, (*_STREAM, "flag"), "Fraction of messages with the flag set over the last second",
-    ),
-    "nedbus_latency_seconds": (
-        _HISTOGRAM, _STREAM, "Latency from the publisher to this host; assumes synchronized clocks",
-    ),
+    "nedbus_stream_jitter_seconds":
+        (_GAUGE, _STREAM, "Standard deviation of message intervals over the last second"),
+    "nedbus_stream_flag_ratio":
+        (_GAUGE, (*_STREAM, "flag"), "Fraction of messages with the flag set over the last second"),
+    "nedbus_latency_seconds":
+        (_HISTOGRAM, _STREAM, "Latency from the publisher to this host; assumes synchronized clocks"),
     "nedbus_streams": (_GAUGE, (), "Known streams"),
     # Vehicles
     "nedbus_vehicle_state": (_GAUGE, ("vehicle", "state"), "1 for the current state of a vehicle, 0 for the others"),
-    "nedbus_vehicle_condition": (
-        _GAUGE, ("vehicle", "condition"),
-        "1 for each bad or watch condition that is active or occurred in the last minute",
-    ),
+    "nedbus_vehicle_condition":
+        (_GAUGE, ("vehicle", "condition"),
+         "1 for each bad or watch condition that is active or occurred in the last minute"),
     "nedbus_vehicle_events": (_COUNTER, ("vehicle", "severity"), "Events of a vehicle, by severity"),
     # Sources
     "nedbus_source_rejected": (_COUNTER, _SOURCE, "Messages rejected by validation and not published"),
-    "nedbus_messages_rejected": (
-        _COUNTER, ("source", "rule"), "Messages rejected by validation and not published, by violated rule",
-    ),
+    "nedbus_messages_rejected":
+        (_COUNTER, ("source", "rule"), "Messages rejected by validation and not published, by violated rule"),
     "nedbus_source_lost": (_COUNTER, _SOURCE, "Messages lost before they reached the source"),
-    "nedbus_source_addresses": (
-        _GAUGE, _SOURCE, "Addresses of a replay, or those a live source currently publishes; 0 while nothing arrives",
-    ),
+    "nedbus_source_addresses":
+        (_GAUGE, _SOURCE, "Addresses of a replay, or those a live source currently publishes; 0 while nothing arrives"),
     "nedbus_source_state": (_GAUGE, ("source", "state"), "1 for the current state of a source, 0 for the others"),
     "nedbus_source_restarts": (_COUNTER, _SOURCE, "Restarts of a source after a failure"),
-    "nedbus_log_stream_active": (
-        _GAUGE, _LOG_STREAM, "1 while a vehicle's messages come from its ULog stream, 0 while converted from MAVLink",
-    ),
+    "nedbus_log_stream_active":
+        (_GAUGE, _LOG_STREAM, "1 while a vehicle's messages come from its ULog stream, 0 while converted from MAVLink"),
     "nedbus_log_stream_bytes": (_COUNTER, _LOG_STREAM, "Bytes received from a vehicle's ULog stream"),
     "nedbus_log_stream_gaps": (_COUNTER, _LOG_STREAM, "Sequence gaps in a vehicle's ULog stream"),
     "nedbus_log_stream_lost": (_COUNTER, _LOG_STREAM, "Lost LOGGING_DATA messages of a vehicle's ULog stream"),
-    "nedbus_log_stream_messages_lost": (
-        _COUNTER, (*_LOG_STREAM, "bound"), "Lower and upper bound of the number of ULog messages lost in gaps",
-    ),
+    "nedbus_log_stream_messages_lost":
+        (_COUNTER, (*_LOG_STREAM, "bound"), "Lower and upper bound of the number of ULog messages lost in gaps"),
     "nedbus_log_stream_undecodable": (_COUNTER, _LOG_STREAM, "ULog messages without a usable definition"),
     "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of ULog messages on arrival"),
-    "nedbus_log_stream_header_seconds": (
-        _GAUGE, _LOG_STREAM, "Transfer time of the last ULog header; the vehicle's own log has a gap of this length",
-    ),
+    "nedbus_log_stream_header_seconds":
+        (_GAUGE, _LOG_STREAM, "Transfer time of the last ULog header; the vehicle's own log has a gap of this length"),
     "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
 }  # fmt: skip
 """Type, labels and help text of each metric, by name."""
