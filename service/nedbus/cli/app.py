@@ -41,19 +41,18 @@ def _show_version(requested: bool) -> None:
         raise typer.Exit
 
 
+VersionOption = Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version")]
+LevelOption = Annotated[LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Lowest level to log")]
+FormatOption = Annotated[LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="Format of the log")]
+
+
 @app.callback()
 @command
 def _set_up(
     *,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version")
-    ] = False,
+    version: VersionOption = False,
     debug: Annotated[bool, typer.Option("--debug", help="Log debug messages, show tracebacks")] = False,
-    log_level: Annotated[
-        LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Lowest level to log")
-    ] = "info",
-    log_format: Annotated[
-        LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="Format of the log")
-    ] = "text",
+    log_level: LevelOption = "info",
+    log_format: FormatOption = "text",
 ) -> None:
     log_to_stderr(level="debug" if debug else log_level, log_format=log_format)

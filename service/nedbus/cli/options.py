@@ -25,6 +25,8 @@ from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text
 _log = logging.getLogger("nedbus")
 
 _ROUTER: Final = f"Router to connect to; repeatable (default: {DEFAULT_ENDPOINT})"
+_ADDRESS: Final = "TOPIC, or VEHICLE/TOPIC/INSTANCE as printed by nedbus list"
+_FILES: Final = "Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"
 _TOPIC: Final = f'Topic, "*" for all (default: {DEFAULT_TOPIC} for echo and get, else all)'
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: ./nedbus.toml)")]
 ConnectOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ROUTER)]
@@ -32,16 +34,8 @@ PrefixOption = Annotated[str | None, typer.Option(help=f"Key prefix (default: {D
 TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="CA certificate for tls/ routers, PEM")]
 TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="Client certificate, PEM")]
 TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of the client certificate, PEM")]
-TopicArgument = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="TOPIC", help="TOPIC, or VEHICLE/TOPIC/INSTANCE as printed by nedbus list", show_default=False
-    ),
-]
-FilesArgument = Annotated[
-    list[Path] | None,
-    typer.Argument(metavar="FILE", help="Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"),
-]
+TopicArgument = Annotated[str | None, typer.Argument(metavar="TOPIC", help=_ADDRESS, show_default=False)]
+FilesArgument = Annotated[list[Path] | None, typer.Argument(metavar="FILE", help=_FILES)]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]

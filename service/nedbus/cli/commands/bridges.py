@@ -24,15 +24,14 @@ from nedbus_msgs import ANY, RELEASES, Selection
 _log = logging.getLogger("nedbus")
 _OPEN: Final = "%s has no password: every client can read it, but not write; listen on loopback to prevent this"
 
-MapOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--map", exists=True, dir_okay=False, metavar="FILE", help="Map: GeoJSON, or an image with a world file"
-    ),
-]
-NamespaceOption = Annotated[
-    list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help="Publish as /NAMESPACE/fmu/out/...; repeatable")
-]
+_MAP: Final = "Map: GeoJSON, or an image with a world file"
+_NAMESPACE: Final = "Publish as /NAMESPACE/fmu/out/...; repeatable"
+_ORIGIN: Final = "Additional host name of this page, for example of a proxy; repeatable"
+_LAYOUT: Final = f"PX4 release of px4_msgs in the ROS 2 workspace: {', '.join(RELEASES)}"
+_TO: Final = "ROS 2's router (default: nedbus's router)"
+
+MapOption = Annotated[Path | None, typer.Option("--map", exists=True, dir_okay=False, metavar="FILE", help=_MAP)]
+NamespaceOption = Annotated[list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help=_NAMESPACE)]
 HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Address to listen on (port 0: any free)")]
 
 
@@ -45,10 +44,7 @@ def web(
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
     http: HttpOption = "127.0.0.1:8420",
-    origin: Annotated[
-        list[str] | None,
-        typer.Option(metavar="HOST:PORT", help="Additional host name of this page, for example of a proxy; repeatable"),
-    ] = None,
+    origin: Annotated[list[str] | None, typer.Option(metavar="HOST:PORT", help=_ORIGIN)] = None,
     background: MapOption = None,
 ) -> None:
     """Serve a web page with a map, the faults and plots of all vehicles."""
@@ -104,14 +100,10 @@ def ros2(
     selection: Selection = ALL,
     *,
     humble: Annotated[bool, typer.Option("--humble", help="Use ROS 2 Humble's keys, without type hash")] = False,
-    layout: Annotated[
-        str, typer.Option(help=f"PX4 release of px4_msgs in the ROS 2 workspace: {', '.join(RELEASES)}")
-    ] = RELEASES[-1],
+    layout: Annotated[str, typer.Option(help=_LAYOUT)] = RELEASES[-1],
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain id")] = 0,
     namespace: NamespaceOption = None,
-    to: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="ROS 2's router (default: nedbus's router)")
-    ] = None,
+    to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help=_TO)] = None,
 ) -> None:
     """Publish px4_msgs on /fmu/out/... to ROS 2 with rmw_zenoh."""
     for each in namespace or ():

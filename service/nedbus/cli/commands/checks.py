@@ -22,6 +22,11 @@ from nedbus.settings import Settings
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
 _HOST: Final = socket.gethostname()
+_REQUIRED: Final = "Require a message of this vehicle, from any publisher"
+_WITHIN: Final = "Require no bad or watch event in the last SECONDS"
+_EXAMINED: Final = "Examine only this vehicle; also test the write permission"
+_LINK: Final = "Also listen on a MAVLink link, such as udpin:0.0.0.0:14540"
+_CONFIGS: Final = "Settings (.toml) or router files (.json5); default: the settings of serve"
 _REFUSED: Final = (
     ", although its service reports it as published: check that the access rules of the router allow the service to"
     " publish this vehicle, and this client to read it (docs/security.md)"
@@ -32,17 +37,13 @@ _REFUSED: Final = (
 def health(
     bus: Bus,
     *,
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Require a message of this vehicle, from any publisher")
-    ] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help=_REQUIRED)] = None,
     services: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N services, on any host")] = None,
     max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Maximum age of the newest message")] = 3.0,
     expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="Require these vehicles, on any host")] = None,
     vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N vehicles, on any host")] = None,
     valid: Annotated[str | None, typer.Option(metavar="xy,z", help="Require valid estimates: xy, z, vxy, vz")] = None,
-    within: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Require no bad or watch event in the last SECONDS")
-    ] = None,
+    within: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help=_WITHIN)] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Check services, sources, messages and vehicles; exit with 0 if healthy.
@@ -172,12 +173,8 @@ class _Check:
 def doctor(
     read_settings: Callable[[], Settings],
     *,
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Examine only this vehicle; also test the write permission")
-    ] = None,
-    mavlink: Annotated[
-        str | None, typer.Option(metavar="LINK", help="Also listen on a MAVLink link, such as udpin:0.0.0.0:14540")
-    ] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help=_EXAMINED)] = None,
+    mavlink: Annotated[str | None, typer.Option(metavar="LINK", help=_LINK)] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Diagnose why no messages arrive.
@@ -205,14 +202,7 @@ def doctor(
 
 @command
 def check(
-    files: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="CONFIG",
-            help="Settings (.toml) or router files (.json5); default: the settings of serve",
-            show_default=False,
-        ),
-    ] = None,
+    files: Annotated[list[Path] | None, typer.Argument(metavar="CONFIG", help=_CONFIGS, show_default=False)] = None,
     *,
     offline: Annotated[bool, typer.Option("--offline", help="Check only the text of the files")] = False,
 ) -> None:

@@ -24,6 +24,7 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus.client import Bus, Mode, Sample, check_max_rate
 from nedbus_msgs import Address, Selection
 
+_MAX_RATE: Final = "Downsample each stream at its publisher to this rate, in Hz"
 _EVERY: Final = "Print every message in order; a replay at speed=max waits for this terminal or pipe"
 
 
@@ -38,9 +39,7 @@ def echo(
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     interval: Annotated[float, typer.Option(min=0.0, help="Minimum time between messages of a stream, in s")] = 0.0,
-    max_rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Downsample each stream at its publisher to this rate, in Hz")
-    ] = None,
+    max_rate: Annotated[float | None, typer.Option(metavar="HZ", help=_MAX_RATE)] = None,
     once: Annotated[bool, typer.Option("--once", help="Stop after one message, same as --count 1")] = False,
     count: CountOption = None,
     duration: DurationOption = None,

@@ -78,11 +78,8 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
     now = clock.now()
     rows: list[dict[str, Any]] = [
         {
-            "file": str(entry.path),
-            "name": entry.name,
-            "use": entry.use,
-            "until": entry.certificate.ends.isoformat(),
-            "days_left": math.floor(entry.certificate.days_left(now)),
+            "file": str(entry.path), "name": entry.name, "use": entry.use,
+            "until": entry.certificate.ends.isoformat(), "days_left": math.floor(entry.certificate.days_left(now)),
             "state": "EXPIRED" if entry.certificate.is_due(now, 0)
             else entry.problem or ("expires soon" if entry.certificate.is_due(now, within) else "valid"),
             "hosts": entry.certificate.hosts,

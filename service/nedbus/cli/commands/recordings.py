@@ -4,7 +4,7 @@ import math
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -21,9 +21,9 @@ from nedbus.sources import convert as convert_messages
 from nedbus.timings import TIMINGS
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
-FlightArgument = Annotated[
-    Path, typer.Argument(metavar="FLIGHT", help="A .ulg, .mcap or .tlog file", show_default=False)
-]
+_FLIGHT: Final = "A .ulg, .mcap or .tlog file"
+_IMAGE: Final = "Image to write (default: next to the flight)"
+FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help=_FLIGHT, show_default=False)]
 
 
 @command
@@ -89,10 +89,7 @@ def convert(
 def plot(
     source: FlightArgument,
     *,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="FILE.png", help="Image to write (default: next to the flight)"),
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.png", help=_IMAGE)] = None,
     topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,

@@ -28,7 +28,8 @@ from .checks import report_mistakes
 _log = logging.getLogger("nedbus")
 _KINDS = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
 _SOURCES = f"Source to publish: {_KINDS}, with ?OPTION=VALUE&...; repeatable"
-
+_HTTP = "Serve metrics, health and status on this address"
+_ZENOHD = "Router configuration in the format of zenohd"
 _LISTEN = f"Endpoint to listen on; repeatable (default: {DEFAULT_ENDPOINT})"
 ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
 _JOIN = "Router to join; repeatable"
@@ -47,9 +48,7 @@ def serve(
     tls_key: TlsKeyOption = None,
     prefix: PrefixOption = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id for sources without one")] = None,
-    http: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Serve metrics, health and status on this address")
-    ] = None,
+    http: Annotated[str | None, typer.Option(metavar="HOST:PORT", help=_HTTP)] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="Exit when finite sources have ended")] = None,
     config: ConfigOption = None,
     check: Annotated[bool, typer.Option("--check", help="Check the settings and exit")] = False,
@@ -94,8 +93,7 @@ def serve(
 @command
 def router(
     config_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="CONFIG.json5", help="Router configuration in the format of zenohd", show_default=False),
+        Path | None, typer.Argument(metavar="CONFIG.json5", help=_ZENOHD, show_default=False)
     ] = None,
     *,
     listen: ListenOption = None,
