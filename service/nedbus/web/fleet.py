@@ -10,16 +10,7 @@ from functools import lru_cache
 from itertools import count
 from typing import Any, Final, NamedTuple
 
-from nedbus.client import (
-    Health,
-    LogStreamStatus,
-    RejectionReport,
-    Sample,
-    StreamState,
-    describe_stream,
-    health_of_last,
-    stream_state,
-)
+from nedbus.client import Health, LogStreamStatus, RejectionReport, Sample, StreamState, health_of_last, stream_state
 from nedbus.events import FIXES, MODES, State, rank_vehicle
 from nedbus.monitoring import Snapshot
 from nedbus_msgs import DEFAULT_TOPIC, Address
@@ -45,11 +36,6 @@ class StreamView:
     health: Health
     state: StreamState
     rejected: int
-
-    @property
-    def description(self) -> str:
-        """State and flags as text."""
-        return describe_stream(self.health, self.state)
 
     @property
     def silence(self) -> float | None:

@@ -21,7 +21,7 @@ from bokeh.models import ColumnDataSource, Model
 from bokeh.models.widgets import Div
 
 import nedbus
-from nedbus.client import LogStreamStatus, Monitor, Sample, stream_state
+from nedbus.client import LogStreamStatus, Monitor, Sample, describe_stream, stream_state
 from nedbus.events import EventLog
 from nedbus.monitoring import Snapshot
 from nedbus.recording import RecordingWriter
@@ -111,6 +111,11 @@ class SimulatedFleet:
 @pytest.fixture
 def sim() -> SimulatedFleet:
     return SimulatedFleet()
+
+
+def describe(view: StreamView) -> str:
+    """Return the state and the flags of a stream, as in its row on the page."""
+    return describe_stream(view.health, view.state)
 
 
 def addresses_of(snapshot: FleetSnapshot) -> list[Address]:

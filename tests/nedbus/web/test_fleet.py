@@ -18,7 +18,7 @@ from nedbus.web.stream import COLUMNS, POINTS, PageStream
 from nedbus_msgs import Address
 from nedbus_msgs.frames import MapProjection
 from tests.flights.messages import VLP, message
-from tests.nedbus.web.page import NOON, QUAD, WING, SimulatedFleet, addresses_of, sim
+from tests.nedbus.web.page import NOON, QUAD, WING, SimulatedFleet, addresses_of, describe, sim
 from tests.waits import DEADLINE
 
 __all__ = ["sim"]  # a fixture
@@ -53,12 +53,12 @@ def test_state_follows_the_validity_flags(
 ) -> None:
     """A vehicle has the worst state that the flags of its position imply, even in the first message."""
     sim.fly(3, **fields)
-    assert (sim.vehicle().grade, sim.vehicle().state.text, sim.view().description) == (grade, text, description)
+    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (grade, text, description)
     sim.fly(3)
-    assert (sim.vehicle().grade, sim.vehicle().state.text, sim.view().description) == ("ok", "ok", "ok")
+    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == ("ok", "ok", "ok")
     began = sim.time + 0.1
     sim.fly(3, **fields)
-    assert (sim.vehicle().grade, sim.vehicle().state.text, sim.view().description) == (grade, text, description)
+    assert (sim.vehicle().grade, sim.vehicle().state.text, describe(sim.view())) == (grade, text, description)
     assert sim.vehicle().state.since == (pytest.approx(began, abs=0.01) if fields and grade != "ok" else None)
 
 
@@ -80,7 +80,7 @@ def test_secondary_estimates_do_not_affect_the_vehicle_state(
             sim.add(other, **fields)
         row = sim.vehicle()
         assert (row.grade, row.state.text, row.state.conditions, row.main.address) == ("ok", "ok", (), WING)
-        assert "invalid" in sim.view(other).description
+        assert "invalid" in describe(sim.view(other))
     sim.fly(30)
     assert sim.view(other, alive=[WING]).state.name == "gone"
     assert sim.vehicle(alive=[WING]).grade == "ok"
@@ -135,7 +135,7 @@ def test_since_is_the_start_of_the_state(sim: SimulatedFleet) -> None:
     silent = sim.vehicle(alive=[WING])
     assert (silent.grade, silent.brief) == ("bad", "silent")
     assert silent.state.since == pytest.approx(last, abs=0.01)
-    assert sim.view(alive=[WING]).description == "stale: nothing for 10.0 s, 1 gap"
+    assert describe(sim.view(alive=[WING])) == "stale: nothing for 10.0 s, 1 gap"
 
 
 def test_lost_link_leaves_vehicle_states_unchanged(sim: SimulatedFleet) -> None:

@@ -21,7 +21,7 @@ from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleAttitude
 from tests.flights.messages import VALID, VLP, message
-from tests.nedbus.web.page import RenderedPage, write_flight
+from tests.nedbus.web.page import RenderedPage, describe, write_flight
 from tests.waits import wait_for
 
 
@@ -69,7 +69,7 @@ def shown(player: Player) -> object:
         )
         for view in row.streams:
             points = view.stream.minute.points(0, view.stream.minute.written)
-            found.append(repr((view.address, view.description, points[points[:, 0] > end - 50_000].tolist())))
+            found.append(repr((view.address, describe(view), points[points[:, 0] > end - 50_000].tolist())))
     return found
 
 
@@ -257,7 +257,7 @@ def test_only_timestamps_of_other_topics_are_kept(tmp_path: Path, clock: SimpleN
     (row,) = player.fleet.snapshot.vehicles
     view = next(view for view in row.streams if view.address.topic == "vehicle_attitude")
     assert view.health.rate == pytest.approx(10, rel=0.1)
-    assert (view.description, view.stream.minute.written, view.health.messages) == ("ok", 0, 101)
+    assert (describe(view), view.stream.minute.written, view.health.messages) == ("ok", 0, 101)
 
 
 def test_message_without_a_timestamp_is_rejected(tmp_path: Path) -> None:
